@@ -1,0 +1,194 @@
+"""The generated controller, compiled for this machine and called through cffi (ABI mode)."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import cffi
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.errors import CodegenError
+from codegen.layout import GAINS, INPUT, OUTPUT, STATE
+from codegen.parameters import to_array
+from codegen.render import TEMPLATES, interface_hash, render, write_tree
+from codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
+from tuning.files import sha256
+from tuning.gains import Gains
+
+HEADER = TEMPLATES / "native" / "mimo_pid_native.h"
+SOURCES = ("core/mimo_pid.cpp", "native/mimo_pid_native.cpp")
+
+#: What mimo_pid_layout(item) must return, in the order of the header's enum.
+LAYOUT = (
+    GAINS.itemsize,
+    INPUT.itemsize,
+    OUTPUT.itemsize,
+    STATE.itemsize,
+    25 * 4,
+    35 * 4,
+    INPUT.fields["rates"][1],  # type: ignore[index]
+    INPUT.fields["saturation"][1],  # type: ignore[index]
+    INPUT.fields["landed"][1],  # type: ignore[index]
+    OUTPUT.fields["fault"][1],  # type: ignore[index]
+    STATE.fields["integral"][1],  # type: ignore[index]
+)
+
+
+def cache_folder() -> Path:
+    """Where compiled libraries are kept between runs: $XDG_CACHE_HOME/mimopilot, or a temporary folder."""
+    base = os.environ.get("XDG_CACHE_HOME")
+    folder = (Path(base) if base else Path.home() / ".cache") / "mimopilot"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        folder = Path(tempfile.gettempdir()) / f"mimopilot-{os.getuid()}"
+        folder.mkdir(mode=0o700, exist_ok=True)
+        return folder
+
+
+def build_native(gains: Gains, folder: Path | None = None) -> Path:
+    """Emit the native target and compile it into a shared library.
+
+    Parameters
+    ----------
+    gains : Gains
+        The gains that become the library's defaults.
+    folder : Path, optional
+        Where the tree is written; by default in the cache, by hash.
+
+    Returns
+    -------
+    Path
+        The library; its name holds the hash of its sources and flags, so that a changed one is never
+        mistaken for one already loaded.
+
+    Raises
+    ------
+    CodegenError
+        When there is no compiler or it fails, or the folder is not ours to write.
+    """
+    files = render(gains, "native")
+    compiler = find_compiler()
+    sources = "".join(f"{name}\0{content}\0" for name, content in files.items() if name.startswith(("core/", "native/")))
+    key = sha256(f"{sources}{compiler}{CXX_FLAGS}{platform.machine()}")[:16]
+    folder = folder or cache_folder() / key
+    write_tree(files, folder)
+    library = folder / "build" / f"libmimo_pid-{key}.so"
+    if not library.is_file():
+        library.parent.mkdir(exist_ok=True)
+        compile_shared(compiler, [folder / name for name in SOURCES], library)
+    return library
+
+
+def _declarations() -> str:
+    """The functions of the C header, as cffi reads them."""
+    text = re.sub(r"/\*.*?\*/", "", HEADER.read_text(), flags=re.DOTALL)
+    return "\n".join(re.findall(r"^(?:uint32_t|int32_t|void) \w+\([^)]*\);", text, flags=re.MULTILINE))
+
+
+class NativeLibrary:
+    """A loaded library, its interface checked.
+
+    Parameters
+    ----------
+    path : Path
+        What `build_native` returned.
+
+    Raises
+    ------
+    CodegenError
+        When it cannot be loaded, or its interface is not the one that this version expects.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.ffi = cffi.FFI()
+        self.ffi.cdef(_declarations())
+        try:
+            self.lib: Any = self.ffi.dlopen(str(path))
+        except OSError as error:
+            raise CodegenError(f"{path}: cannot load the compiled controller: {error}", exit_code=1) from error
+        if self.lib.mimo_pid_interface_hash() != interface_hash():
+            raise CodegenError(f"{path}: made for another version of the interface; delete it and generate again")
+        layout = tuple(self.lib.mimo_pid_layout(item) for item in range(len(LAYOUT)))
+        if layout != LAYOUT:
+            raise CodegenError(f"{path}: sizes and offsets are {layout}, expected {LAYOUT}; generate again")
+
+    @property
+    def step_address(self) -> int:
+        """Address of mimo_pid_step, for calls from compiled loops."""
+        return int(self.ffi.cast("uintptr_t", self.ffi.addressof(self.lib, "mimo_pid_step")))
+
+    def default_gains(self) -> NDArray[np.float32]:
+        """The gains that the library was generated with, (36,) float32."""
+        gains = np.zeros(GAINS.shape, np.float32)
+        self.lib.mimo_pid_default_gains(self.ffi.from_buffer("float[]", gains))
+        return gains
+
+
+class NativeController:
+    """One controller of a loaded library, with its own state.
+
+    Parameters
+    ----------
+    library : NativeLibrary
+        The code.
+    gains : Gains or None
+        What it starts with; None takes the library's defaults.
+    """
+
+    def __init__(self, library: NativeLibrary, gains: Gains | None = None) -> None:
+        self.library = library
+        self.state: NDArray[Any] = np.zeros(1, STATE)
+        self._state = library.ffi.from_buffer("uint8_t[]", self.state)
+        array = library.default_gains() if gains is None else to_array(gains)
+        if not library.lib.mimo_pid_initialise(self._state, library.ffi.from_buffer("float[]", array)):
+            raise CodegenError("the controller refused its gains: every one must be finite and within its range")
+
+    def set_gains(self, gains: Gains | NDArray[np.float32]) -> bool:
+        """Change the gains, bumpless. False: refused, the old ones stay.
+
+        Parameters
+        ----------
+        gains : Gains or (36,) float32 array
+            The new set.
+        """
+        array = gains if isinstance(gains, np.ndarray) else to_array(gains)
+        if array.shape != GAINS.shape or array.dtype != np.float32:
+            raise CodegenError(f"gains: got {array.dtype} {array.shape}, expected float32 {GAINS.shape}")
+        return bool(self.library.lib.mimo_pid_set_gains(self._state, self.library.ffi.from_buffer("float[]", array)))
+
+    def run(self, inputs: NDArray[Any]) -> NDArray[Any]:
+        """Consecutive control periods.
+
+        Parameters
+        ----------
+        inputs : (N,) array of `codegen.layout.INPUT`
+            One row a period.
+
+        Returns
+        -------
+        (N,) array of `codegen.layout.OUTPUT`
+        """
+        if inputs.dtype != INPUT or inputs.ndim != 1:
+            raise CodegenError(f"inputs: got {inputs.dtype} {inputs.shape}, expected (N,) of codegen.layout.INPUT")
+        rows = np.ascontiguousarray(inputs)
+        outputs = np.zeros(len(rows), OUTPUT)
+        ffi = self.library.ffi
+        self.library.lib.mimo_pid_run(
+            self._state, ffi.from_buffer("uint8_t[]", rows), ffi.from_buffer("uint8_t[]", outputs), len(rows)
+        )
+        return outputs
+
+
+def load_native(gains: Gains, folder: Path | None = None) -> NativeLibrary:
+    """`build_native` and load the result."""
+    return NativeLibrary(build_native(gains, folder))

@@ -1,0 +1,110 @@
+"""The one table of the controller's parameters.
+
+The C++ headers, PX4's module.yaml, ground-station files, the SITL's parameter server and the uploader
+all come from here. Its order is that of ``mimopilot::Gains`` seen as an array of float.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.errors import CodegenError
+from tuning.gains import AXES, LIMITS, MATRICES, PARAMETER_PREFIX, Gains
+
+AXIS_NAMES = dict(zip("RPY", AXES, strict=True))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One scalar of the controller as a vehicle publishes it.
+
+    Attributes
+    ----------
+    name : str
+        At most 16 characters: ``MIMO_<loop and term>_<output><error>``.
+    code : str
+        The element's code in `tuning.gains.Gains.elements`.
+    unit : str
+        As PX4 spells it; empty when it has none there.
+    minimum, maximum : float
+        Range that a vehicle accepts, both included.
+    writable : bool
+        False for what is fixed in the firmware and published only to be checked.
+    description : str
+        One line.
+    """
+
+    name: str
+    code: str
+    unit: str
+    minimum: float
+    maximum: float
+    writable: bool
+    description: str
+
+
+#: Matrix -> (unit, largest value, what it does).
+_TERMS = {
+    "Kp_o": ("1/s", 50.0, "rate set-point from angle error"),
+    "Kp_i": ("s", 5.0, "moment from rate error"),
+    "Ki_i": ("", 10.0, "moment from the integral of the rate error"),
+    "Kd_i": ("s^2", 0.5, "moment from measured angular acceleration, subtracted"),
+    "Kff_i": ("s", 5.0, "moment from rate set-point"),
+}
+_LIMITS = {
+    "rate_max": ("rad/s", 0.01, 50.0, "limit of the rate set-point"),
+    "moment_max": ("norm", 0.01, 1.0, "limit of the moment, excitation included"),
+    "integral_max": ("norm", 0.001, 1.0, "limit of the integral term"),
+}
+
+
+def _gain(matrix: str, output: str, error: str) -> Parameter:
+    unit, largest, text = _TERMS[matrix]
+    code = f"{MATRICES[matrix]}_{output}{error}"
+    what = f"{text}, {AXIS_NAMES[output]} from {AXIS_NAMES[error]}" if output != error else f"{text}, {AXIS_NAMES[output]}"
+    return Parameter(PARAMETER_PREFIX + code, code, unit, -largest, largest, True, f"{matrix}: {what}")
+
+
+def _limit(limit: str, axis: str) -> Parameter:
+    unit, smallest, largest, text = _LIMITS[limit]
+    code = f"{LIMITS[limit]}_{axis}"
+    return Parameter(PARAMETER_PREFIX + code, code, unit, smallest, largest, True, f"{text}, {AXIS_NAMES[axis]}")
+
+
+PARAMETERS: tuple[Parameter, ...] = (
+    *(_gain(matrix, output, error) for matrix in MATRICES for output in "RP" for error in "RP"),
+    *(_gain(matrix, "Y", "Y") for matrix in MATRICES),
+    *(_limit(limit, axis) for limit in LIMITS for axis in "RPY"),
+    Parameter("MIMO_D_POLE", "D_POLE", "norm", 0.0, 0.9999, True, "pole of the derivative filter, exp(-2 pi f_d Ts); 0: none"),
+    Parameter("MIMO_TS", "TS", "s", 1e-4, 1.0, False, "control period, fixed in the firmware"),
+)
+
+BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
+
+
+def check_ranges(gains: Gains) -> None:
+    """Refuse a set that a vehicle would refuse.
+
+    Raises
+    ------
+    CodegenError
+        Naming the first parameter out of its range, its value and the range.
+    """
+    values = gains.elements()
+    for parameter in PARAMETERS:
+        value = values[parameter.code]
+        if not parameter.minimum <= value <= parameter.maximum:
+            raise CodegenError(
+                f"{parameter.name}: got {value:.6g} {parameter.unit}".rstrip()
+                + f", expected {parameter.minimum:g} to {parameter.maximum:g} ({parameter.description})"
+            )
+
+
+def to_array(gains: Gains) -> NDArray[np.float32]:
+    """The (36,) float32 array that ``mimopilot::Gains`` is in memory."""
+    values = gains.elements()
+    return np.array([values[parameter.code] for parameter in PARAMETERS], dtype=np.float32)

@@ -1,0 +1,80 @@
+"""Test vectors: rows of random inputs and the bits that the independent Python reference returns for them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.layout import INPUT, OUTPUT
+from tuning.controller import Controller
+from tuning.gains import Gains
+
+ROWS = 256
+
+
+def random_inputs(rows: int, generator: np.random.Generator) -> NDArray[Any]:
+    """Inputs that reach every branch of the controller.
+
+    Ordinary flight, saturation, denormals, and values that are not finite or far out of range, alone and
+    in runs longer than the controller holds.
+
+    Parameters
+    ----------
+    rows : int
+        How many control periods.
+    generator : numpy.random.Generator
+        Source of all randomness.
+
+    Returns
+    -------
+    (rows,) array of `codegen.layout.INPUT`
+    """
+    inputs = np.zeros(rows, INPUT)
+    scale = 10.0 ** generator.uniform(-3, 0.5, (rows, 1))
+    for name, size in (("attitude_setpoint", 0.5), ("attitude", 0.5), ("rates", 3.0), ("excitation", 0.1)):
+        inputs[name] = np.clip(generator.standard_normal((rows, 3)) * scale, -8, 8) * size
+    inputs["excitation"] = np.clip(inputs["excitation"], -1, 1)
+    inputs["saturation"] = generator.choice([-1, 0, 0, 0, 1], (rows, 3))
+    inputs["armed"] = generator.random(rows) > 0.02
+    inputs["landed"] = generator.random(rows) < 0.05
+    wild = np.array([np.nan, np.inf, -np.inf, 1e38, -1e38, 1e-40, -1e-42, 0.0, -0.0, 100.0, 12.6], np.float32)
+    for name in ("attitude_setpoint", "attitude", "rates", "excitation"):
+        hit = generator.random((rows, 3)) < 0.01
+        inputs[name][hit] = generator.choice(wild, int(hit.sum()))
+    for _ in range(max(1, rows // 500)):
+        start = int(generator.integers(0, max(1, rows - 60)))
+        name = ("attitude_setpoint", "attitude", "rates")[int(generator.integers(3))]
+        inputs[name][start : start + int(generator.integers(20, 40)), int(generator.integers(3))] = np.nan
+    return inputs
+
+
+def reference_outputs(controller: Controller, inputs: NDArray[Any]) -> NDArray[Any]:
+    """What the Python reference makes of `inputs`, as rows of `codegen.layout.OUTPUT`."""
+    outputs = np.zeros(len(inputs), OUTPUT)
+    for row, output in zip(inputs, outputs, strict=True):
+        step = controller.step(
+            row["attitude_setpoint"],
+            row["attitude"],
+            row["rates"],
+            row["excitation"],
+            row["saturation"],
+            bool(row["armed"]),
+            bool(row["landed"]),
+        )
+        output["moment"], output["rates_setpoint"] = step.moment, step.rates_setpoint
+        output["fault"], output["fault_count"] = step.fault, step.fault_count
+    return outputs
+
+
+def emitted_vectors(gains: Gains) -> dict[str, list[list[str]]]:
+    """Inputs and expected outputs as rows of 32-bit hexadecimal words, for the emitted test."""
+    inputs = random_inputs(ROWS, np.random.default_rng(1))
+    outputs = reference_outputs(Controller(gains), inputs)
+    return {"inputs": _words(inputs), "outputs": _words(outputs)}
+
+
+def _words(rows: NDArray[Any]) -> list[list[str]]:
+    words = rows.view(np.uint32).reshape(len(rows), -1)
+    return [[f"0x{int(word):08x}U" for word in row] for row in words]

@@ -1,0 +1,7 @@
+"""The one exception of this room."""
+
+
+class TuningError(ValueError):
+    """Bad input to tuning: the message says what, where and what to do next."""
+
+    exit_code = 2

@@ -1,0 +1,78 @@
+"""The excitation: a pseudo-random binary moment (theory: PRBS with random hold times)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.errors import TuningError
+
+
+def hold_from_bandwidth(bandwidth: float, Ts: float) -> tuple[int, int]:
+    """Hold times of a PRBS whose shortest pulse is half a period of `bandwidth`.
+
+    Parameters
+    ----------
+    bandwidth : float, rad/s
+        Upper end w of the band to excite.
+    Ts : float, s
+        Control period.
+
+    Returns
+    -------
+    hold_min, hold_max : int, samples
+        round(pi / (w Ts)) and four times that.
+
+    Raises
+    ------
+    TuningError
+        When the bandwidth is not between 0 and the Nyquist frequency.
+    """
+    if not 0 < bandwidth <= math.pi / Ts:
+        raise TuningError(f"bandwidth: got {bandwidth} rad/s, expected more than 0 and at most {math.pi / Ts:.4g} rad/s")
+    hold_min = max(1, round(math.pi / (bandwidth * Ts)))
+    return hold_min, 4 * hold_min
+
+
+def prbs(
+    samples: int, amplitude: float, hold_min: int, hold_max: int, generator: np.random.Generator
+) -> NDArray[np.float64]:
+    """Two-valued signal of alternating sign, each value held for a random number of samples.
+
+    A constant hold time would put nulls in the spectrum, hence the draw from
+    ``hold_min..hold_max`` (both included).
+
+    Parameters
+    ----------
+    samples : int
+        Length N.
+    amplitude : float
+        Absolute value of the signal, in the unit of u.
+    hold_min, hold_max : int, samples
+        Range of the hold times.
+    generator : numpy.random.Generator
+        Source of all randomness.
+
+    Returns
+    -------
+    (N,) array
+        The signal.
+
+    Raises
+    ------
+    TuningError
+        When the hold times are not 1 <= hold_min <= hold_max or N is negative.
+    """
+    if samples < 0 or not 1 <= hold_min <= hold_max:
+        raise TuningError(f"prbs: got {samples} samples, hold {hold_min}..{hold_max}; expected N >= 0, 1 <= min <= max")
+    signal = np.empty(samples)
+    sign = 1.0 if generator.integers(2) else -1.0
+    start = 0
+    while start < samples:
+        hold = int(generator.integers(hold_min, hold_max, endpoint=True))
+        signal[start : start + hold] = sign * amplitude
+        sign = -sign
+        start += hold
+    return signal

@@ -1,0 +1,79 @@
+"""One recorded flight as uniformly sampled signals: what every log reader and the bench return."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.errors import TuningError
+from tuning.gains import Gains
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """Signals of one flight, roll then pitch, in SI units; rows outside `segments` are not used.
+
+    Attributes
+    ----------
+    Ts : float, s
+        Sampling period.
+    u : (N, 2) array
+        Control moment applied to the plant, after injection and saturation, dimensionless.
+    y_i, y_o : (N, 2) arrays, rad/s, rad
+        Measured body rates and measured roll and pitch angle.
+    u_bar : (N, 2) array or None
+        Injected excitation, part of u. None: not logged.
+    r_o, r_i : (N, 2) arrays or None, rad, rad/s
+        Attitude and rate set-points. None: not logged.
+    segments : tuple of (start, stop)
+        Stretches without a gap, in samples, stop excluded.
+    source, sha256 : str
+        Name and hash of the log.
+    flown : Gains or None
+        The controller that flew, when the log says so.
+
+    Raises
+    ------
+    TuningError
+        When shapes differ, a segment is empty or out of range, or a sample in a segment is not finite.
+    """
+
+    Ts: float
+    u: Signal
+    y_i: Signal
+    y_o: Signal
+    u_bar: Signal | None = None
+    r_o: Signal | None = None
+    r_i: Signal | None = None
+    segments: tuple[tuple[int, int], ...] = ()
+    source: str = ""
+    sha256: str = ""
+    flown: Gains | None = None
+
+    def __post_init__(self) -> None:
+        if not self.segments:
+            object.__setattr__(self, "segments", ((0, len(self.u)),))
+        for name in ("u", "y_i", "y_o", "u_bar", "r_o", "r_i"):
+            signal = getattr(self, name)
+            if signal is None:
+                continue
+            if signal.ndim != 2 or signal.shape != self.u.shape:
+                raise TuningError(f"{self.source}: {name}: got shape {signal.shape}, expected {self.u.shape}")
+            for start, stop in self.segments:
+                if not 0 <= start < stop <= len(signal):
+                    raise TuningError(f"{self.source}: segment {start}..{stop} is empty or not within 0..{len(signal)}")
+                bad = np.flatnonzero(~np.isfinite(signal[start:stop]).all(axis=1))
+                if len(bad):
+                    raise TuningError(
+                        f"{self.source}: {name} is not finite at {len(bad)} samples, first at "
+                        f"{(start + bad[0]) * self.Ts:.3f} s; cut that stretch out of the log"
+                    )
+
+    @property
+    def seconds(self) -> float:
+        """Usable length of the flight, s."""
+        return sum(stop - start for start, stop in self.segments) * self.Ts

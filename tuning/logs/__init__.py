@@ -1,0 +1,1 @@
+"""Readers that turn flight logs into `tuning.experiment.Experiment`."""

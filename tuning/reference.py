@@ -1,0 +1,99 @@
+"""Reference models: what each closed loop is asked to look like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter
+
+from tuning.errors import TuningError
+
+
+@dataclass(frozen=True)
+class ReferenceModel:
+    """Scalar discrete transfer function num(z)/den(z) times z^-delay.
+
+    Attributes
+    ----------
+    num, den : tuple of float
+        Coefficients of descending powers of z; den[0] = 1 and len(num) <= len(den).
+    delay : int, samples
+        Extra dead time.
+    Ts : float, s
+        Sampling period.
+    label : str
+        How it was specified, for reports and provenance.
+    """
+
+    num: tuple[float, ...]
+    den: tuple[float, ...]
+    delay: int
+    Ts: float
+    label: str = ""
+
+    @property
+    def taps(self) -> NDArray[np.float64]:
+        """Numerator in powers of z^-1, aligned with `den` and with the delay in front, for `lfilter`."""
+        lag = len(self.den) - len(self.num) + self.delay
+        return np.concatenate([np.zeros(lag), self.num])
+
+    def response(self, signal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Output of the model, from rest, along axis 0.
+
+        Parameters
+        ----------
+        signal : (N,) or (N, n) array
+            Input, each column by itself.
+        """
+        filtered: NDArray[np.float64] = lfilter(self.taps, self.den, signal, axis=0)
+        return filtered
+
+    def frequency_response(self, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Value at z = exp(j omega Ts); omega in rad/s."""
+        z = np.exp(1j * np.asarray(omega) * self.Ts)
+        value: NDArray[np.complex128] = np.polyval(self.num, z) / np.polyval(self.den, z) * z ** -float(self.delay)
+        return value
+
+    def settling_samples(self, fraction: float = 0.01) -> int:
+        """Samples after which the model's transient has fallen below `fraction`."""
+        slowest = float(np.max(np.abs(np.roots(self.den))))
+        if slowest >= 1:
+            raise TuningError(f"reference model {self.label}: pole at {slowest:.4g}, expected inside the unit circle")
+        decay = 0 if slowest == 0 else int(np.ceil(np.log(fraction) / np.log(slowest)))
+        return decay + self.delay + len(self.den)
+
+
+def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceModel:
+    """Zero-order-hold discretisation of omega^2/(s^2 + 2 zeta omega s + omega^2), times z^-delay.
+
+    Parameters
+    ----------
+    omega : float, rad/s
+        Natural frequency.
+    zeta : float
+        Damping ratio.
+    delay : int, samples
+        Extra dead time.
+    Ts : float, s
+        Sampling period.
+
+    Raises
+    ------
+    TuningError
+        When omega or zeta is not positive, omega is above Nyquist, or the delay is negative.
+    """
+    if not (0 < omega < np.pi / Ts and zeta > 0 and delay >= 0):
+        raise TuningError(
+            f"reference model: got omega {omega} rad/s, damping {zeta}, delay {delay}; "
+            f"expected 0 < omega < {np.pi / Ts:.4g} rad/s, damping > 0, delay >= 0 samples"
+        )
+    num, den, _ = cont2discrete(([omega**2], [1, 2 * zeta * omega, omega**2]), Ts, method="zoh")
+    return ReferenceModel(
+        tuple(float(b) for b in num[0][1:]),
+        tuple(float(a) for a in den),
+        int(delay),
+        Ts,
+        label=f"{omega:g} rad/s, {zeta:g}, {delay:d}",
+    )
