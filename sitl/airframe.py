@@ -1,0 +1,208 @@
+"""Airframes: a TOML file each; every physical constant is a line that a user can replace."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from sitl.allocation import Allocation, make_allocation, moment_scale
+from sitl.errors import SitlError
+from sitl.plant import PlantParameters, checked_inertia
+from tuning.gains import Gains, load_gains
+
+FOLDER = Path(__file__).resolve().parent / "airframes"
+
+Vector = tuple[float, float, float]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Rotor(_Table):
+    """One rotor: position (m, FRD, from the reference point) and direction of rotation seen from above."""
+
+    position: Vector
+    direction: Literal["cw", "ccw"]
+
+
+class Motors(_Table):
+    """Constants shared by all motors; units as in `sitl.plant.PlantParameters`."""
+
+    thrust_max: Positive
+    time_constant: Positive
+    thrust_coefficient: Positive
+    torque_ratio: Positive
+
+
+class PointMass(_Table):
+    """Something attached: mass (kg) and position (m, FRD, from the reference point)."""
+
+    mass: Positive
+    position: Vector
+
+
+class Noise(_Table):
+    """Standard deviation of the state estimate: angle (rad) and body rate (rad/s)."""
+
+    angle: NotNegative
+    rate: NotNegative
+
+
+class Airframe(_Table):
+    """A vehicle as its TOML file describes it.
+
+    Attributes
+    ----------
+    name, description : str
+    mass : float, kg
+        Without point masses.
+    inertia : 3x3, kg m^2
+        Tensor about the reference point, which is the centre of gravity without point masses.
+    rate_damping : float, 1/s
+        Damping moment is this times the diagonal of the inertia times the rate.
+    drag : float, N s/m
+    airmode : bool
+        See `sitl.allocation`.
+    computing_delay : int, samples
+        Whole control periods between a measurement and the motor command made from it.
+    gains : str
+        The gains file that it flies under until tuned, beside the TOML file.
+    motors, rotors, noise, point_masses
+        See their classes.
+    """
+
+    name: str
+    description: str = ""
+    mass: Positive
+    inertia: tuple[Vector, Vector, Vector]
+    rate_damping: NotNegative
+    drag: NotNegative
+    airmode: bool
+    computing_delay: Annotated[int, Field(ge=0, le=50)]
+    gains: str
+    motors: Motors
+    rotors: Annotated[tuple[Rotor, ...], Field(min_length=4, max_length=16)]
+    noise: Noise
+    point_masses: tuple[PointMass, ...] = ()
+
+    def geometry(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Rotor positions (n, 3), m, from the reference point, and spin (n,)."""
+        spin = np.array([1.0 if rotor.direction == "ccw" else -1.0 for rotor in self.rotors])
+        return np.array([rotor.position for rotor in self.rotors]), spin
+
+    def moment_scale(self) -> Vector:
+        """N m that u = 1 stands for on roll, pitch, yaw, for this vehicle's allocator."""
+        rotors, spin = self.geometry()
+        roll, pitch, yaw = moment_scale(rotors, spin, self.motors.thrust_max, self.motors.torque_ratio)
+        return float(roll), float(pitch), float(yaw)
+
+    def allocation(self) -> Allocation:
+        """Mixer of the autopilot host: made from the geometry, it knows nothing of point masses."""
+        rotors, spin = self.geometry()
+        return make_allocation(rotors, spin, self.motors.thrust_max, self.motors.torque_ratio, self.airmode)
+
+    def plant(self) -> PlantParameters:
+        """Physical constants about the true centre of gravity, point masses included."""
+        rotors, spin = self.geometry()
+        mass, centre, inertia = combine_masses(self.mass, np.array(self.inertia), self.point_masses)
+        return PlantParameters(
+            mass=mass,
+            inertia=inertia,
+            inertia_inverse=np.linalg.inv(inertia),
+            rotors=np.ascontiguousarray(rotors - centre),
+            spin=spin,
+            thrust_max=self.motors.thrust_max,
+            thrust_coefficient=self.motors.thrust_coefficient,
+            torque_ratio=self.motors.torque_ratio,
+            motor_time_constant=self.motors.time_constant,
+            rate_damping=self.rate_damping * np.diag(np.array(self.inertia)).copy(),
+            drag=self.drag,
+            wind=np.zeros(3),
+        )
+
+
+def combine_masses(
+    mass: float, inertia: NDArray[np.float64], added: tuple[PointMass, ...]
+) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+    """A body and point masses as one body (parallel-axis theorem).
+
+    Parameters
+    ----------
+    mass : float, kg
+        Of the body, whose centre of gravity is the reference point.
+    inertia : (3, 3) array, kg m^2
+        Of the body, about the reference point.
+    added : tuple of PointMass
+        What is attached.
+
+    Returns
+    -------
+    mass : float, kg
+    centre : (3,) array, m
+        New centre of gravity, from the reference point.
+    inertia : (3, 3) array, kg m^2
+        About the new centre of gravity.
+    """
+    masses = np.array([mass, *(item.mass for item in added)])
+    places = np.array([(0.0, 0.0, 0.0), *(item.position for item in added)])
+    centre = masses @ places / masses.sum()
+    total = np.array(inertia, dtype=np.float64)
+    for m, r in zip(masses, places - centre, strict=True):
+        total = total + m * (r @ r * np.eye(3) - np.outer(r, r))
+    return float(masses.sum()), centre, total
+
+
+@dataclass(frozen=True, eq=False)
+class Vehicle:
+    """An airframe and where its file is: what commands work with."""
+
+    airframe: Airframe
+    path: Path
+
+    def default_gains(self) -> Gains:
+        """The gains that the airframe's file names."""
+        return load_gains(self.path.parent / self.airframe.gains)
+
+
+def known_airframes() -> list[str]:
+    """Names of the airframes that come with mimopilot."""
+    return sorted(path.stem for path in FOLDER.glob("*.toml") if not path.name.endswith(".gains.toml"))
+
+
+def load_airframe(name_or_path: str) -> Vehicle:
+    """Load an airframe by name, or by the path of a TOML file.
+
+    Raises
+    ------
+    SitlError
+        When the name is unknown (listing the known ones) or the file is not a valid airframe.
+    """
+    path = FOLDER / f"{name_or_path}.toml"
+    if name_or_path not in known_airframes():
+        path = Path(name_or_path)
+        if not path.is_file():
+            raise SitlError(
+                f"unknown airframe {name_or_path!r}: neither a file nor one of {', '.join(known_airframes())}"
+            )
+    try:
+        airframe = Airframe.model_validate(tomllib.loads(path.read_text()))
+        checked_inertia(airframe.inertia)
+        airframe.allocation()
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SitlError(f"{path}: not an airframe file: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise SitlError(f"{path}: {where}: {first['msg']}, got {first.get('input')!r}") from error
+    except SitlError as error:
+        raise SitlError(f"{path}: {error}") from error
+    return Vehicle(airframe, path)

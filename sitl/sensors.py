@@ -1,0 +1,46 @@
+"""What the autopilot is told of the vehicle's state: the estimate, with noise, rounded as the wire rounds it.
+
+A measurement is an array of nine numbers: quaternion (w, x, y, z) and body rates (rad/s), each a
+single-precision value, then altitude in whole millimetres and climb rate in whole cm/s, just what one
+HIL_STATE_QUATERNION message carries. The in-process loop rounds the same way, so both fly the same bits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sitl.compiled import compiled
+
+SIZE = 9
+NOISES = 6
+
+
+@compiled
+def measure(state, noise, angle_deviation, rate_deviation, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (9,) from the true state and six standard normal numbers (angles, then rates)."""
+    w, x, y, z = state[6], state[7], state[8], state[9]
+    a, b, c = 0.5 * angle_deviation * noise[0], 0.5 * angle_deviation * noise[1], 0.5 * angle_deviation * noise[2]
+    # A small rotation about the body axes, 1 + (a, b, c), then back to length one.
+    qw, qx = w - x * a - y * b - z * c, x + w * a + y * c - z * b
+    qy, qz = y + w * b + z * a - x * c, z + w * c + x * b - y * a
+    scale = 1.0 / np.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
+    out[0], out[1], out[2], out[3] = (
+        np.float32(qw * scale),
+        np.float32(qx * scale),
+        np.float32(qy * scale),
+        np.float32(qz * scale),
+    )
+    for i in range(3):
+        out[4 + i] = np.float32(state[10 + i] + rate_deviation * noise[3 + i])
+    out[7] = np.round(-1000.0 * state[2])
+    out[8] = np.round(-100.0 * state[5])
+
+
+@compiled
+def euler_angles(w, x, y, z):  # type: ignore[no-untyped-def]
+    """Roll, pitch and yaw (rad) of the aeronautical 3-2-1 sequence."""
+    return (
+        np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        np.arcsin(min(max(2.0 * (w * y - z * x), -1.0), 1.0)),
+        np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )

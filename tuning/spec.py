@@ -1,0 +1,128 @@
+"""What to tune for: reference models, method, and what the log does not say. TOML in, validated."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+from tuning.errors import TuningError
+from tuning.reference import ReferenceModel, second_order
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Model = tuple[Positive, Positive, Annotated[int, Field(ge=0)]]
+Triple = tuple[Positive, Positive, Positive]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class YawSpec(_Table):
+    """Yaw gains, for logs that do not hold them; names as in `tuning.gains.YawGains`."""
+
+    Kp_o: Finite
+    Kp_i: Finite
+    Ki_i: Finite
+    Kd_i: Finite
+    Kff_i: Finite = 0.0
+
+
+class LimitsSpec(_Table):
+    """Saturations; names and units as in `tuning.gains.Limits`."""
+
+    rate_max: Triple
+    moment_max: Triple
+    integral_max: Triple
+
+
+class TuningSpec(_Table):
+    """One tuning task.
+
+    Attributes
+    ----------
+    method : str
+        ``mimo``: full matrices. ``siso``: each axis by itself.
+    inner, outer : tuple of (omega rad/s, damping, delay samples)
+        Reference models of the rate and the attitude loop: one for both axes, or one each.
+    window : int or None, samples
+        Lags of the instrument; None: from the reference model.
+    weight : str
+        Of the equations of the instruments: ``optimal`` is (3.30), in two steps; ``identity`` is plain least
+        squares, with about twice the spread of Ki on recorded flights.
+    derivative_cutoff_hz : float or None, Hz
+        Of the derivative filter that will fly; None: as flown.
+    moment_scale : tuple of 3 float or None, N m
+        What one unit of u stands for; None: as logged.
+    yaw, limits
+        None: as flown.
+    """
+
+    method: Literal["mimo", "siso"] = "mimo"
+    inner: tuple[Model, Model] = ((20.0, 0.4, 0), (20.0, 0.4, 0))
+    outer: tuple[Model, Model] = ((10.0, 0.7, 0), (10.0, 0.7, 0))
+    window: Annotated[int, Field(ge=1)] | None = None
+    weight: Literal["identity", "optimal"] = "optimal"
+    derivative_cutoff_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
+    moment_scale: Triple | None = None
+    yaw: YawSpec | None = None
+    limits: LimitsSpec | None = None
+
+    @field_validator("inner", "outer", mode="before")
+    @classmethod
+    def _one_model_for_both_axes(cls, value: object) -> object:
+        if isinstance(value, list | tuple) and len(value) == 3 and not isinstance(value[0], list | tuple):
+            return (tuple(value), tuple(value))
+        return tuple(tuple(v) if isinstance(v, list) else v for v in value) if isinstance(value, list) else value
+
+    def models(self, loop: Literal["inner", "outer"], Ts: float) -> list[ReferenceModel]:
+        """Reference models of a loop, roll then pitch."""
+        return [second_order(omega, zeta, delay, Ts) for omega, zeta, delay in getattr(self, loop)]
+
+
+def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
+    """A specification from a TOML file, with the given entries replaced (None: not given).
+
+    Raises
+    ------
+    TuningError
+        When the file cannot be read, is not TOML, or holds an unknown or impossible entry.
+    """
+    table: dict[str, object] = {}
+    if path is not None:
+        try:
+            table = tomllib.loads(path.read_text())
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise TuningError(f"{path}: cannot read the specification: {error}") from error
+    table |= {name: value for name, value in overrides.items() if value is not None}
+    try:
+        return TuningSpec.model_validate(table)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise TuningError(f"{path or 'specification'}: {where}: {first['msg']}, got {first.get('input')!r}") from error
+
+
+def parse_model(text: str) -> tuple[float, float, int]:
+    """``OMEGA,ZETA,DELAY`` (rad/s, damping, samples) as it stands on the command line.
+
+    Raises
+    ------
+    TuningError
+        When it is not two or three numbers.
+
+    Examples
+    --------
+    >>> parse_model("20,0.4,0")
+    (20.0, 0.4, 0)
+    """
+    parts = text.split(",")
+    try:
+        if len(parts) not in (2, 3):
+            raise ValueError
+        return float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
+    except ValueError:
+        raise TuningError(f"reference model: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0") from None

@@ -1,0 +1,261 @@
+"""Multivariable Virtual Reference Feedback Tuning of one loop, with extended instrumental variables.
+
+Given one experiment {u, y} and a diagonal reference model M, the controller C(B) that would make the closed
+loop look like M is the one that turns the virtual error e_V = (M^-1 - I) y into u. All signals pass one
+scalar filter l, so that nothing improper is ever computed; the controller is linear in its gains, and the
+instrument is an external signal of the experiment at 2 l + 1 lags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, cholesky, lstsq
+
+from tuning.controller import filtered_derivative
+from tuning.correlations import autocorrelation, cross_correlation
+from tuning.errors import TuningError
+from tuning.reference import ReferenceModel
+
+TERMS = "PIDF"
+#: Diagonal loading of the residual covariance: the instruments at neighbouring lags are almost the same.
+LOADING = 1e-3
+
+Signal = NDArray[np.float64]
+Segments = Sequence[tuple[int, int]]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopEstimate:
+    """Gains of one loop, by term.
+
+    Attributes
+    ----------
+    gains : dict
+        Term (``P``, ``I``, ``D``, ``F``) -> (n_u, n_y) array.
+    deviations : dict
+        The same for their standard deviations.
+    samples : int
+        Samples used.
+    window : int
+        Lags l of the instrument.
+    """
+
+    gains: dict[str, Signal]
+    deviations: dict[str, Signal]
+    samples: int
+    window: int
+
+    def gain(self, term: str) -> Signal:
+        """Matrix of a term; zeros when the structure does not have it."""
+        first = next(iter(self.gains.values()))
+        return self.gains.get(term, np.zeros_like(first))
+
+
+def default_window(models: Sequence[ReferenceModel]) -> int:
+    """Lags of the instrument: long enough for the slowest reference model to decay to 10 %."""
+    return max(model.settling_samples(0.1) for model in models)
+
+
+def virtual_signals(
+    y: Signal, models: Sequence[ReferenceModel]
+) -> tuple[Signal, Signal, Signal, list[ReferenceModel]]:
+    """e_l, r_l and y_l for the filter l = product of the distinct models.
+
+    Returns
+    -------
+    e_l, r_l, y_l : (N, n_y) arrays
+        l (M^-1 - I) y, l M^-1 y and l y, in the unit of `y`.
+    factors : list of ReferenceModel
+        The models whose product is l.
+    """
+    factors: list[ReferenceModel] = []
+    for model in models:
+        if model not in factors:
+            factors.append(model)
+    virtual = np.empty_like(y)
+    for j, model in enumerate(models):
+        signal = y[:, j]
+        for factor in factors:
+            if factor != model:
+                signal = factor.response(signal)
+        virtual[:, j] = signal
+    filtered = filter_by(y, factors)
+    return virtual - filtered, virtual, filtered, factors
+
+
+def filter_by(signal: Signal, factors: Sequence[ReferenceModel]) -> Signal:
+    """The scalar filter l on every column."""
+    for factor in factors:
+        signal = factor.response(signal)
+    return signal
+
+
+def regressors(
+    terms: str, e_l: Signal, y_l: Signal, r_l: Signal, Ts: float, derivative_cutoff_hz: float
+) -> Signal:
+    """The regressor x(k) of the flown difference equation, one column a gain: P, I, D, F as `terms` has them.
+
+    Parameters
+    ----------
+    terms : str
+        Letters of ``PIDF``, in that order.
+    e_l, y_l, r_l : (N, n) arrays
+        Error, output and reference, all filtered by l.
+    Ts : float, s
+        Sampling period.
+    derivative_cutoff_hz : float, Hz
+        Of the flown derivative filter.
+
+    Returns
+    -------
+    (N, n len(terms)) array
+    """
+    columns = {
+        "P": lambda: e_l,
+        "I": lambda: Ts * np.cumsum(e_l, axis=0),
+        "D": lambda: -filtered_derivative(y_l, Ts, derivative_cutoff_hz),
+        "F": lambda: r_l,
+    }
+    return np.hstack([columns[term]() for term in terms])
+
+
+def vrft(
+    u: Signal,
+    y: Signal,
+    instrument: Signal,
+    models: Sequence[ReferenceModel],
+    terms: str,
+    *,
+    segments: Segments | None = None,
+    window: int | None = None,
+    derivative_cutoff_hz: float = 0.0,
+    settling: int = 0,
+    weight: str = "optimal",
+) -> LoopEstimate:
+    """Gains that bring the closed loop closest to the reference model.
+
+    Parameters
+    ----------
+    u : (N, n_u) array
+        Input of the plant that the controller makes.
+    y : (N, n_y) array
+        Output of the plant.
+    instrument : (N, n_w) array
+        External signal: the injected excitation, or the set-point.
+    models : sequence of n_y ReferenceModel
+        Wanted complementary sensitivity of each output.
+    terms : str
+        Structure of the controller: ``P``, ``PI``, ``PID``, ``PIDF``...
+    segments : sequence of (start, stop), optional
+        Stretches without a gap; all of the data by default. Filters start anew and a constant (trim and
+        initial integrator) is estimated on each.
+    window : int, optional
+        Lags l of the instrument; see `default_window`.
+    derivative_cutoff_hz : float, Hz
+        Of the flown derivative filter.
+    settling : int, samples
+        Further samples to drop at the start of each segment.
+    weight : str
+        ``identity``: least squares on the correlations, (3.28). ``optimal``: (3.30), in two steps.
+
+    Returns
+    -------
+    LoopEstimate
+
+    Raises
+    ------
+    TuningError
+        When a segment is too short, a model's period differs, or the regressors are not excited.
+    """
+    letters = [term for term in TERMS if term in terms]
+    if not letters or len(letters) != len(terms) or weight not in ("optimal", "identity"):
+        raise TuningError(f"terms {terms!r}, weight {weight!r}: expected letters of {TERMS}, and optimal or identity")
+    if len(models) != y.shape[1]:
+        raise TuningError(f"got {len(models)} reference models for {y.shape[1]} outputs")
+    lags = default_window(models) if window is None else window
+    Ts = models[0].Ts
+    drop = settling + sum(model.settling_samples() for model in dict.fromkeys(models))
+    xs, us, ws = [], [], []
+    for start, stop in segments or [(0, len(u))]:
+        if stop - start < drop + 4 * lags:
+            continue
+        e_l, r_l, y_l, factors = virtual_signals(y[start:stop], models)
+        x = regressors("".join(letters), e_l, y_l, r_l, Ts, derivative_cutoff_hz)[drop:]
+        u_l = filter_by(u[start:stop], factors)[drop:]
+        # The constant is regressor and instrument at once: taking the mean off both is the same.
+        xs.append(x - x.mean(axis=0))
+        us.append(u_l - u_l.mean(axis=0))
+        ws.append(filter_by(instrument[start:stop], factors)[drop:])
+    if not xs:
+        raise TuningError(
+            f"too short: no stretch without a gap is longer than {(drop + 4 * lags) * Ts:.2f} s, which these reference "
+            "models need; record a longer flight, or ask for faster models"
+        )
+    return _solve(xs, us, ws, lags, "".join(letters), y.shape[1], weight)
+
+
+def _solve(
+    xs: list[Signal], us: list[Signal], ws: list[Signal], lags: int, terms: str, n_y: int, weight: str
+) -> LoopEstimate:
+    samples = sum(len(x) for x in xs)
+
+    def correlate(signals: list[Signal]) -> Signal:
+        total = sum(cross_correlation(w, s, lags) for w, s in zip(ws, signals, strict=True))
+        return np.reshape(total, (-1, signals[0].shape[1])) / samples
+
+    scale = np.sqrt(sum((x**2).sum(axis=0) for x in xs) / samples)
+    if not (scale > 0).all():
+        raise TuningError("not excited: a measured signal is constant, so its gains cannot be found")
+    S, Q = correlate(xs) / scale, correlate(us)
+    B, _, rank, _ = lstsq(S, Q)
+    if rank < S.shape[1]:
+        raise TuningError("not excited: the injected signal does not reach every axis, so some gains cannot be found")
+    covariance = np.empty((Q.shape[1], S.shape[1]))
+    for row in range(Q.shape[1]):
+        gamma = _residual_covariance(xs, us, ws, B[:, row] / scale, row, lags)
+        if weight == "optimal":
+            factor = (cholesky(gamma, lower=True), True)
+            solved = cho_solve(factor, S)
+            normal = np.linalg.inv(S.T @ solved)
+            B[:, row] = normal @ (solved.T @ Q[:, row])
+            covariance[row] = np.diag(normal) / samples
+        else:
+            H = np.linalg.pinv(S)
+            covariance[row] = np.einsum("ij,jk,ik->i", H, gamma, H) / samples
+    gains = (B / scale[:, None]).T
+    deviations = np.sqrt(covariance) / scale
+    split = {term: slice(i * n_y, (i + 1) * n_y) for i, term in enumerate(terms)}
+    return LoopEstimate(
+        {term: gains[:, columns] for term, columns in split.items()},
+        {term: deviations[:, columns] for term, columns in split.items()},
+        samples,
+        lags,
+    )
+
+
+def _residual_covariance(
+    xs: list[Signal], us: list[Signal], ws: list[Signal], b: Signal, row: int, lags: int
+) -> Signal:
+    """Newey-West covariance of zeta(k) eps(k), Gamma of (3.30), for one row of the controller.
+
+    The residual is independent of the external instrument, so the covariance at lag h is the product of
+    their autocorrelations and Gamma is block Toeplitz: sum over h of R_eps(h) R_w(h + tau_1 - tau_2).
+    """
+    samples = sum(len(x) for x in xs)
+    eps = [(u[:, row] - x @ b)[:, None] for u, x in zip(us, xs, strict=True)]
+    taper = 1 - np.abs(np.arange(-lags, lags + 1)) / (lags + 1)
+    R_eps = sum(autocorrelation(e, lags) for e in eps)[:, 0, 0] / samples * taper
+    R_w = sum(autocorrelation(w, 3 * lags) for w in ws) / samples
+    n_w = R_w.shape[1]
+    blocks = np.empty((4 * lags + 1, n_w, n_w))
+    for i in range(n_w):
+        for j in range(n_w):
+            blocks[:, i, j] = np.convolve(R_w[:, i, j], R_eps[::-1], "valid")
+    difference = np.arange(2 * lags + 1)[:, None] - np.arange(2 * lags + 1)[None, :]
+    gamma = blocks[difference + 2 * lags].transpose(0, 2, 1, 3).reshape((2 * lags + 1) * n_w, -1)
+    gamma = (gamma + gamma.T) / 2
+    return gamma + LOADING * np.trace(gamma) / len(gamma) * np.eye(len(gamma))
