@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.errors import CodegenError
+from tuning.flown import SCALE
 from tuning.gains import AXES, LIMITS, MATRICES, PARAMETER_PREFIX, Gains
 
 AXIS_NAMES = dict(zip("RPY", AXES, strict=True))
@@ -83,7 +84,20 @@ PARAMETERS: tuple[Parameter, ...] = (
     Parameter("MIMO_TS", "TS", "s", 1e-4, 1.0, False, "control period, fixed in the firmware"),
 )
 
+#: What a vehicle publishes beside them, so that gains made for another unit of moment are noticed.
+IDENTITY: tuple[Parameter, ...] = tuple(
+    Parameter(
+        f"{PARAMETER_PREFIX}{SCALE}_{axis}", f"{SCALE}_{axis}", "N m", 0.0, 1e6, False, f"moment of u = 1, {AXIS_NAMES[axis]}"
+    )
+    for axis in "RPY"
+)
+
 BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
+
+
+def identity_parameters(gains: Gains) -> dict[str, float]:
+    """Name -> value of `IDENTITY`; empty when the gains do not say their unit of moment."""
+    return {p.name: value for p, value in zip(IDENTITY, gains.moment_scale or (), strict=False)}
 
 
 def check_ranges(gains: Gains) -> None:

@@ -96,6 +96,17 @@ def hover(axis: str, period: float, Ts: float) -> Scenario:
     return Scenario("hover", Ts, setpoint, np.zeros_like(setpoint), _axis_index(axis), (0, len(setpoint)))
 
 
+def make_scenario(name: str, axis: str, amplitude_deg: float, period: float, Ts: float) -> Scenario:
+    """A scenario by name: ``doublet``, ``step`` or ``hover``; amplitude in degrees, period in seconds."""
+    if name == "doublet":
+        return doublet(axis, float(np.radians(amplitude_deg)), period, Ts)
+    if name == "step":
+        return step(axis, float(np.radians(amplitude_deg)), period, Ts)
+    if name == "hover":
+        return hover(axis, period, Ts)
+    raise SitlError(f"scenario: got {name!r}, expected doublet, step or hover")
+
+
 def excitation_flight(
     seconds_per_axis: float, amplitude: float, bandwidth: float, Ts: float, generator: np.random.Generator
 ) -> Scenario:

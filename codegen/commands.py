@@ -1,0 +1,27 @@
+"""The commands of this room."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add this room's commands to the front door."""
+    app.command(epilog="Example: mimopilot generate my.gains.toml --target native --out firmware")(generate)
+
+
+def generate(
+    gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
+    out: Annotated[Path, typer.Option(help="Folder to write to; changed files are replaced, nothing is deleted.")],
+    target: Annotated[str, typer.Option(help="native: the controller, a C interface and tests for this machine.")] = "native",
+) -> None:
+    """Emit the C++ controller with its gains, parameter table, build files and tests."""
+    from codegen.render import render, write_tree
+    from tuning.gains import load_gains
+
+    files = render(load_gains(gains), target)
+    written = write_tree(files, out)
+    print(f"{out}: {len(files)} files, {len(written)} written, {len(files) - len(written)} unchanged")

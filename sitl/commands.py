@@ -1,0 +1,157 @@
+"""The commands of this room."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+AirframeArgument = Annotated[str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, or a TOML file.")]
+GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
+SeedOption = Annotated[int, typer.Option(help="Seed of all randomness.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add this room's commands to the front door."""
+    app.command(epilog="Example: mimopilot experiment adam0 --seed 1 --out flight.ulg")(experiment)
+    app.command(epilog="Example: mimopilot fly adam0 --gains my.gains.toml --axis roll --json")(fly)
+    app.command(epilog="Example: mimopilot sitl adam0 --gains my.gains.toml, then mavproxy.py --master=udp:127.0.0.1:14550")(sitl)
+    app.command(epilog="Example: mimopilot plant adam0 --port 4560")(plant)
+
+
+def _load(airframe: str, gains: Path | None) -> tuple[Any, Any]:
+    from sitl.airframe import load_airframe
+    from tuning.gains import load_gains
+
+    vehicle = load_airframe(airframe)
+    return vehicle.airframe, load_gains(gains) if gains else vehicle.default_gains()
+
+
+def experiment(
+    airframe: AirframeArgument,
+    out: Annotated[Path, typer.Option(help="Log to write (ULog, .ulg).")],
+    gains: GainsOption = None,
+    seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
+    amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
+    bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,
+    seed: SeedOption = 0,
+) -> None:
+    """Fly with a pseudo-random moment injected on roll, then on pitch, and log it."""
+    import numpy as np
+
+    from sitl.autopilot import Autopilot
+    from sitl.errors import SitlError
+    from sitl.loop import fly as fly_scenario
+    from sitl.recorder import save_flight
+    from sitl.scenario import excitation_flight
+
+    body, controller = _load(airframe, gains)
+    scenario = excitation_flight(seconds_per_axis, amplitude, bandwidth, controller.Ts, np.random.default_rng(seed))
+    flight = fly_scenario(body, Autopilot(body, controller), scenario, seed)
+    save_flight(out, flight, body, controller)
+    tilt = np.degrees(np.abs(flight.truth["attitude"][:, :2]).max(axis=0))
+    print(f"{out}: {len(flight.record) * controller.Ts:.1f} s, largest roll {tilt[0]:.1f} deg, pitch {tilt[1]:.1f} deg")
+    if flight.crashed_at is not None:
+        raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s; lower --amplitude", exit_code=1)
+
+
+def fly(
+    airframe: AirframeArgument,
+    gains: GainsOption = None,
+    scenario: Annotated[str, typer.Option(help="doublet, step or hover.")] = "doublet",
+    axis: Annotated[str, typer.Option(help="roll or pitch.")] = "roll",
+    amplitude_deg: Annotated[float, typer.Option(help="Of the doublet or step, degrees.")] = 22.5,
+    period_s: Annotated[float, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.")] = 0.42,
+    seed: SeedOption = 0,
+    out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly the generated C++ in process and print how well it followed."""
+    from dataclasses import asdict
+
+    from sitl.autopilot import Autopilot
+    from sitl.errors import SitlError
+    from sitl.loop import fly as fly_scenario
+    from sitl.metrics import performance
+    from sitl.models import reference_models
+    from sitl.recorder import save_flight
+    from sitl.scenario import make_scenario
+    from tuning.output import print_json, print_table
+
+    body, controller = _load(airframe, gains)
+    task = make_scenario(scenario, axis, amplitude_deg, period_s, controller.Ts)
+    flight = fly_scenario(body, Autopilot(body, controller), task, seed)
+    inner, outer = reference_models(controller, task.axis)
+    figures: dict[str, Any] = {**asdict(performance(flight, inner, outer)), "crashed_at_s": flight.crashed_at}
+    if out is not None:
+        save_flight(out, flight, body, controller)
+    if as_json:
+        print_json({"airframe": body.name, "scenario": scenario, "axis": axis, "seed": seed, **figures})
+    else:
+        rows = [[name, "-" if value is None else f"{value:.5g}"] for name, value in figures.items()]
+        title = f"{body.name}, {scenario} on {axis}, against {inner.label} (inner) and {outer.label} (outer)"
+        print_table(title, ["figure", "value"], rows)
+    if flight.crashed_at is not None:
+        raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s", exit_code=1)
+
+
+def sitl(
+    airframe: AirframeArgument,
+    gains: GainsOption = None,
+    port: Annotated[int, typer.Option(help="TCP port of the plant (PX4's simulator API).")] = 4560,
+    ground_port: Annotated[int, typer.Option(help="UDP port where the ground station listens.")] = 14550,
+    speed: Annotated[float, typer.Option(help="Times real time.")] = 1.0,
+    seed: SeedOption = 0,
+) -> None:
+    """Run the vehicle as two processes that talk MAVLink, for a ground station. Ctrl-C ends it."""
+    from sitl.autopilot import Autopilot
+    from sitl.mavlink.ground import Ground
+    from sitl.mavlink.host import Host, plant_process
+    from sitl.mavlink.parameter_server import ParameterServer
+
+    body, controller = _load(airframe, gains)
+    autopilot = Autopilot(body, controller)
+    autopilot.warm_up()
+    ground = Ground(ParameterServer(autopilot.controller, controller), ground_port)
+    with plant_process(airframe, port, controller.Ts, seed, speed) as plant_port:
+        host = Host(autopilot, len(body.rotors), plant_port)
+        print(f"{body.name} flies: plant on TCP {plant_port}, ground station on UDP {ground_port}; Ctrl-C ends", flush=True)
+        try:
+            host.run(ground)
+        except KeyboardInterrupt:
+            print("ended")
+        finally:
+            host.close()
+            ground.close()
+
+
+def plant(
+    airframe: AirframeArgument,
+    port: Annotated[int, typer.Option(help="TCP port to listen on; 0: any free one.")] = 4560,
+    rate: Annotated[float, typer.Option(help="Frames a second (the autopilot's control rate), Hz.")] = 250.0,
+    speed: Annotated[str, typer.Option(help="Times real time, or max.")] = "1",
+    seed: SeedOption = 0,
+) -> None:
+    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot."""
+    from sitl.airframe import load_airframe
+    from sitl.errors import SitlError
+    from sitl.mavlink.link import LOOPBACK, listen
+    from sitl.mavlink.simulator import PlantServer
+
+    try:
+        times = None if speed == "max" else float(speed)
+        if rate <= 0 or (times is not None and times <= 0):
+            raise ValueError
+    except ValueError:
+        raise SitlError(f"--rate {rate}, --speed {speed}: expected numbers above 0, or max for the speed") from None
+    server = PlantServer(load_airframe(airframe).airframe, 1 / rate, seed, times)
+    with listen(LOOPBACK, port) as socket:
+        print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
+        try:
+            connection, _ = socket.accept()
+            with connection:
+                server.serve(connection)
+        except KeyboardInterrupt:
+            pass

@@ -1,0 +1,103 @@
+"""Figures as a control engineer draws them, as self-contained SVG. Colours survive colour-blindness and print."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from sitl.loop import Flight
+from sitl.metrics import reference_responses
+from tuning.reference import ReferenceModel
+
+AXES = ("roll", "pitch")
+#: Okabe-Ito colours, each with a line style of its own.
+STYLES: tuple[tuple[str, str], ...] = (("#D55E00", ":"), ("#0072B2", "--"), ("#009E73", "-"), ("#CC79A7", "-."))
+MODEL = {"color": "#888888", "linewidth": 3.0, "alpha": 0.6}
+SETPOINT = {"color": "black", "linewidth": 1.0}
+
+
+def svg(figure: Figure, name: str) -> str:
+    """The figure as SVG text; the same data give the same bytes. `name` keeps ids apart within one page."""
+    buffer = io.StringIO()
+    with matplotlib.rc_context({"svg.hashsalt": f"mimopilot {name}"}):
+        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer: ReferenceModel) -> Figure:
+    """One manoeuvre under several gain sets: angle, off-axis angle, rate and moment over time.
+
+    Parameters
+    ----------
+    flights : mapping
+        Label -> flight; all of the same scenario.
+    inner, outer : ReferenceModel
+        Of the rate and the attitude loop.
+    """
+    first = next(iter(flights.values()))
+    scenario, axis = first.scenario, first.scenario.axis
+    other = 1 - axis
+    time = (np.arange(len(first.record)) - scenario.window[0]) * scenario.Ts
+    shown = time >= -0.1
+    figure = Figure(figsize=(9, 9.5), layout="constrained")
+    panels: Any = figure.subplots(4, 1, sharex=True)
+    model, _ = reference_responses(first, inner, outer)
+    panels[0].step(time, np.degrees(first.record["setpoint"][:, axis]), where="post", label="set-point", **SETPOINT)
+    panels[0].plot(time, np.degrees(model), label=f"reference model ({outer.label})", **MODEL)
+    for (label, flight), (colour, style) in zip(flights.items(), STYLES, strict=False):
+        line = {"color": colour, "linestyle": style, "linewidth": 1.6, "label": label}
+        panels[0].plot(time, np.degrees(flight.truth["attitude"][:, axis]), **line)
+        panels[1].plot(time, np.degrees(flight.truth["attitude"][:, other]), **line)
+        panels[2].plot(time, np.degrees(flight.truth["rates"][:, axis]), **line)
+        panels[3].step(time, flight.record["moment"][:, axis], where="post", **line)
+    for panel, text in zip(
+        panels,
+        (
+            f"{AXES[axis]} angle [deg]",
+            f"off-axis: {AXES[other]} [deg]",
+            f"{AXES[axis]} rate [deg/s]",
+            f"{AXES[axis]} moment u [-]",
+        ),
+        strict=True,
+    ):
+        panel.set_ylabel(text)
+        panel.grid(alpha=0.3)
+        panel.axvspan(0, (scenario.window[1] - scenario.window[0]) * scenario.Ts, color="#000000", alpha=0.04)
+    panels[0].legend(loc="upper right", fontsize=9, ncols=2)
+    panels[0].set_title(f"{AXES[axis].capitalize()} {scenario.name}", loc="left")
+    panels[3].set_xlabel("time from the start of the manoeuvre [s] (shaded: window of the figures)")
+    panels[3].set_xlim(time[shown][0], time[-1])
+    figure.align_ylabels(panels)
+    return figure
+
+
+def experiment_figure(flight: Flight) -> Figure:
+    """The closed-loop data set: injected and total moment, rates and angles of both axes."""
+    time = np.arange(len(flight.record)) * flight.scenario.Ts
+    record = flight.record
+    figure = Figure(figsize=(9, 7), layout="constrained")
+    panels: Any = figure.subplots(4, 1, sharex=True)
+    for axis, (colour, _) in enumerate((STYLES[1], STYLES[0])):
+        line = {"color": colour, "linewidth": 0.6, "label": AXES[axis]}
+        panels[0].step(time, record["excitation"][:, axis], where="post", **line)
+        panels[1].plot(time, record["moment"][:, axis], **line)
+        panels[2].plot(time, np.degrees(record["rates"][:, axis]), **line)
+        panels[3].plot(time, np.degrees(record["attitude"][:, axis]), **line)
+    names = ("injected moment [-]", "total moment u [-]", "body rate [deg/s]", "angle [deg]")
+    for panel, text in zip(panels, names, strict=True):
+        panel.set_ylabel(text)
+        panel.grid(alpha=0.3)
+    legend = panels[0].legend(loc="upper right", fontsize=9, ncols=2)
+    for handle in legend.get_lines():
+        handle.set_linewidth(2.0)
+    panels[0].set_title("Closed-loop experiment", loc="left")
+    panels[3].set_xlabel("time [s]")
+    panels[3].set_xlim(time[0], time[-1])
+    figure.align_ylabels(panels)
+    return figure

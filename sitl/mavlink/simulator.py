@@ -1,0 +1,154 @@
+"""The plant as a process of its own: PX4's simulator API over TCP, in lockstep.
+
+The autopilot connects; each period the plant sends HIL_SENSOR and HIL_STATE_QUATERNION, waits for
+HIL_ACTUATOR_CONTROLS and only then steps.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
+from sitl.airframe import Airframe
+from sitl.loop import Simulator
+from sitl.mavlink.link import Codec
+from sitl.plant import GRAVITY, advance
+from sitl.sensors import SIZE, measure
+
+FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is answered
+NOISE_BLOCK = 250
+EPOCH_US = 1_000_000
+HOME_LATITUDE, HOME_LONGITUDE = 473977420, 85455940  # 1e-7 deg
+METRES_PER_DEGREE = 111_319.5
+ALL_FIELDS = 7 | 56 | 448 | 6656  # accelerometer, gyro, magnetometer, barometer
+EARTH_FIELD = np.array([0.21, 0.01, 0.43])  # Gauss, NED
+
+
+class PlantServer:
+    """A simulated vehicle at one end of a TCP connection.
+
+    Parameters
+    ----------
+    airframe : Airframe
+        The vehicle.
+    Ts : float, s
+        Interval between frames.
+    seed : int
+        Of the measurement noise.
+    speed : float or None
+        Times real time; None: as fast as the autopilot answers.
+    """
+
+    def __init__(self, airframe: Airframe, Ts: float, seed: int, speed: float | None = 1.0) -> None:
+        self.simulator = Simulator(airframe, Ts, seed)
+        self.Ts, self.speed = Ts, speed
+        self.rotors = len(airframe.rotors)
+        self.codec = Codec(system=1, component=mavlink.MAV_COMP_ID_USER1)
+
+    def serve(self, connection: socket.socket) -> int:
+        """Fly until the autopilot goes away; returns the number of periods."""
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        answers = self._answers(connection)
+        measurement = np.zeros(SIZE)
+        delay = len(self.simulator.queue)
+        begin = time.monotonic()
+        count = 0
+        while True:
+            if count % NOISE_BLOCK == 0:
+                noise = self.simulator.noise(NOISE_BLOCK)
+            measure(self.simulator.state, noise[count % NOISE_BLOCK], *self.simulator.deviations, measurement)
+            frame = self._frame(count, measurement)
+            try:
+                connection.sendall(frame)
+                if count == 0:
+                    connection.settimeout(FIRST_ANSWER_S)
+                answer = None
+                while answer is None:
+                    answer = next(answers)
+                    if answer is None:
+                        connection.sendall(frame)
+                connection.settimeout(None)
+            except (StopIteration, OSError):
+                return count
+            commands = np.array(answer.controls, np.float32)
+            if delay:
+                applied = self.simulator.queue[count % delay].copy()
+                self.simulator.queue[count % delay] = commands
+            else:
+                applied = commands
+            simulator = self.simulator
+            advance(simulator.state, applied, simulator.plant, simulator.steps, simulator.step, simulator.work)
+            count += 1
+            if self.speed is not None:
+                ahead = begin + count * self.Ts / self.speed - time.monotonic()
+                if ahead > 0:
+                    time.sleep(ahead)
+
+    def _answers(self, connection: socket.socket) -> Iterator[Any]:
+        """Actuator messages as they come; None each time that the wait for one ran out."""
+        while True:
+            try:
+                data = connection.recv(65536)
+            except TimeoutError:
+                yield None
+                continue
+            if not data:
+                return
+            for message in self.codec.parse(data):
+                if message.get_type() == "HIL_ACTUATOR_CONTROLS":
+                    yield message
+
+    def _frame(self, count: int, measurement: Any) -> bytes:
+        """One HIL_SENSOR and one HIL_STATE_QUATERNION."""
+        stamp = EPOCH_US + round(count * self.Ts * 1e6)
+        q = [float(v) for v in measurement[:4]]
+        p, q_rate, r = (float(v) for v in measurement[4:7])
+        position, velocity = self.simulator.state[:3], self.simulator.state[3:6]
+        speeds = self.simulator.state[13:]
+        lift = self.simulator.plant.thrust_coefficient * float(speeds @ speeds) / self.simulator.plant.mass
+        magnetic = _to_body(q, EARTH_FIELD)
+        pressure = 1013.25 * (1 + position[2] / 44330.0) ** 5.255
+        sensor = mavlink.MAVLink_hil_sensor_message(
+            stamp,
+            *(0.0, 0.0, -lift),
+            *(p, q_rate, r),
+            *(float(v) for v in magnetic),
+            pressure,
+            0.0,
+            float(-position[2]),
+            20.0,
+            ALL_FIELDS,
+        )
+        down = _to_body(q, np.array([0.0, 0.0, GRAVITY]))
+        acceleration = [round(float(v) / GRAVITY * 1000) for v in (*down[:2], down[2] - lift)]
+        state = mavlink.MAVLink_hil_state_quaternion_message(
+            stamp,
+            q,
+            p,
+            q_rate,
+            r,
+            HOME_LATITUDE + round(float(position[0]) / METRES_PER_DEGREE * 1e7),
+            HOME_LONGITUDE + round(float(position[1]) / METRES_PER_DEGREE / np.cos(np.radians(HOME_LATITUDE * 1e-7)) * 1e7),
+            int(measurement[7]),
+            *(_int16(float(v) * 100) for v in velocity[:2]),
+            _int16(-float(measurement[8])),
+            0,
+            0,
+            *(_int16(v) for v in acceleration),
+        )
+        return self.codec.pack(sensor) + self.codec.pack(state)
+
+
+def _int16(value: float) -> int:
+    return max(-32768, min(32767, round(value)))
+
+
+def _to_body(q: list[float], v: Any) -> Any:
+    """An earth vector in body axes."""
+    w, r = q[0], np.array(q[1:])
+    return v - 2 * w * np.cross(r, v) + 2 * np.cross(r, np.cross(r, v))

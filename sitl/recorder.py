@@ -1,0 +1,93 @@
+"""A flight of the bench as a PX4 log: topics and fields as PX4 names them, so one reader serves both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.parameters import PARAMETERS, identity_parameters
+from codegen.render import generator_version
+from sitl.airframe import Airframe
+from sitl.loop import Flight
+from sitl.ulog_writer import ulog_bytes
+from tuning.files import write_atomically
+from tuning.gains import Gains
+
+EXCITATION_NAME = b"MIMO_EXC"
+
+
+def quaternions(angles: NDArray[Any]) -> NDArray[np.float32]:
+    """Quaternions (N, 4), w first, of aeronautical angles (N, 3), rad."""
+    half = np.asarray(angles, np.float64).T / 2
+    (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
+    return np.column_stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    ).astype(np.float32)
+
+
+def record_flight(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
+    """The flight as a ULog file; u is logged after injection, the injected signal beside it.
+
+    Parameters
+    ----------
+    flight : Flight
+        What flew.
+    airframe : Airframe
+        The vehicle.
+    gains : Gains
+        The controller that flew: logged as the vehicle's parameters.
+    """
+    record, truth = flight.record, flight.truth
+    excitation = record["excitation"]
+    # z is the axis that is being excited: 0 roll, 1 pitch, -1 none.
+    active = np.where(excitation[:, 0] != 0, 0, np.where(excitation[:, 1] != 0, 1, -1)).astype(np.float32)
+    thrust = np.zeros_like(excitation)
+    thrust[:, 2] = -record["collective"]
+    topics = {
+        "vehicle_angular_velocity": {"xyz": record["rates"]},
+        "vehicle_attitude": {"q": record["quaternion"]},
+        "vehicle_attitude_setpoint": {"q_d": quaternions(record["setpoint"]), "thrust_body": thrust},
+        "vehicle_rates_setpoint": {
+            **{name: record["rates_setpoint"][:, i] for i, name in enumerate(("roll", "pitch", "yaw"))},
+            "thrust_body": thrust,
+        },
+        "vehicle_torque_setpoint": {"xyz": record["moment"]},
+        "vehicle_thrust_setpoint": {"xyz": thrust},
+        "actuator_motors": {"control": record["commands"][:, : len(airframe.rotors)]},
+        "control_allocator_status": {"unallocated_torque": record["unallocated"]},
+        "debug_vect": {
+            "x": excitation[:, 0],
+            "y": excitation[:, 1],
+            "z": active,
+            "name": np.full(len(record), EXCITATION_NAME, "S10"),
+        },
+        "vehicle_attitude_groundtruth": {"q": quaternions(truth["attitude"])},
+        "vehicle_angular_velocity_groundtruth": {"xyz": truth["rates"].astype(np.float32)},
+        "vehicle_local_position_groundtruth": {
+            name: truth[field][:, i].astype(np.float32)
+            for field, names in (("position", "x y z"), ("velocity", "vx vy vz"))
+            for i, name in enumerate(names.split())
+        },
+    }
+    elements = gains.elements()
+    parameters = {parameter.name: elements[parameter.code] for parameter in PARAMETERS}
+    parameters |= identity_parameters(gains)
+    information = {
+        "sys_name": "mimopilot",
+        "ver_hw": f"SITL {airframe.name}",
+        "ver_sw": f"mimopilot {generator_version()}",
+    }
+    return ulog_bytes(flight.scenario.Ts, topics, parameters, information)
+
+
+def save_flight(path: Path, flight: Flight, airframe: Airframe, gains: Gains) -> None:
+    """`record_flight` into a file, atomically."""
+    write_atomically(path, record_flight(flight, airframe, gains))

@@ -1,0 +1,274 @@
+"""The whole way, once: from a flight to tested firmware."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codegen.native import NativeController, load_native
+from sitl.airframe import Airframe, load_airframe
+from sitl.autopilot import Autopilot
+from sitl.errors import SitlError
+from sitl.figures import experiment_figure, manoeuvre_figure, svg
+from sitl.loop import Flight, fly
+from sitl.mavlink.host import Host, plant_process
+from sitl.metrics import Performance, performance
+from sitl.models import reference_models
+from sitl.recorder import save_flight
+from sitl.report import Section, Table, write_report
+from sitl.scenario import AXES, Scenario, doublet, excitation_flight
+from tuning.cascade import tune
+from tuning.gains import MATRICES, Gains
+from tuning.logs.ulog import read_ulog
+from tuning.output import print_table
+from tuning.spec import load_spec
+
+AIRFRAME = "adam0"
+METHODS = ("default", "siso", "mimo")
+SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH = 20.0, 0.15, 50.0
+DOUBLET_DEG, DOUBLET_S = 22.5, 0.42
+TABLES = Path(__file__).with_name("thesis_tables.json")
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """What the demo found: paths, gain sets, figures by axis and method, and the seconds it took."""
+
+    paths: dict[str, Path]
+    gains: dict[str, Gains]
+    figures: dict[str, dict[str, Performance]]
+    report: Path
+    log: Path
+    mavlink_samples: int
+    mavlink_speed: float
+    seconds: float
+
+    def as_json(self) -> dict[str, Any]:
+        """The object that ``--json`` prints."""
+        return {
+            "gains": {method: str(path) for method, path in self.paths.items()},
+            "report": str(self.report),
+            "log": str(self.log),
+            "doublets": {
+                axis: {method: asdict(figures) for method, figures in methods.items()}
+                for axis, methods in self.figures.items()
+            },
+            "mavlink": {"samples": self.mavlink_samples, "different": 0, "times_real_time": self.mavlink_speed},
+            "seconds": self.seconds,
+        }
+
+
+@contextmanager
+def _stage(text: str) -> Iterator[None]:
+    """Say on a terminal's standard error what is being done."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+
+    with Console(stderr=True).status(text):
+        yield
+
+
+def run_demo(out: Path, seed: int) -> Summary:
+    """Fly, tune, generate, compile, fly again, compare with MAVLink, report.
+
+    Parameters
+    ----------
+    out : Path
+        Folder for everything that is made.
+    seed : int
+        Of all randomness.
+
+    Raises
+    ------
+    SitlError
+        When a flight is lost, or the flight over MAVLink differs from the one in process.
+    """
+    begin = time.monotonic()
+    vehicle = load_airframe(AIRFRAME)
+    airframe, gains = vehicle.airframe, {"default": vehicle.default_gains()}
+
+    with _stage("experiment: 40 s of flight with a PRBS moment on roll, then on pitch (the first run compiles)"):
+        controllers = {"default": _controller(gains["default"], out, "default")}
+        generator = np.random.default_rng(seed)
+        scenario = excitation_flight(SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH, gains["default"].Ts, generator)
+        autopilot = Autopilot(airframe, gains["default"], controllers["default"])
+        flight = _survived(fly(airframe, autopilot, scenario, seed))
+        log = out / "flight.ulg"
+        save_flight(log, flight, airframe, gains["default"])
+
+    with _stage("tuning: SISO and MIMO VRFT from the log"):
+        experiment = read_ulog(log)
+        for method in ("siso", "mimo"):
+            gains[method] = tune(experiment, load_spec(method=method))
+        paths = {method: out / f"{method}.gains.toml" for method in METHODS}
+        for method, path in paths.items():
+            gains[method].save(path)
+
+    with _stage("firmware: emitting and compiling the C++ of each gain set"):
+        for method in ("siso", "mimo"):
+            controllers[method] = _controller(gains[method], out, method)
+
+    with _stage("doublets: in process, then over MAVLink"):
+        flights: dict[str, dict[str, Flight]] = {}
+        for axis in AXES:
+            task = doublet(axis, float(np.radians(DOUBLET_DEG)), DOUBLET_S, gains["default"].Ts)
+            flights[axis] = {m: _doublet(airframe, gains[m], controllers[m], task, seed) for m in METHODS}
+        speed = _same_over_mavlink(airframe, gains["mimo"], controllers["mimo"], flights["roll"]["mimo"], seed)
+
+    figures = {
+        axis: {
+            method: performance(flight, *reference_models(gains["mimo"], AXES.index(axis)))
+            for method, flight in methods.items()
+        }
+        for axis, methods in flights.items()
+    }
+    report = out / "report.html"
+    with _stage("report"):
+        _write_report(report, gains, figures, flights, flight)
+    samples = len(flights["roll"]["mimo"].record)
+    return Summary(paths, gains, figures, report, log, samples, speed, time.monotonic() - begin)
+
+
+def _controller(gains: Gains, out: Path, method: str) -> NativeController:
+    """Emit, compile and load the C++ of a set; it starts with the gains that were compiled in."""
+    return NativeController(load_native(gains, out / "firmware" / method))
+
+
+def _survived(flight: Flight) -> Flight:
+    if flight.crashed_at is not None:
+        raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s of the {flight.scenario.name}", exit_code=1)
+    return flight
+
+
+def _doublet(airframe: Airframe, gains: Gains, controller: NativeController, task: Scenario, seed: int) -> Flight:
+    fresh = NativeController(controller.library)
+    return _survived(fly(airframe, Autopilot(airframe, gains, fresh), task, seed))
+
+
+def _same_over_mavlink(
+    airframe: Airframe, gains: Gains, controller: NativeController, flight: Flight, seed: int
+) -> float:
+    """Fly again as two processes; the moments must be the same bits. Returns times real time."""
+    autopilot = Autopilot(airframe, gains, NativeController(controller.library))
+    autopilot.warm_up()
+    with plant_process(AIRFRAME, 0, gains.Ts, seed, None) as port:
+        host = Host(autopilot, len(airframe.rotors), port)
+        try:
+            begin = time.monotonic()
+            record = host.fly(flight.scenario)
+            elapsed = time.monotonic() - begin
+        finally:
+            host.close()
+    different = np.flatnonzero((record["moment"].view(np.uint32) != flight.record["moment"].view(np.uint32)).any(axis=1))
+    if len(different):
+        raise SitlError(
+            f"over MAVLink {len(different)} of {len(record)} moments differ from the flight in process, first at "
+            f"sample {different[0]}",
+            exit_code=1,
+        )
+    return len(record) * gains.Ts / elapsed
+
+
+def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
+    printed = json.loads(TABLES.read_text())["adam0_simulation"]["table_5_4"]
+    sets: list[tuple[str, Any]] = [
+        ("default", gains["default"]),
+        ("SISO", gains["siso"]),
+        ("SISO, Table 5.4", printed["SISO"]),
+        ("MIMO", gains["mimo"]),
+        ("MIMO, Table 5.4", printed["MIMO"]),
+    ]
+    rows = []
+    for name in MATRICES:
+        if name == "Kff_i":
+            continue  # zero in every set
+        for label, values in sets:
+            matrix = values[name] if isinstance(values, dict) else getattr(values, name)
+            rows.append([f"{name}  {label}", *(f"{float(v):.4f}" for v in np.ravel(matrix))])
+    return rows
+
+
+GAIN_COLUMNS = ("gain", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
+FIGURE_COLUMNS = ("doublet", "J_M,o", "J_M,i", "J_r,o", "J_r,i", "off-axis peak [deg]", "off-axis RMS [deg]", "effort RMS")
+
+
+def _figure_rows(figures: dict[str, dict[str, Performance]]) -> list[list[str]]:
+    return [
+        [
+            f"{axis}, {method if method == 'default' else method.upper()}",
+            f"{p.J_M_o:.5f}",
+            f"{p.J_M_i:.4f}",
+            f"{p.J_r_o:.4f}",
+            f"{p.J_r_i:.3f}",
+            f"{p.offaxis_peak_deg:.2f}",
+            f"{p.offaxis_rms_deg:.2f}",
+            f"{p.effort_rms:.3f}",
+        ]
+        for axis, methods in figures.items()
+        for method, p in methods.items()
+    ]
+
+
+def _write_report(
+    path: Path,
+    gains: dict[str, Gains],
+    figures: dict[str, dict[str, Performance]],
+    flights: dict[str, dict[str, Flight]],
+    experiment: Flight,
+) -> None:
+    inner, outer = reference_models(gains["mimo"], 0)
+    labels = {"default": "default", "siso": "SISO", "mimo": "MIMO"}
+    doublets = [
+        svg(manoeuvre_figure({labels[m]: f for m, f in methods.items()}, inner, outer), axis)
+        for axis, methods in flights.items()
+    ]
+    lead = (
+        f"ADAM-0 with 10 % inertia coupling (class values: the thesis prints no inertia), tuned from one {2 * SECONDS_PER_AXIS:g} s "
+        f"closed-loop flight. Reference models: rate loop {inner.label} samples, attitude loop {outer.label} samples."
+    )
+    sections = [
+        Section(
+            "Experiment",
+            f"PRBS moment of amplitude {AMPLITUDE:g} and bandwidth {BANDWIDTH:g} rad/s on roll, then on pitch, under the default gains.",
+            figures=[svg(experiment_figure(experiment), "experiment")],
+        ),
+        Section(
+            "Gains",
+            "Beside those that the thesis prints for its own simulator, whose inertia it does not give.",
+            tables=[Table("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
+        ),
+        Section(
+            "Doublets",
+            f"{DOUBLET_DEG:g} degrees, {DOUBLET_S:g} s. J in rad^2 and rad^2/s^2, over the doublet. The flight over MAVLink "
+            "(roll, MIMO) gave the same moments bit for bit.",
+            tables=[Table("Performance figures, (6.1)-(6.4)", FIGURE_COLUMNS, _figure_rows(figures))],
+            figures=doublets,
+        ),
+    ]
+    write_report(path, "mimopilot demo", lead, sections)
+
+
+def print_summary(summary: Summary) -> None:
+    """The tables, and where everything is."""
+    print_table("Gains beside Table 5.4 of the thesis", GAIN_COLUMNS, _gain_rows(summary.gains))
+    title = f"Doublet of {DOUBLET_DEG:g} deg, {DOUBLET_S:g} s: J in rad^2 and rad^2/s^2"
+    print_table(title, FIGURE_COLUMNS, _figure_rows(summary.figures))
+    print(
+        f"over MAVLink (roll, MIMO): {summary.mavlink_samples} moments, 0 differ from the flight in process; "
+        f"{summary.mavlink_speed:.0f} times real time"
+    )
+    print(f"log     {summary.log}")
+    for method, path in summary.paths.items():
+        print(f"gains   {path}  ({method})")
+    print(f"report  {summary.report}")
+    print(f"{summary.seconds:.1f} s")
