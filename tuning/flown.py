@@ -39,7 +39,8 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
         None when the parameters do not describe a whole controller. Elements that our module does not
         have in that log (yaw, limits) are PX4's.
     """
-    values = {name: float(value) for name, value in parameters.items()}
+    # Vehicles store single precision: take the shortest decimal that means the same.
+    values = {name: float(str(np.float32(value))) for name, value in parameters.items()}
 
     def find(code: str, fallback: str, factor: float = 1.0) -> float:
         ours = values.get(PARAMETER_PREFIX + code)
@@ -73,7 +74,7 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     if pole is None:
         cutoff = values.get("IMU_DGYRO_CUTOFF", 0.0)
     else:
-        cutoff = -math.log(pole) / (2 * math.pi * Ts) if pole > 0 else 0.0
+        cutoff = float(f"{-math.log(pole) / (2 * math.pi * Ts):.6g}") if pole > 0 else 0.0
     scale = [values.get(f"{PARAMETER_PREFIX}{SCALE}_{letter}") for letter in "RPY"]
     return Gains(
         **matrices,

@@ -57,12 +57,13 @@ class ReferenceModel:
         return value
 
     def settling_samples(self, fraction: float = 0.01) -> int:
-        """Samples after which the model's transient has fallen below `fraction`."""
+        """Samples after which a transient of the model has fallen below `fraction` of its peak, delay included."""
         slowest = float(np.max(np.abs(np.roots(self.den))))
         if slowest >= 1:
             raise TuningError(f"reference model {self.label}: pole at {slowest:.4g}, expected inside the unit circle")
-        decay = 0 if slowest == 0 else int(np.ceil(np.log(fraction) / np.log(slowest)))
-        return decay + self.delay + len(self.den)
+        horizon = 1 if slowest == 0 else int(np.ceil(np.log(fraction / 100) / np.log(slowest)))
+        transient = np.abs(lfilter([1.0], self.den, np.eye(1, horizon + len(self.den))[0]))
+        return int(np.flatnonzero(transient > fraction * transient.max())[-1]) + 1 + self.delay
 
 
 def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceModel:

@@ -186,21 +186,31 @@ def vrft(
         e_l, r_l, y_l, factors = virtual_signals(y[start:stop], models)
         x = regressors("".join(letters), e_l, y_l, r_l, Ts, derivative_cutoff_hz)[drop:]
         u_l = filter_by(u[start:stop], factors)[drop:]
-        # The constant is regressor and instrument at once: taking the mean off both is the same.
-        xs.append(x - x.mean(axis=0))
-        us.append(u_l - u_l.mean(axis=0))
+        # The constant (trim, initial integrator), filtered like the rest, is regressor and instrument at once:
+        # to take its part off all others is the same as to estimate it.
+        constant = filter_by(np.ones((stop - start, 1)), factors)[drop:]
+        xs.append(_without(constant, x))
+        us.append(_without(constant, u_l))
         ws.append(filter_by(instrument[start:stop], factors)[drop:])
     if not xs:
         raise TuningError(
             f"too short: no stretch without a gap is longer than {(drop + 4 * lags) * Ts:.2f} s, which these reference "
             "models need; record a longer flight, or ask for faster models"
         )
-    return _solve(xs, us, ws, lags, "".join(letters), y.shape[1], weight)
+    memory = max(lags, 2 * drop)
+    return _solve(xs, us, ws, lags, memory, "".join(letters), y.shape[1], weight)
+
+
+def _without(constant: Signal, signal: Signal) -> Signal:
+    """`signal` (N, n) less its projection on `constant` (N, 1)."""
+    rest: Signal = signal - constant @ (constant.T @ signal) / (constant.T @ constant)
+    return rest
 
 
 def _solve(
-    xs: list[Signal], us: list[Signal], ws: list[Signal], lags: int, terms: str, n_y: int, weight: str
+    xs: list[Signal], us: list[Signal], ws: list[Signal], lags: int, memory: int, terms: str, n_y: int, weight: str
 ) -> LoopEstimate:
+    """Both steps of the estimate; `memory` is how many samples the residual may remember."""
     samples = sum(len(x) for x in xs)
 
     def correlate(signals: list[Signal]) -> Signal:
@@ -216,7 +226,7 @@ def _solve(
         raise TuningError("not excited: the injected signal does not reach every axis, so some gains cannot be found")
     covariance = np.empty((Q.shape[1], S.shape[1]))
     for row in range(Q.shape[1]):
-        gamma = _residual_covariance(xs, us, ws, B[:, row] / scale, row, lags)
+        gamma = _residual_covariance(xs, us, ws, B[:, row] / scale, row, lags, memory)
         if weight == "optimal":
             factor = (cholesky(gamma, lower=True), True)
             solved = cho_solve(factor, S)
@@ -238,7 +248,7 @@ def _solve(
 
 
 def _residual_covariance(
-    xs: list[Signal], us: list[Signal], ws: list[Signal], b: Signal, row: int, lags: int
+    xs: list[Signal], us: list[Signal], ws: list[Signal], b: Signal, row: int, lags: int, memory: int
 ) -> Signal:
     """Newey-West covariance of zeta(k) eps(k), Gamma of (3.30), for one row of the controller.
 
@@ -247,9 +257,9 @@ def _residual_covariance(
     """
     samples = sum(len(x) for x in xs)
     eps = [(u[:, row] - x @ b)[:, None] for u, x in zip(us, xs, strict=True)]
-    taper = 1 - np.abs(np.arange(-lags, lags + 1)) / (lags + 1)
-    R_eps = sum(autocorrelation(e, lags) for e in eps)[:, 0, 0] / samples * taper
-    R_w = sum(autocorrelation(w, 3 * lags) for w in ws) / samples
+    taper = 1 - np.abs(np.arange(-memory, memory + 1)) / (memory + 1)
+    R_eps = sum(autocorrelation(e, memory) for e in eps)[:, 0, 0] / samples * taper
+    R_w = sum(autocorrelation(w, 2 * lags + memory) for w in ws) / samples
     n_w = R_w.shape[1]
     blocks = np.empty((4 * lags + 1, n_w, n_w))
     for i in range(n_w):

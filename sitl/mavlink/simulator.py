@@ -15,6 +15,7 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.airframe import Airframe
+from sitl.autopilot import MAX_ROTORS
 from sitl.loop import Simulator
 from sitl.mavlink.link import Codec
 from sitl.plant import GRAVITY, advance
@@ -49,6 +50,14 @@ class PlantServer:
         self.Ts, self.speed = Ts, speed
         self.rotors = len(airframe.rotors)
         self.codec = Codec(system=1, component=mavlink.MAV_COMP_ID_USER1)
+        self._warm_up(airframe, seed)
+
+    def _warm_up(self, airframe: Airframe, seed: int) -> None:
+        """Compile what each period calls now, so that the first frames come in time."""
+        spare = Simulator(airframe, self.Ts, seed)
+        measure(spare.state, spare.noise(1)[0], *spare.deviations, np.zeros(SIZE))
+        commands = np.zeros(MAX_ROTORS, np.float32)
+        advance(spare.state, commands, spare.plant, spare.steps, spare.step, spare.work)
 
     def serve(self, connection: socket.socket) -> int:
         """Fly until the autopilot goes away; returns the number of periods."""

@@ -1,0 +1,53 @@
+"""Fixtures shared by all rooms."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tuning.gains import Gains, Limits, YawGains
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture
+def gains() -> Gains:
+    """A full, coupled set with every term in use."""
+    return Gains(
+        Kp_o=np.array([[6.0, 0.3], [-0.2, 5.5]]),
+        Kp_i=np.array([[0.15, 0.02], [0.01, 0.13]]),
+        Ki_i=np.array([[0.25, 0.03], [-0.02, 0.2]]),
+        Kd_i=np.array([[0.003, 0.0004], [0.0002, 0.002]]),
+        Kff_i=np.array([[0.02, 0.001], [0.002, 0.03]]),
+        yaw=YawGains(1.5, 0.5, 0.1, 0.01, 0.02),
+        Ts=0.004,
+        derivative_cutoff_hz=30.0,
+        limits=Limits(rate_max=(5.0, 4.0, 3.0), moment_max=(1.0, 0.9, 0.8), integral_max=(0.3, 0.25, 0.2)),
+        moment_scale=(2.54592, 2.54592, 0.2736),
+    )
+
+
+@pytest.fixture
+def mimopilot(tmp_path: Path) -> Run:
+    """Run the command line as a user would; returns the finished process."""
+
+    def run(*arguments: object, **keywords: object) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "mimopilot", *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300, **keywords)  # type: ignore[call-overload,no-any-return]
+
+    return run
+
+
+def assert_one_clear_line(result: subprocess.CompletedProcess[str], *words: str, code: int = 2) -> None:
+    """The command failed with `code` and one message that holds `words`, and no traceback."""
+    assert result.returncode == code, result.stderr
+    assert "Traceback" not in result.stderr
+    lines = result.stderr.strip().splitlines()
+    assert len(lines) == 1, result.stderr
+    for word in words:
+        assert word in lines[0]
