@@ -99,7 +99,7 @@ def _largest_share(base, part, collective, allocation):  # type: ignore[no-untyp
                 slope = -part[i] / h_i
             if room < -1e-12:
                 return -1.0
-            if slope * share > room:
+            if slope > 0.0 and slope * share > room:
                 share = max(room, 0.0) / slope
     return share
 

@@ -24,7 +24,7 @@ def _sources_hash() -> str:
 # numba's own cache does not notice that a *called* function changed: keep one folder for each state of the room.
 config.CACHE_DIR = str(cache_folder() / f"numba-{_sources_hash()}")
 
-compiled = numba.njit(cache=True)
+compiled = numba.njit(cache=True, error_model="numpy")
 
 
 @intrinsic  # type: ignore[untyped-decorator]

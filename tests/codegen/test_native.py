@@ -1,0 +1,274 @@
+"""The compiled C++ against the independent Python reference, bit for bit, and what each rule of it does."""
+
+import dataclasses
+import subprocess
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from codegen.errors import CodegenError
+from codegen.layout import INPUT
+from codegen.native import NativeController, NativeLibrary, build_native, load_native
+from codegen.parameters import to_array
+from codegen.vectors import random_inputs, reference_outputs
+from tuning.controller import Controller
+from tuning.gains import MATRICES, Limits
+
+TS = 0.004
+HOLD = 25
+
+
+@pytest.fixture(scope="module")
+def library():
+    from tests.conftest import gains
+
+    return load_native(gains.__wrapped__())
+
+
+def quiet(rows=1, **values):
+    """Armed rows of zeros with the given fields."""
+    inputs = np.zeros(rows, INPUT)
+    inputs["armed"] = 1
+    for name, value in values.items():
+        inputs[name] = value
+    return inputs
+
+
+def random_gains(base, rng):
+    changes = {
+        code: float(np.float32(value + rng.normal() * (abs(value) + 0.05) * 0.5))
+        for code, value in base.elements().items()
+        if code[:2] in ("AP", "RP", "RI", "RD", "RF")
+    }
+    if rng.random() < 0.3:
+        changes |= {"RI_RR": 0.0, "RI_RP": 0.0}
+    if rng.random() < 0.2:
+        changes |= {"D_POLE": 0.0}
+    return base.with_elements(changes)
+
+
+def test_ten_thousand_random_rows_with_gain_changes_agree_in_every_bit(library, gains):
+    rng = np.random.default_rng(20)
+    inputs = random_inputs(10_000, rng)
+    native, reference = NativeController(library, gains), Controller(gains)
+    different = saturated = faulty = 0
+    for block in np.split(inputs, 40):
+        got, expected = native.run(block), reference_outputs(reference, block)
+        different += int((got.view(np.uint8) != expected.view(np.uint8)).reshape(len(block), -1).any(axis=1).sum())
+        saturated += int((np.abs(expected["moment"]) >= [1.0, 0.9, 0.8]).any(axis=1).sum())
+        faulty += int((expected["fault"] != 0).sum())
+        assert np.isfinite(got["moment"]).all()
+        changed = random_gains(gains, rng)
+        assert native.set_gains(changed)
+        reference.set_gains(changed)
+    assert different == 0
+    # The rows reach what they are meant to reach.
+    assert saturated > 200
+    assert faulty > 50
+    assert sum(np.count_nonzero(~np.isfinite(inputs[name])) for name in ("rates", "attitude")) > 100
+
+
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=25, deadline=None)
+def test_any_gains_and_any_inputs_agree_in_every_bit(library, seed):
+    from tests.conftest import gains
+
+    rng = np.random.default_rng(seed)
+    changed = random_gains(gains.__wrapped__(), rng)
+    inputs = random_inputs(300, rng)
+    got = NativeController(library, changed).run(inputs)
+    expected = reference_outputs(Controller(changed), inputs)
+    assert (got.view(np.uint8) == expected.view(np.uint8)).all()
+
+
+def test_denormal_inputs_are_not_flushed_to_zero(library, gains):
+    inputs = quiet(2, rates=[[1e-40, 0, 0]])
+    got = NativeController(library, gains).run(inputs)
+    assert 0 < abs(got["moment"][0, 0]) < 1.2e-38
+
+
+@pytest.mark.parametrize("matrix", list(MATRICES))
+@pytest.mark.parametrize("i", [0, 1])
+@pytest.mark.parametrize("j", [0, 1])
+def test_each_gain_element_changes_exactly_its_output(library, gains, matrix, i, j):
+    # All matrices diagonal, inputs that drive axis j alone: only output i may answer to element (i, j).
+    base = dataclasses.replace(gains, **{name: np.diag(np.diag(getattr(gains, name))) for name in MATRICES})
+    changed = getattr(base, matrix).copy()
+    changed[i, j] += 0.0625
+    other = dataclasses.replace(base, **{matrix: changed})
+    rng = np.random.default_rng(3)
+    inputs = quiet(50)
+    for name in ("attitude_setpoint", "attitude", "rates"):
+        inputs[name][:, j] = 0.1 * rng.standard_normal(50)
+    before, after = (NativeController(library, g).run(inputs)["moment"] for g in (base, other))
+    changed_outputs = (before != after).any(axis=0)
+    assert list(np.flatnonzero(changed_outputs)) == [i]
+
+
+@pytest.mark.parametrize("name", list(MATRICES))
+def test_each_yaw_gain_changes_yaw_alone(library, gains, name):
+    other = dataclasses.replace(gains, yaw=dataclasses.replace(gains.yaw, **{name: getattr(gains.yaw, name) + 0.0625}))
+    rng = np.random.default_rng(3)
+    inputs = quiet(50)
+    for field in ("attitude_setpoint", "attitude", "rates"):
+        inputs[field] = 0.1 * rng.standard_normal((50, 3))
+    before, after = (NativeController(library, g).run(inputs)["moment"] for g in (gains, other))
+    assert list(np.flatnonzero((before != after).any(axis=0))) == [2]
+
+
+def test_positive_derivative_gain_damps(library, gains):
+    only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2) * 0.01}
+    damping = dataclasses.replace(gains, **only)
+    inputs = quiet(20)
+    inputs["rates"][:, 0] = np.arange(20) * 0.01  # accelerating to the right
+    assert (NativeController(library, damping).run(inputs)["moment"][1:, 0] < 0).all()
+
+
+def test_the_first_sample_has_no_derivative(library, gains):
+    only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2)}
+    out = NativeController(library, dataclasses.replace(gains, **only)).run(quiet(1, rates=[[3.0, -2.0, 1.0]]))
+    assert (out["moment"][0, :2] == 0).all()
+
+
+def test_gain_changes_are_bumpless_within_the_integrator_limit(library, gains):
+    inputs = quiet(40, attitude_setpoint=[[0.02, -0.01, 0.01]], rates=[[0.01, 0.02, -0.01]])
+    controller = NativeController(library, gains)
+    before = controller.run(inputs)["moment"][-1]
+    assert controller.set_gains(gains.with_elements({"RP_RR": 0.2, "RP_RP": -0.05, "AP_RR": 4.0, "RI_PP": 0.4, "RP_YY": 0.3}))
+    after = controller.run(inputs[:1])["moment"][0]
+    # One period of integration is all that may change.
+    assert np.abs(after - before).max() < 2e-4
+    jumped = NativeController(library, gains.with_elements({"RP_RR": 0.2, "AP_RR": 4.0})).run(inputs)["moment"][-1]
+    assert np.abs(jumped - before).max() > 10 * np.abs(after - before).max()
+
+
+def test_an_axis_without_integral_gain_drops_its_integrator(library, gains):
+    controller = NativeController(library, gains)
+    controller.run(quiet(100, attitude_setpoint=[[0.05, 0.05, 0.05]]))
+    assert (controller.state["integral"][0] != 0).all()
+    assert controller.set_gains(gains.with_elements({"RI_RR": 0.0, "RI_RP": 0.0}))
+    assert controller.state["integral"][0, 0] == 0
+    assert controller.state["integral"][0, 1] != 0
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e38, -1e7])
+def test_gains_that_no_vehicle_can_fly_are_refused_and_change_nothing(library, gains, bad):
+    controller = NativeController(library, gains)
+    controller.run(quiet(10, attitude_setpoint=[[0.1, 0.1, 0.1]]))
+    before = controller.state.tobytes()
+    for index in range(len(to_array(gains))):
+        array = to_array(gains)
+        array[index] = bad
+        assert not controller.set_gains(array)
+    assert controller.state.tobytes() == before
+
+
+def test_refused_gains_at_the_start_are_an_error(library, gains):
+    array = to_array(gains)
+    assert library.lib.mimo_pid_initialise(library.ffi.new("uint8_t[1024]"), library.ffi.from_buffer("float[]", array)) == 1
+    array[0] = np.nan
+    assert library.lib.mimo_pid_initialise(library.ffi.new("uint8_t[1024]"), library.ffi.from_buffer("float[]", array)) == 0
+
+
+def test_saturation_stops_the_integrator_in_that_direction_only(library, gains):
+    only_integral = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kp_o": np.eye(2), "Ki_i": np.eye(2)}
+    g = dataclasses.replace(gains, **only_integral, limits=Limits((9, 9, 9), (1, 1, 1), (0.5, 0.5, 0.5)))
+    push = quiet(1, attitude_setpoint=[[1.0, 0, 0]])
+    for sign, moves in ((1, False), (-1, True), (0, True)):
+        controller = NativeController(library, g)
+        push["saturation"][0, 0] = sign
+        controller.run(push)
+        assert (controller.state["integral"][0, 0] > 0) == moves
+
+
+def test_the_integrator_does_not_wind_up_while_the_excitation_saturates(library, gains):
+    g = gains.with_elements({"UMAX_R": 0.2})
+    controller = NativeController(library, g)
+    controller.run(quiet(200, attitude_setpoint=[[0.01, 0, 0]], excitation=[[0.5, 0, 0]]))
+    assert controller.state["integral"][0, 0] == 0
+
+
+def test_disarmed_clears_and_landed_holds_the_integrator(library, gains):
+    controller = NativeController(library, gains)
+    controller.run(quiet(50, attitude_setpoint=[[0.05, 0.02, 0.01]]))
+    held = controller.state["integral"].copy()
+    controller.run(quiet(50, attitude_setpoint=[[0.05, 0.02, 0.01]], landed=1))
+    assert (controller.state["integral"] == held).all()
+    controller.run(quiet(1, attitude_setpoint=[[0.05, 0.02, 0.01]], armed=0))
+    assert (controller.state["integral"] == 0).all()
+
+
+@pytest.mark.parametrize("field", ["attitude_setpoint", "attitude", "rates"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e38, -101.0])
+def test_an_invalid_input_is_held_for_25_samples_and_then_the_rates_are_damped(library, gains, field, bad):
+    controller = NativeController(library, gains)
+    normal = quiet(20, attitude_setpoint=[[0.05, 0.02, 0.0]], attitude=[[0.01, 0, 0]], rates=[[0.3, -0.2, 0.1]])
+    controller.run(normal)
+    broken = normal[:1].repeat(HOLD + 1)
+    broken[field][:, 0] = bad
+    out = controller.run(broken)
+    assert (out["fault"][:HOLD] == 0).all()
+    kind = ("attitude_setpoint", "attitude", "rates").index(field)
+    assert out["fault"][HOLD] == 1 << (3 * kind)
+    assert out["fault_count"][HOLD] == HOLD + 1
+    integral = controller.state["integral"].copy()
+    again = controller.run(broken)
+    assert (controller.state["integral"] == integral).all()
+    y = np.array([0.3, -0.2, 0.1])
+    if field == "rates":
+        y[0] = 0
+    expected = np.append(-gains.Kp_i @ y[:2], -gains.yaw.Kp_i * y[2])
+    if field == "rates":
+        expected[0] = 0
+        assert again["moment"][-1, 0] == 0
+    assert again["moment"][-1] == pytest.approx(expected, abs=1e-6)
+    recovered = controller.run(normal)
+    assert (recovered["fault"] == 0).all()
+    assert np.isfinite(recovered["moment"]).all()
+
+
+def test_a_recovered_rate_makes_no_derivative_kick(library, gains):
+    only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2) * 0.1}
+    controller = NativeController(library, dataclasses.replace(gains, **only))
+    controller.run(quiet(5))
+    lost = quiet(40, rates=[[np.nan, 0, 0]])
+    controller.run(lost)
+    assert controller.run(quiet(1, rates=[[2.0, 0, 0]]))["moment"][0, 0] == 0
+
+
+def test_an_excitation_that_is_not_finite_is_not_injected(library, gains):
+    controller, clean = NativeController(library, gains), NativeController(library, gains)
+    wild = controller.run(quiet(3, excitation=[[np.nan, np.inf, 7.0]]))
+    assert (wild["moment"] == clean.run(quiet(3))["moment"]).all()
+    assert wild["fault_count"][-1] == 9
+
+
+def test_yaw_takes_the_shortest_way_round(library, gains):
+    out = NativeController(library, gains).run(quiet(1, attitude_setpoint=[[0, 0, 3.1]], attitude=[[0, 0, -3.1]]))
+    # From -3.1 to 3.1 rad the short way is -0.083 rad.
+    assert out["rates_setpoint"][0, 2] == pytest.approx(1.5 * (6.2 - 2 * np.pi), rel=1e-4)
+
+
+def test_the_rate_setpoint_is_limited(library, gains):
+    out = NativeController(library, gains).run(quiet(1, attitude_setpoint=[[3.0, -3.0, 3.0]]))
+    assert list(out["rates_setpoint"][0]) == [5.0, -4.0, 3.0]
+
+
+def test_a_library_of_another_interface_is_refused(gains, tmp_path):
+    path = build_native(gains, tmp_path / "a")
+    source = tmp_path / "a" / "native" / "mimo_pid_native.cpp"
+    text = source.read_text()
+    hash_line = next(line for line in text.splitlines() if "mimo_pid_interface_hash" in line)
+    source.write_text(text.replace(hash_line, "uint32_t mimo_pid_interface_hash(void) { return 1U; }"))
+    other = path.with_name("other.so")
+    subprocess.run(
+        ["g++", "-shared", "-fPIC", "-o", other, source, tmp_path / "a" / "core" / "mimo_pid.cpp"], check=True
+    )
+    with pytest.raises(CodegenError, match="another version of the interface"):
+        NativeLibrary(other)
+
+
+def test_the_library_carries_the_gains_it_was_generated_with(gains, library):
+    assert (library.default_gains() == to_array(gains)).all()
