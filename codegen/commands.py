@@ -16,7 +16,9 @@ def register(app: typer.Typer) -> None:
 def generate(
     gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
     out: Annotated[Path, typer.Option(help="Folder to write to; changed files are replaced, nothing is deleted.")],
-    target: Annotated[str, typer.Option(help="native: the controller, a C interface and tests for this machine.")] = "native",
+    target: Annotated[
+        str, typer.Option(help="native: the controller, a C interface and tests for this machine.")
+    ] = "native",
 ) -> None:
     """Emit the C++ controller with its gains, parameter table, build files and tests."""
     from codegen.render import render, write_tree

@@ -77,7 +77,9 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
     """
     files = render(gains, "native")
     compiler = find_compiler()
-    sources = "".join(f"{name}\0{content}\0" for name, content in files.items() if name.startswith(("core/", "native/")))
+    sources = "".join(
+        f"{name}\0{content}\0" for name, content in files.items() if name.startswith(("core/", "native/"))
+    )
     key = sha256(f"{sources}{compiler}{CXX_FLAGS}{platform.machine()}")[:16]
     folder = folder or cache_folder() / key
     write_tree(files, folder)

@@ -66,7 +66,9 @@ _LIMITS = {
 def _gain(matrix: str, output: str, error: str) -> Parameter:
     unit, largest, text = _TERMS[matrix]
     code = f"{MATRICES[matrix]}_{output}{error}"
-    what = f"{text}, {AXIS_NAMES[output]} from {AXIS_NAMES[error]}" if output != error else f"{text}, {AXIS_NAMES[output]}"
+    what = (
+        f"{text}, {AXIS_NAMES[output]} from {AXIS_NAMES[error]}" if output != error else f"{text}, {AXIS_NAMES[output]}"
+    )
     return Parameter(PARAMETER_PREFIX + code, code, unit, -largest, largest, True, f"{matrix}: {what}")
 
 
@@ -80,14 +82,22 @@ PARAMETERS: tuple[Parameter, ...] = (
     *(_gain(matrix, output, error) for matrix in MATRICES for output in "RP" for error in "RP"),
     *(_gain(matrix, "Y", "Y") for matrix in MATRICES),
     *(_limit(limit, axis) for limit in LIMITS for axis in "RPY"),
-    Parameter("MIMO_D_POLE", "D_POLE", "norm", 0.0, 0.9999, True, "pole of the derivative filter, exp(-2 pi f_d Ts); 0: none"),
+    Parameter(
+        "MIMO_D_POLE", "D_POLE", "norm", 0.0, 0.9999, True, "pole of the derivative filter, exp(-2 pi f_d Ts); 0: none"
+    ),
     Parameter("MIMO_TS", "TS", "s", 1e-4, 1.0, False, "control period, fixed in the firmware"),
 )
 
 #: What a vehicle publishes beside them, so that gains made for another unit of moment are noticed.
 IDENTITY: tuple[Parameter, ...] = tuple(
     Parameter(
-        f"{PARAMETER_PREFIX}{SCALE}_{axis}", f"{SCALE}_{axis}", "N m", 0.0, 1e6, False, f"moment of u = 1, {AXIS_NAMES[axis]}"
+        f"{PARAMETER_PREFIX}{SCALE}_{axis}",
+        f"{SCALE}_{axis}",
+        "N m",
+        0.0,
+        1e6,
+        False,
+        f"moment of u = 1, {AXIS_NAMES[axis]}",
     )
     for axis in "RPY"
 )

@@ -117,7 +117,7 @@ class Airframe(_Table):
         return PlantParameters(
             mass=mass,
             inertia=inertia,
-            inertia_inverse=np.linalg.inv(inertia),
+            inertia_inverse=np.linalg.inv(inertia).astype(np.float64),
             rotors=np.ascontiguousarray(rotors - centre),
             spin=spin,
             thrust_max=self.motors.thrust_max,

@@ -31,7 +31,9 @@ class Allocation(NamedTuple):
     airmode: bool
 
 
-def moment_scale(rotors: NDArray[np.float64], spin: NDArray[np.float64], thrust: float, ratio: float) -> NDArray[np.float64]:
+def moment_scale(
+    rotors: NDArray[np.float64], spin: NDArray[np.float64], thrust: float, ratio: float
+) -> NDArray[np.float64]:
     """Moment that u = 1 stands for: half of the motors at full thrust, the others off (M_max = 2 b T_max for a quad).
 
     Parameters

@@ -7,7 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-AirframeArgument = Annotated[str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, or a TOML file.")]
+AirframeArgument = Annotated[
+    str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, or a TOML file.")
+]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
 SeedOption = Annotated[int, typer.Option(help="Seed of all randomness.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -17,7 +19,9 @@ def register(app: typer.Typer) -> None:
     """Add this room's commands to the front door."""
     app.command(epilog="Example: mimopilot experiment adam0 --seed 1 --out flight.ulg")(experiment)
     app.command(epilog="Example: mimopilot fly adam0 --gains my.gains.toml --axis roll --json")(fly)
-    app.command(epilog="Example: mimopilot sitl adam0 --gains my.gains.toml, then mavproxy.py --master=udp:127.0.0.1:14550")(sitl)
+    app.command(
+        epilog="Example: mimopilot sitl adam0 --gains my.gains.toml, then mavproxy.py --master=udp:127.0.0.1:14550"
+    )(sitl)
     app.command(epilog="Example: mimopilot plant adam0 --port 4560")(plant)
 
 
@@ -63,7 +67,9 @@ def fly(
     scenario: Annotated[str, typer.Option(help="doublet, step or hover.")] = "doublet",
     axis: Annotated[str, typer.Option(help="roll or pitch.")] = "roll",
     amplitude_deg: Annotated[float, typer.Option(help="Of the doublet or step, degrees.")] = 22.5,
-    period_s: Annotated[float, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.")] = 0.42,
+    period_s: Annotated[
+        float, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.")
+    ] = 0.42,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
     as_json: JsonOption = False,
@@ -117,7 +123,10 @@ def sitl(
     ground = Ground(ParameterServer(autopilot.controller, controller), ground_port)
     with plant_process(airframe, port, controller.Ts, seed, speed) as plant_port:
         host = Host(autopilot, len(body.rotors), plant_port)
-        print(f"{body.name} flies: plant on TCP {plant_port}, ground station on UDP {ground_port}; Ctrl-C ends", flush=True)
+        print(
+            f"{body.name} flies: plant on TCP {plant_port}, ground station on UDP {ground_port}; Ctrl-C ends",
+            flush=True,
+        )
         try:
             host.run(ground)
         except KeyboardInterrupt:

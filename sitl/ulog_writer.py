@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ HEADER = b"ULog\x01\x12\x35\x01"
 EPOCH_US = 1_000_000  # time stamp of the first sample
 
 #: Field of a topic: name -> (N,) or (N, m) array; the dtype says how it is stored.
-Fields = Mapping[str, NDArray[np.generic]]
+Fields = Mapping[str, NDArray[Any]]
 
 _TYPES = {"f4": "float", "f8": "double", "u1": "uint8_t", "i4": "int32_t", "u2": "uint16_t", "S": "char"}
 
@@ -45,9 +46,11 @@ def ulog_bytes(
     count = len(next(iter(next(iter(topics.values())).values())))
     stamps = EPOCH_US + np.round(np.arange(count) * Ts * 1e6).astype(np.uint64)
     definitions = [HEADER, struct.pack("<Q", EPOCH_US), _message("B", bytes(40))]
-    definitions += [_keyed("I", f"char[{len(text.encode())}] {key}", text.encode()) for key, text in information.items()]
+    definitions += [
+        _keyed("I", f"char[{len(text.encode())}] {key}", text.encode()) for key, text in information.items()
+    ]
     columns: list[tuple[str, str, tuple[int, ...]]] = []
-    data: dict[str, NDArray[np.generic] | int] = {}
+    data: dict[str, NDArray[Any]] = {}
     subscriptions = []
     for number, (topic, fields) in enumerate(topics.items()):
         named = {"timestamp": stamps, "timestamp_sample": stamps, **fields}
@@ -56,14 +59,14 @@ def ulog_bytes(
         payload = sum(value.dtype.itemsize * int(np.prod(value.shape[1:])) for value in named.values())
         for name, kind, value in (("size", "<u2", payload + 2), ("type", "u1", ord("D")), ("id", "<u2", number)):
             columns.append((f"{topic}.{name}", kind, ()))
-            data[f"{topic}.{name}"] = value
-        for name, value in named.items():
-            columns.append((f"{topic}.{name}", value.dtype.str, value.shape[1:]))
-            data[f"{topic}.{name}"] = value
+            data[f"{topic}.{name}"] = np.array(value)
+        for name, array in named.items():
+            columns.append((f"{topic}.{name}", array.dtype.str, array.shape[1:]))
+            data[f"{topic}.{name}"] = array
     definitions += [_keyed("P", f"float {name}", struct.pack("<f", value)) for name, value in parameters.items()]
     rows = np.zeros(count, np.dtype(columns))
-    for column, value in data.items():
-        rows[column] = value
+    for column, values in data.items():
+        rows[column] = values
     return b"".join(definitions + subscriptions) + rows.tobytes()
 
 
@@ -75,7 +78,7 @@ def _keyed(kind: str, key: str, value: bytes) -> bytes:
     return _message(kind, struct.pack("<B", len(key)) + key.encode() + value)
 
 
-def _declare(name: str, values: NDArray[np.generic]) -> str:
+def _declare(name: str, values: NDArray[Any]) -> str:
     if values.dtype == np.uint64:
         return f"uint64_t {name};"
     if values.dtype.kind == "S":

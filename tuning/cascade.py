@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -58,7 +59,8 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
         )
         for axes, segments in stretches
     ]
-    gains = replace(base, **{matrix: _assemble(inner, stretches, term) for term, matrix in TERMS.items()})
+    Kp, Ki, Kd = (_assemble(inner, stretches, term) for term in TERMS)
+    gains = replace(base, Kp_i=Kp, Ki_i=Ki, Kd_i=Kd)
 
     settling = 0
     r_i = np.zeros_like(experiment.y_i)
@@ -159,7 +161,7 @@ def _stretches(
 
 
 def _assemble(
-    estimates: list[LoopEstimate], stretches: list[tuple[slice, Segments]], term: str, what: str = "gains"
+    estimates: list[LoopEstimate], stretches: Sequence[tuple[slice, Segments]], term: str, what: str = "gains"
 ) -> NDArray[np.float64]:
     matrix = np.zeros((2, 2))
     for estimate, (axes, _) in zip(estimates, stretches, strict=True):

@@ -16,11 +16,19 @@ def register(app: typer.Typer) -> None:
 def tune(
     log: Annotated[Path, typer.Argument(help="Flight log (PX4 ULog) with an injected moment.")],
     out: Annotated[Path, typer.Option(help="Where the gains are written: FILE.gains.toml.")],
-    method: Annotated[str | None, typer.Option(help="mimo (full matrices, the default) or siso (each axis by itself).")] = None,
-    inner: Annotated[str | None, typer.Option(help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 20,0.4,0.")] = None,
+    method: Annotated[
+        str | None, typer.Option(help="mimo (full matrices, the default) or siso (each axis by itself).")
+    ] = None,
+    inner: Annotated[
+        str | None, typer.Option(help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 20,0.4,0.")
+    ] = None,
     outer: Annotated[str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY; 10,0.7,0.")] = None,
-    window: Annotated[int | None, typer.Option(help="Lags of the instrument, samples; by default from the models.")] = None,
-    spec: Annotated[Path | None, typer.Option(help="Specification (TOML): the above, and what the log does not say.")] = None,
+    window: Annotated[
+        int | None, typer.Option(help="Lags of the instrument, samples; by default from the models.")
+    ] = None,
+    spec: Annotated[
+        Path | None, typer.Option(help="Specification (TOML): the above, and what the log does not say.")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Find the gains of the attitude cascade from one flight."""

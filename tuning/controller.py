@@ -284,5 +284,3 @@ def rebuild_rate_setpoint(
     slowest = float(moving.max()) if len(moving) else 0.0
     settling = int(np.ceil(np.log(0.01) / np.log(slowest))) if 0 < slowest < 1 else 0
     return error + y_i, settling
-
-

@@ -31,7 +31,9 @@ def hold_from_bandwidth(bandwidth: float, Ts: float) -> tuple[int, int]:
         When the bandwidth is not between 0 and the Nyquist frequency.
     """
     if not 0 < bandwidth <= math.pi / Ts:
-        raise TuningError(f"bandwidth: got {bandwidth} rad/s, expected more than 0 and at most {math.pi / Ts:.4g} rad/s")
+        raise TuningError(
+            f"bandwidth: got {bandwidth} rad/s, expected more than 0 and at most {math.pi / Ts:.4g} rad/s"
+        )
     hold_min = max(1, round(math.pi / (bandwidth * Ts)))
     return hold_min, 4 * hold_min
 

@@ -188,7 +188,7 @@ class Gains:
             Ts=values["TS"],
             derivative_cutoff_hz=cutoff,
             limits=Limits(**{name: triple(code) for name, code in LIMITS.items()}),
-            **{name: matrix(code) for name, code in MATRICES.items()},
+            **{name: matrix(code) for name, code in MATRICES.items()},  # type: ignore[arg-type]
         )
 
     def save(self, path: Path) -> None:
@@ -231,7 +231,9 @@ def gains_from_toml(text: str, where: str) -> Gains:
     except tomllib.TOMLDecodeError as error:
         raise TuningError(f"{where}: not a TOML file: {error}") from error
     if table.get("schema") != SCHEMA:
-        raise TuningError(f"{where}: schema: got {table.get('schema')!r}, expected {SCHEMA}; not a mimopilot gains file?")
+        raise TuningError(
+            f"{where}: schema: got {table.get('schema')!r}, expected {SCHEMA}; not a mimopilot gains file?"
+        )
     known = {"schema", "Ts", "derivative_cutoff_hz", "moment_scale", "roll_pitch", "yaw", "limits", "provenance"}
     for key in sorted(set(table) - known):
         raise TuningError(f"{where}: {key}: unknown entry; known: {', '.join(sorted(known))}")

@@ -8,7 +8,7 @@ instrument is an external signal of the experiment at 2 l + 1 lags.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,9 +60,7 @@ def default_window(models: Sequence[ReferenceModel]) -> int:
     return max(model.settling_samples(0.1) for model in models)
 
 
-def virtual_signals(
-    y: Signal, models: Sequence[ReferenceModel]
-) -> tuple[Signal, Signal, Signal, list[ReferenceModel]]:
+def virtual_signals(y: Signal, models: Sequence[ReferenceModel]) -> tuple[Signal, Signal, Signal, list[ReferenceModel]]:
     """e_l, r_l and y_l for the filter l = product of the distinct models.
 
     Returns
@@ -94,9 +92,7 @@ def filter_by(signal: Signal, factors: Sequence[ReferenceModel]) -> Signal:
     return signal
 
 
-def regressors(
-    terms: str, e_l: Signal, y_l: Signal, r_l: Signal, Ts: float, derivative_cutoff_hz: float
-) -> Signal:
+def regressors(terms: str, e_l: Signal, y_l: Signal, r_l: Signal, Ts: float, derivative_cutoff_hz: float) -> Signal:
     """The regressor x(k) of the flown difference equation, one column a gain: P, I, D, F as `terms` has them.
 
     Parameters
@@ -114,7 +110,7 @@ def regressors(
     -------
     (N, n len(terms)) array
     """
-    columns = {
+    columns: dict[str, Callable[[], Signal]] = {
         "P": lambda: e_l,
         "I": lambda: Ts * np.cumsum(e_l, axis=0),
         "D": lambda: -filtered_derivative(y_l, Ts, derivative_cutoff_hz),
@@ -214,7 +210,7 @@ def _solve(
     samples = sum(len(x) for x in xs)
 
     def correlate(signals: list[Signal]) -> Signal:
-        total = sum(cross_correlation(w, s, lags) for w, s in zip(ws, signals, strict=True))
+        total = np.sum([cross_correlation(w, s, lags) for w, s in zip(ws, signals, strict=True)], axis=0)
         return np.reshape(total, (-1, signals[0].shape[1])) / samples
 
     scale = np.sqrt(sum((x**2).sum(axis=0) for x in xs) / samples)
@@ -258,8 +254,8 @@ def _residual_covariance(
     samples = sum(len(x) for x in xs)
     eps = [(u[:, row] - x @ b)[:, None] for u, x in zip(us, xs, strict=True)]
     taper = 1 - np.abs(np.arange(-memory, memory + 1)) / (memory + 1)
-    R_eps = sum(autocorrelation(e, memory) for e in eps)[:, 0, 0] / samples * taper
-    R_w = sum(autocorrelation(w, 2 * lags + memory) for w in ws) / samples
+    R_eps = np.sum([autocorrelation(e, memory) for e in eps], axis=0)[:, 0, 0] / samples * taper
+    R_w: Signal = np.sum([autocorrelation(w, 2 * lags + memory) for w in ws], axis=0) / samples
     n_w = R_w.shape[1]
     blocks = np.empty((4 * lags + 1, n_w, n_w))
     for i in range(n_w):
@@ -268,4 +264,5 @@ def _residual_covariance(
     difference = np.arange(2 * lags + 1)[:, None] - np.arange(2 * lags + 1)[None, :]
     gamma = blocks[difference + 2 * lags].transpose(0, 2, 1, 3).reshape((2 * lags + 1) * n_w, -1)
     gamma = (gamma + gamma.T) / 2
-    return gamma + LOADING * np.trace(gamma) / len(gamma) * np.eye(len(gamma))
+    loaded: Signal = gamma + LOADING * np.trace(gamma) / len(gamma) * np.eye(len(gamma))
+    return loaded

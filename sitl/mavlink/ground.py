@@ -127,7 +127,9 @@ class Ground:
         )
         if not version:
             return [answer(mavlink.MAV_RESULT_UNSUPPORTED)]
-        details = mavlink.MAVLink_autopilot_version_message(CAPABILITIES, 0, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, 0)
+        details = mavlink.MAVLink_autopilot_version_message(
+            CAPABILITIES, 0, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, 0
+        )
         return [answer(mavlink.MAV_RESULT_ACCEPTED), details]
 
     @staticmethod

@@ -43,7 +43,9 @@ def plant_process(airframe: str, port: int, Ts: float, seed: int, speed: float |
     try:
         line = child.stdout.readline()
         if not line:
-            raise SitlError(child.stderr.read().strip().removeprefix("mimopilot: ") or "the plant process did not start")
+            raise SitlError(
+                child.stderr.read().strip().removeprefix("mimopilot: ") or "the plant process did not start"
+            )
         yield int(line.rsplit(":", 1)[1])
     finally:
         child.terminate()
@@ -94,7 +96,7 @@ class Host:
             yield from self.codec.parse(data)
 
     def _take(self, message: Any) -> bool:
-        """Note a message of the plant; True when a new period is due. A repeated or backward time is answered, not flown."""
+        """Note a message of the plant; True when a new period is due. A repeated time is answered, not flown."""
         if message.get_type() != "HIL_STATE_QUATERNION":
             return False
         if message.time_usec <= self.stamp:

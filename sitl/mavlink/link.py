@@ -55,7 +55,9 @@ def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
         server.listen(backlog)
     except OSError as error:
         server.close()
-        raise SitlError(f"TCP port {port} on {host} cannot be used: {error.strerror}; is another simulator running?") from error
+        raise SitlError(
+            f"TCP port {port} on {host} cannot be used: {error.strerror}; is another simulator running?"
+        ) from error
     return server
 
 
@@ -72,6 +74,8 @@ def udp_socket(host: str, port: int) -> socket.socket:
         link.bind((host, port))
     except OSError as error:
         link.close()
-        raise SitlError(f"UDP port {port} on {host} cannot be used: {error.strerror}; is another vehicle running?") from error
+        raise SitlError(
+            f"UDP port {port} on {host} cannot be used: {error.strerror}; is another vehicle running?"
+        ) from error
     link.setblocking(False)
     return link

@@ -142,7 +142,8 @@ class PlantServer:
             q_rate,
             r,
             HOME_LATITUDE + round(float(position[0]) / METRES_PER_DEGREE * 1e7),
-            HOME_LONGITUDE + round(float(position[1]) / METRES_PER_DEGREE / np.cos(np.radians(HOME_LATITUDE * 1e-7)) * 1e7),
+            HOME_LONGITUDE
+            + round(float(position[1]) / METRES_PER_DEGREE / np.cos(np.radians(HOME_LATITUDE * 1e-7)) * 1e7),
             int(measurement[7]),
             *(_int16(float(v) * 100) for v in velocity[:2]),
             _int16(-float(measurement[8])),

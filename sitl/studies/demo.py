@@ -169,7 +169,9 @@ def _same_over_mavlink(
             elapsed = time.monotonic() - begin
         finally:
             host.close()
-    different = np.flatnonzero((record["moment"].view(np.uint32) != flight.record["moment"].view(np.uint32)).any(axis=1))
+    different = np.flatnonzero(
+        (record["moment"].view(np.uint32) != flight.record["moment"].view(np.uint32)).any(axis=1)
+    )
     if len(different):
         raise SitlError(
             f"over MAVLink {len(different)} of {len(record)} moments differ from the flight in process, first at "
@@ -199,7 +201,16 @@ def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
 
 
 GAIN_COLUMNS = ("gain", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
-FIGURE_COLUMNS = ("doublet", "J_M,o", "J_M,i", "J_r,o", "J_r,i", "off-axis peak [deg]", "off-axis RMS [deg]", "effort RMS")
+FIGURE_COLUMNS = (
+    "doublet",
+    "J_M,o",
+    "J_M,i",
+    "J_r,o",
+    "J_r,i",
+    "off-axis peak [deg]",
+    "off-axis RMS [deg]",
+    "effort RMS",
+)
 
 
 def _figure_rows(figures: dict[str, dict[str, Performance]]) -> list[list[str]]:
@@ -233,13 +244,14 @@ def _write_report(
         for axis, methods in flights.items()
     ]
     lead = (
-        f"ADAM-0 with 10 % inertia coupling (class values: the thesis prints no inertia), tuned from one {2 * SECONDS_PER_AXIS:g} s "
-        f"closed-loop flight. Reference models: rate loop {inner.label} samples, attitude loop {outer.label} samples."
+        "ADAM-0 with 10 % inertia coupling (class values: the thesis prints no inertia), tuned from one "
+        f"{2 * SECONDS_PER_AXIS:g} s closed-loop flight. Reference models: rate loop {inner.label} samples, attitude loop {outer.label} samples."
     )
     sections = [
         Section(
             "Experiment",
-            f"PRBS moment of amplitude {AMPLITUDE:g} and bandwidth {BANDWIDTH:g} rad/s on roll, then on pitch, under the default gains.",
+            f"PRBS moment of amplitude {AMPLITUDE:g} and bandwidth {BANDWIDTH:g} rad/s on roll, then on pitch, "
+            "under the default gains.",
             figures=[svg(experiment_figure(experiment), "experiment")],
         ),
         Section(
@@ -249,8 +261,8 @@ def _write_report(
         ),
         Section(
             "Doublets",
-            f"{DOUBLET_DEG:g} degrees, {DOUBLET_S:g} s. J in rad^2 and rad^2/s^2, over the doublet. The flight over MAVLink "
-            "(roll, MIMO) gave the same moments bit for bit.",
+            f"{DOUBLET_DEG:g} degrees, {DOUBLET_S:g} s. J in rad^2 and rad^2/s^2, over the doublet. The flight over "
+            "MAVLink (roll, MIMO) gave the same moments bit for bit.",
             tables=[Table("Performance figures, (6.1)-(6.4)", FIGURE_COLUMNS, _figure_rows(figures))],
             figures=doublets,
         ),

@@ -136,7 +136,9 @@ def test_gain_changes_are_bumpless_within_the_integrator_limit(library, gains):
     inputs = quiet(40, attitude_setpoint=[[0.02, -0.01, 0.01]], rates=[[0.01, 0.02, -0.01]])
     controller = NativeController(library, gains)
     before = controller.run(inputs)["moment"][-1]
-    assert controller.set_gains(gains.with_elements({"RP_RR": 0.2, "RP_RP": -0.05, "AP_RR": 4.0, "RI_PP": 0.4, "RP_YY": 0.3}))
+    assert controller.set_gains(
+        gains.with_elements({"RP_RR": 0.2, "RP_RP": -0.05, "AP_RR": 4.0, "RI_PP": 0.4, "RP_YY": 0.3})
+    )
     after = controller.run(inputs[:1])["moment"][0]
     # One period of integration is all that may change.
     assert np.abs(after - before).max() < 2e-4
@@ -167,9 +169,15 @@ def test_gains_that_no_vehicle_can_fly_are_refused_and_change_nothing(library, g
 
 def test_refused_gains_at_the_start_are_an_error(library, gains):
     array = to_array(gains)
-    assert library.lib.mimo_pid_initialise(library.ffi.new("uint8_t[1024]"), library.ffi.from_buffer("float[]", array)) == 1
+    assert (
+        library.lib.mimo_pid_initialise(library.ffi.new("uint8_t[1024]"), library.ffi.from_buffer("float[]", array))
+        == 1
+    )
     array[0] = np.nan
-    assert library.lib.mimo_pid_initialise(library.ffi.new("uint8_t[1024]"), library.ffi.from_buffer("float[]", array)) == 0
+    assert (
+        library.lib.mimo_pid_initialise(library.ffi.new("uint8_t[1024]"), library.ffi.from_buffer("float[]", array))
+        == 0
+    )
 
 
 def test_saturation_stops_the_integrator_in_that_direction_only(library, gains):

@@ -48,7 +48,7 @@ def test_the_manifest_holds_the_hash_of_every_file(gains):
 
 def test_nothing_generated_speaks_of_this_machine(gains, tmp_path):
     text = "\n".join(render(gains).values())
-    for word in (str(tmp_path), os.getcwd(), str(TEMPLATES), os.uname().nodename):
+    for word in (str(tmp_path), str(Path.cwd()), str(TEMPLATES), os.uname().nodename):
         assert word not in text
 
 
@@ -84,10 +84,17 @@ def test_the_emitted_test_fails_when_one_bit_is_wrong(gains, tmp_path):
     assert "1 of 256 rows differ" in result.stdout
 
 
-FAST_MATH = ["-Ofast", "-ffast-math", "-funsafe-math-optimizations", "-freciprocal-math -fno-signed-zeros -fno-trapping-math"]
+FAST_MATH = [
+    "-Ofast",
+    "-ffast-math",
+    "-funsafe-math-optimizations",
+    "-freciprocal-math -fno-signed-zeros -fno-trapping-math",
+]
 
 
-@pytest.mark.parametrize("flags", ["-O0", "-O2", "-O3", "-Os", "-O2 -mfma -ffp-contract=fast", *(f"{f} -fno-fast-math" for f in FAST_MATH)])
+@pytest.mark.parametrize(
+    "flags", ["-O0", "-O2", "-O3", "-Os", "-O2 -mfma -ffp-contract=fast", *(f"{f} -fno-fast-math" for f in FAST_MATH)]
+)
 def test_no_optimisation_flag_changes_a_bit(gains, tmp_path, flags):
     if "-mfma" in flags and "fma" not in Path("/proc/cpuinfo").read_text():
         flags = flags.replace("-mfma ", "")
@@ -122,7 +129,9 @@ def test_the_parameter_header_is_valid_c(gains, tmp_path):
         "int main(void) { for (int i = 0; i < MIMO_PID_PARAMETER_COUNT; i++) "
         'printf("%s %.9g\\n", mimo_pid_parameters[i].name, (double)mimo_pid_parameters[i].default_value); return 0; }\n'
     )
-    subprocess.run(["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", str(source), "-o", str(tmp_path / "use")], check=True)
+    subprocess.run(
+        ["gcc", "-std=c99", "-Wall", "-Wextra", "-Werror", str(source), "-o", str(tmp_path / "use")], check=True
+    )
     printed = subprocess.run([str(tmp_path / "use")], capture_output=True, text=True, check=True).stdout.split()
     values = gains.elements()
     assert printed[::2] == [p.name for p in PARAMETERS]

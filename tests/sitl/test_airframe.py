@@ -14,7 +14,7 @@ def test_the_airframes_of_the_thesis_come_with_their_gains():
 
 
 def test_an_unknown_airframe_lists_the_known_ones():
-    with pytest.raises(SitlError, match="unknown airframe 'adam1'.*adam0, adam0_nominal, adam0_perturbed, antr"):
+    with pytest.raises(SitlError, match=r"unknown airframe 'adam1'.*adam0, adam0_nominal, adam0_perturbed, antr"):
         load_airframe("adam1")
 
 

@@ -27,7 +27,12 @@ def hexacopter(airmode):
 
 
 def vehicles():
-    return [load_airframe("adam0").airframe.allocation(), load_airframe("antr").airframe.allocation(), hexacopter(False), hexacopter(True)]
+    return [
+        load_airframe("adam0").airframe.allocation(),
+        load_airframe("antr").airframe.allocation(),
+        hexacopter(False),
+        hexacopter(True),
+    ]
 
 
 def test_one_unit_of_moment_is_2_b_t_max():
@@ -57,12 +62,13 @@ def test_commands_stay_in_range_and_what_fits_is_given_exactly(roll, pitch, yaw,
         else:
             assert unallocated[axis] == np.sign(moments[axis])
             # Less of it, never the other way round.
-            assert -1e-9 <= got[axis] / moments[axis] <= 1 + 1e-9
+            low, high = sorted((0.0, moments[axis]))
+            assert low - 1e-9 <= got[axis] <= high + 1e-9
     # Yaw gives way before roll and pitch, which are scaled together.
     if unallocated[:2].any():
         assert abs(got[2]) < 1e-9
         if min(abs(roll), abs(pitch)) > 1e-6:
-            assert got[0] / roll == pytest.approx(got[1] / pitch, rel=1e-6, abs=1e-6)
+            assert got[0] * pitch == pytest.approx(got[1] * roll, abs=1e-9)
 
 
 def test_at_the_upper_limit_the_collective_is_lowered():

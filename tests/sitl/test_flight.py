@@ -154,7 +154,9 @@ def test_the_figures_of_a_perfect_response_are_zero_and_the_others_those_of_thei
     window = slice(*flight.scenario.window)
     setpoint = flight.scenario.setpoint[window, 0]
     assert window.stop - window.start == 100
-    assert figures.J_r_o == pytest.approx(np.mean((outer.response(flight.scenario.setpoint[:, 0])[window] - setpoint) ** 2), rel=1e-5)
+    assert figures.J_r_o == pytest.approx(
+        np.mean((outer.response(flight.scenario.setpoint[:, 0])[window] - setpoint) ** 2), rel=1e-5
+    )
     assert figures.J_r_i == pytest.approx(0.25)
     assert figures.J_M_i == pytest.approx(np.mean((0.5 - inner.response(np.ones(len(flight.record)))[window]) ** 2))
     assert figures.offaxis_peak_deg == pytest.approx(2.0)

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -61,7 +62,9 @@ def test_the_plant_repeats_its_first_frame_until_it_is_answered_and_then_keeps_l
         link.sendall(codec.pack(answer))
         frames = []
         while len(frames) < 2:
-            frames += [m for m in codec.parse(link.recv(4096)) if m.get_type() in ("HIL_SENSOR", "HIL_STATE_QUATERNION")]
+            frames += [
+                m for m in codec.parse(link.recv(4096)) if m.get_type() in ("HIL_SENSOR", "HIL_STATE_QUATERNION")
+            ]
         assert {f.get_type() for f in frames} == {"HIL_SENSOR", "HIL_STATE_QUATERNION"}
         assert frames[-1].time_usec == stamps[0] + 4000
         # Unanswered, it waits: nothing more comes.
@@ -138,7 +141,19 @@ def test_the_list_holds_the_whole_table_in_order(server):
 def running_sitl(*extra):
     """`mimopilot sitl` on ports of its own; yields the ground station's port."""
     plant_port, ground_port = free_port(), free_port(socket.SOCK_DGRAM)
-    command = [sys.executable, "-u", "-m", "mimopilot", "sitl", "adam0", "--port", plant_port, "--ground-port", ground_port, *extra]
+    command = [
+        sys.executable,
+        "-u",
+        "-m",
+        "mimopilot",
+        "sitl",
+        "adam0",
+        "--port",
+        plant_port,
+        "--ground-port",
+        ground_port,
+        *extra,
+    ]
     process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         assert "flies" in process.stdout.readline()
@@ -195,8 +210,16 @@ def test_a_ground_station_sees_the_vehicle_and_changes_its_gains():
 
 def test_mavproxy_fetches_and_sets_parameters(tmp_path):
     with running_sitl() as (_, port):
-        command = [sys.executable, "-m", "MAVProxy.mavproxy", f"--master=udp:127.0.0.1:{port}", "--default-modules=param,link"]
-        proxy = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=tmp_path)
+        command = [
+            sys.executable,
+            "-m",
+            "MAVProxy.mavproxy",
+            f"--master=udp:127.0.0.1:{port}",
+            "--default-modules=param,link",
+        ]
+        proxy = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=tmp_path
+        )
         output: list[str] = []
         reader = threading.Thread(target=lambda: output.extend(iter(lambda: proxy.stdout.read(1), "")))
         reader.start()
@@ -223,7 +246,7 @@ def test_mavproxy_fetches_and_sets_parameters(tmp_path):
             say("param show MIMO_RP_RR")
             until("MIMO_RP_RR       0.11999999731779099")
         finally:
-            proxy.terminate()
+            proxy.kill()
             proxy.wait(timeout=10)
             reader.join(timeout=10)
             proxy.stdin.close()
@@ -233,7 +256,11 @@ def test_mavproxy_fetches_and_sets_parameters(tmp_path):
 def test_a_plant_port_in_use_is_one_clear_line(mimopilot):
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
-        assert_one_clear_line(mimopilot("sitl", "adam0", "--port", port, "--ground-port", free_port(socket.SOCK_DGRAM)), f"TCP port {port}", "is another simulator running?")
+        assert_one_clear_line(
+            mimopilot("sitl", "adam0", "--port", port, "--ground-port", free_port(socket.SOCK_DGRAM)),
+            f"TCP port {port}",
+            "is another simulator running?",
+        )
         assert_one_clear_line(mimopilot("plant", "adam0", "--port", port), f"TCP port {port}")
 
 
@@ -241,8 +268,9 @@ def test_ctrl_c_ends_both_processes():
     import signal
 
     with running_sitl() as (process, _):
-        children = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True, check=True).stdout.split()
+        tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
+        children = [child for task in tasks for child in task.read_text().split()]
         assert len(children) == 1
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=10) == 0
-        assert subprocess.run(["kill", "-0", children[0]], capture_output=True, check=False).returncode != 0
+        assert not Path(f"/proc/{children[0]}").exists()

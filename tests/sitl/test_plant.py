@@ -26,21 +26,21 @@ def random_tensor(rng):
 
 def test_a_torque_free_asymmetric_top_follows_the_elliptic_functions():
     # Landau and Lifshitz, Mechanics, section 37: I1 < I2 < I3, M^2 > 2 E I2.
-    I = np.array([0.0147, 0.0172, 0.0295])
+    J = np.array([0.0147, 0.0172, 0.0295])
     omega0 = np.array([0.6, 0.0, 1.5])
-    E2 = float(I @ omega0**2)
-    M2 = float((I * omega0) @ (I * omega0))
-    assert M2 > E2 * I[1]
-    speed = np.sqrt((I[2] - I[1]) * (M2 - E2 * I[0]) / I.prod())
-    k2 = (I[1] - I[0]) * (E2 * I[2] - M2) / ((I[2] - I[1]) * (M2 - E2 * I[0]))
+    E2 = float(J @ omega0**2)
+    M2 = float((J * omega0) @ (J * omega0))
+    assert E2 * J[1] < M2
+    speed = np.sqrt((J[2] - J[1]) * (M2 - E2 * J[0]) / J.prod())
+    k2 = (J[1] - J[0]) * (E2 * J[2] - M2) / ((J[2] - J[1]) * (M2 - E2 * J[0]))
     dt, n = 1e-3, 5000
-    rates, _ = integrate_moments(np.diag(I), np.zeros((n, 3)), dt, omega0)
+    rates, _ = integrate_moments(np.diag(J), np.zeros((n, 3)), dt, omega0)
     sn, cn, dn, _ = ellipj(speed * dt * np.arange(n + 1), k2)
     exact = np.column_stack(
         [
-            np.sqrt((E2 * I[2] - M2) / (I[0] * (I[2] - I[0]))) * cn,
-            np.sqrt((E2 * I[2] - M2) / (I[1] * (I[2] - I[1]))) * sn,
-            np.sqrt((M2 - E2 * I[0]) / (I[2] * (I[2] - I[0]))) * dn,
+            np.sqrt((E2 * J[2] - M2) / (J[0] * (J[2] - J[0]))) * cn,
+            np.sqrt((E2 * J[2] - M2) / (J[1] * (J[2] - J[1]))) * sn,
+            np.sqrt((M2 - E2 * J[0]) / (J[2] * (J[2] - J[0]))) * dn,
         ]
     )
     # The sense of the rotation about axis 2 is that of Euler's equations.
@@ -131,7 +131,10 @@ def test_160_g_at_motor_3_moves_the_centre_and_adds_to_three_entries_of_the_tens
 
 def test_an_added_mass_is_the_same_body_seen_from_its_new_centre():
     rng = np.random.default_rng(4)
-    parts = [PointMass(mass=float(m), position=tuple(map(float, r))) for m, r in zip(rng.uniform(0.1, 1, 5), rng.standard_normal((5, 3)), strict=True)]
+    parts = [
+        PointMass(mass=float(m), position=tuple(map(float, r)))
+        for m, r in zip(rng.uniform(0.1, 1, 5), rng.standard_normal((5, 3)), strict=True)
+    ]
     mass, centre, total = combine_masses(2.0, random_tensor(rng), tuple(parts))
     at_once = combine_masses(2.0, np.zeros((3, 3)), tuple(parts))[2]
     # Linearity in the body's own inertia, and independence of the order of the parts.

@@ -51,8 +51,12 @@ def test_the_inverse_forgets_its_unknown_integrator_after_settling(gains):
     gains = unlimited(gains)
     u, r_i, y_i = fly(gains)
     rebuilt, settling = rebuild_rate_setpoint(gains, u + 0.1, y_i)  # as if I had started at 0.1
-    longer, _ = rebuild_rate_setpoint(gains, np.vstack([u + 0.1, np.full((settling, 2), 0.1)]), np.vstack([y_i, np.zeros((settling, 2))]))
-    plain, _ = rebuild_rate_setpoint(gains, np.vstack([u, np.zeros((settling, 2))]), np.vstack([y_i, np.zeros((settling, 2))]))
+    longer, _ = rebuild_rate_setpoint(
+        gains, np.vstack([u + 0.1, np.full((settling, 2), 0.1)]), np.vstack([y_i, np.zeros((settling, 2))])
+    )
+    plain, _ = rebuild_rate_setpoint(
+        gains, np.vstack([u, np.zeros((settling, 2))]), np.vstack([y_i, np.zeros((settling, 2))])
+    )
     start = np.abs(longer - plain)[0].max()
     assert np.abs(longer - plain)[settling:].max() < 0.02 * start
     assert np.abs(rebuilt - r_i)[0].max() == pytest.approx(start, rel=1e-6)
@@ -80,7 +84,9 @@ def test_a_proportional_controller_can_be_inverted_too(gains):
 def test_a_singular_controller_is_refused(gains):
     zero = np.zeros((2, 2))
     with pytest.raises(TuningError, match="singular"):
-        rebuild_rate_setpoint(dataclasses.replace(gains, Kp_i=zero, Ki_i=zero, Kff_i=zero), np.zeros((N, 2)), np.zeros((N, 2)))
+        rebuild_rate_setpoint(
+            dataclasses.replace(gains, Kp_i=zero, Ki_i=zero, Kff_i=zero), np.zeros((N, 2)), np.zeros((N, 2))
+        )
 
 
 def test_the_derivative_of_a_ramp_settles_on_its_slope():

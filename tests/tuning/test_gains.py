@@ -17,7 +17,9 @@ def test_a_gains_file_reads_back_to_the_same_bits(values, text):
     from tuning.gains import YawGains
 
     matrices = {name: np.reshape(values[4 * i : 4 * i + 4], (2, 2)) for i, name in enumerate(MATRICES)}
-    written = Gains(**matrices, yaw=YawGains(*values[20:]), Ts=0.004, derivative_cutoff_hz=30.0, provenance={"log": text})
+    written = Gains(
+        **matrices, yaw=YawGains(*values[20:]), Ts=0.004, derivative_cutoff_hz=30.0, provenance={"log": text}
+    )
     read = gains_from_toml(gains_to_toml(written), "test")
     assert read.elements() == written.elements()
     assert read.provenance == written.provenance

@@ -65,7 +65,9 @@ def test_the_transient_is_below_one_percent_after_settling():
     assert impulse[model.settling_samples() // 2 :].max() > 0.02 * impulse.max()
 
 
-@pytest.mark.parametrize(("omega", "zeta", "delay"), [(0, 0.4, 0), (20, -1, 0), (20, 0.4, -1), (1e4, 0.4, 0), (math.nan, 1, 0)])
+@pytest.mark.parametrize(
+    ("omega", "zeta", "delay"), [(0, 0.4, 0), (20, -1, 0), (20, 0.4, -1), (1e4, 0.4, 0), (math.nan, 1, 0)]
+)
 def test_an_impossible_model_is_refused(omega, zeta, delay):
     with pytest.raises(TuningError, match="reference model"):
         second_order(omega, zeta, delay, TS)

@@ -115,12 +115,14 @@ def _period(time: NDArray[np.float64]) -> float:
 
 
 def _place(signal: Series, grid: NDArray[np.float64], Ts: float, hold: bool) -> NDArray[np.float64]:
-    # Half of a thousandth of a period forgives rounding of the stamps, so that equal times pair exactly.
+    # A thousandth of a period forgives rounding of the stamps, so that equal times pair exactly.
+    index = np.searchsorted(signal.time, grid + 1e-3 * Ts, side="right") - 1
+    last = signal.values[np.maximum(index, 0)]
     if hold:
-        index = np.searchsorted(signal.time, grid + 1e-3 * Ts, side="right") - 1
-        placed = signal.values[np.maximum(index, 0)]
-        return np.where((index >= 0)[:, None], placed, placed[0] * 0.0)
-    return np.column_stack([np.interp(grid, signal.time, column) for column in signal.values.T])
+        return np.where((index >= 0)[:, None], last, 0.0)
+    exact = np.abs(signal.time[np.maximum(index, 0)] - grid) <= 1e-3 * Ts
+    between = np.column_stack([np.interp(grid, signal.time, column) for column in signal.values.T])
+    return np.where(exact[:, None], last, between)
 
 
 def _covered(time: NDArray[np.float64], grid: NDArray[np.float64], Ts: float) -> NDArray[np.bool_]:

@@ -1,0 +1,226 @@
+"""The command line as a user meets it, on real input, and what it says to mistakes."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+
+import pytest
+from pyulog import ULog
+
+from tests.conftest import assert_one_clear_line
+
+COMMANDS = ["demo", "experiment", "tune", "generate", "fly", "sitl", "plant"]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    """A short experiment, flown by the command."""
+    path = tmp_path_factory.mktemp("log") / "flight.ulg"
+    command = [sys.executable, "-m", "mimopilot", "experiment", "adam0", "--seconds-per-axis", "8", "--out", str(path)]
+    subprocess.run(command, check=True, capture_output=True)
+    return path
+
+
+def test_help_starts_without_the_heavy_libraries(mimopilot):
+    heavy = ("numpy", "scipy", "numba", "matplotlib", "pydantic", "pymavlink")
+    code = f"import sys, mimopilot; print([m for m in {heavy} if m in sys.modules])"
+    assert (
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.strip() == "[]"
+    )
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_help_with_an_example(mimopilot, command):
+    result = mimopilot(command, "--help")
+    assert result.returncode == 0
+    assert f"Example: mimopilot {command}" in result.stdout
+
+
+def test_the_commands_are_all_listed(mimopilot):
+    listing = mimopilot("--help").stdout
+    for command in COMMANDS:
+        assert f"  {command} " in listing
+
+
+def test_from_a_log_to_a_flight_by_the_commands_alone(mimopilot, log, tmp_path):
+    tuned = mimopilot("tune", log, "--out", "my.gains.toml", "--json")
+    assert tuned.returncode == 0, tuned.stderr
+    found = json.loads(tuned.stdout)
+    for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i"):
+        assert [len(row) for row in found[name]] == [2, 2]
+    # 10 % coupling in the inertia: positive off-diagonals, about a tenth of the diagonal.
+    assert 0.05 < found["Kp_i"][0][1] / found["Kp_i"][1][1] < 0.18
+    assert mimopilot("generate", "my.gains.toml", "--target", "native", "--out", "cpp").returncode == 0
+    assert (
+        subprocess.run(
+            ["make", "-s", "-C", tmp_path / "cpp/native", "test"], capture_output=True, check=False
+        ).returncode
+        == 0
+    )
+    flown = mimopilot("fly", "adam0", "--gains", "my.gains.toml", "--axis", "pitch", "--out", "doublet.ulg", "--json")
+    assert flown.returncode == 0, flown.stderr
+    figures = json.loads(flown.stdout)
+    assert figures["axis"] == "pitch"
+    assert figures["offaxis_peak_deg"] < 0.6
+    assert ULog(str(tmp_path / "doublet.ulg")).get_dataset("vehicle_torque_setpoint")
+
+
+def test_tables_are_the_default_output(mimopilot, log):
+    result = mimopilot("tune", log, "--method", "siso", "--out", "s.gains.toml")
+    assert "SISO gains" in result.stdout
+    assert "pitch<-roll" in result.stdout
+
+
+def test_equal_seeds_give_equal_logs(mimopilot, tmp_path):
+    for name in ("a.ulg", "b.ulg"):
+        assert mimopilot("experiment", "adam0", "--seconds-per-axis", "3", "--seed", "4", "--out", name).returncode == 0
+    assert (tmp_path / "a.ulg").read_bytes() == (tmp_path / "b.ulg").read_bytes()
+
+
+def test_models_window_and_specification_are_taken(mimopilot, log, tmp_path):
+    (tmp_path / "spec.toml").write_text(
+        "inner = [[25, 0.5, 1], [20, 0.4, 0]]\nouter = [9, 0.8, 0]\nderivative_cutoff_hz = 0\n"
+    )
+    result = mimopilot(
+        "tune", log, "--spec", "spec.toml", "--outer", "8,0.9,2", "--window", "40", "--out", "x.gains.toml"
+    )
+    assert result.returncode == 0, result.stderr
+    text = (tmp_path / "x.gains.toml").read_text()
+    assert "inner_model = [[25.0, 0.5, 1], [20.0, 0.4, 0]]" in text
+    assert "outer_model = [[8.0, 0.9, 2], [8.0, 0.9, 2]]" in text
+    assert "window = [40, 40]" in text
+    assert "derivative_cutoff_hz = 0.0" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("fly", "adam1"), ("unknown airframe 'adam1'", "adam0_nominal", "antr")),
+        (("fly", "adam0", "--gains", "none.toml"), ("none.toml", "cannot read")),
+        (("fly", "adam0", "--axis", "yaw"), ("axis: got 'yaw'",)),
+        (("fly", "adam0", "--scenario", "spin"), ("scenario: got 'spin'",)),
+        (("fly", "adam0", "--amplitude-deg", "nan"), ("amplitude: got nan",)),
+        (("tune", "none.ulg", "--out", "x.toml"), ("none.ulg", "no such file")),
+        (("tune", "text.ulg", "--out", "x.toml"), ("text.ulg", "not a ULog")),
+        (("tune", "cut.ulg", "--out", "x.toml"), ("cut.ulg",)),
+        (("tune", "LOG", "--inner", "20", "--out", "x.toml"), ("expected OMEGA,ZETA,DELAY",)),
+        (("tune", "LOG", "--inner", "20,-1,0", "--out", "x.toml"), ("inner.0.1",)),
+        (("tune", "LOG", "--method", "magic", "--out", "x.toml"), ("method", "'mimo' or 'siso'")),
+        (("tune", "LOG", "--outer", "0.5,0.7,0", "--out", "x.toml"), ("too short",)),
+        (("generate", "bad.toml", "--out", "cpp"), ("bad.toml", "schema")),
+        (("experiment", "adam0", "--bandwidth", "-5", "--out", "x.ulg"), ("bandwidth: got -5",)),
+        (("experiment", "adam0", "--seconds-per-axis", "2", "--out", "text.ulg/x.ulg"), ("text.ulg",)),
+        (("plant", "adam0", "--speed", "fast"), ("--speed fast",)),
+    ],
+)
+def test_a_mistake_is_one_clear_line_and_nothing_is_written(mimopilot, log, tmp_path, arguments, words):
+    (tmp_path / "text.ulg").write_text("hello")
+    (tmp_path / "cut.ulg").write_bytes(log.read_bytes()[:300])
+    (tmp_path / "bad.toml").write_text("a = 1")
+    before = sorted(p.name for p in tmp_path.iterdir())
+    assert_one_clear_line(mimopilot(*(log if a == "LOG" else a for a in arguments)), *words)
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
+def test_a_gains_file_with_a_matrix_that_is_not_finite_is_refused(mimopilot, log, tmp_path):
+    mimopilot("tune", log, "--out", "x.gains.toml")
+    text = (tmp_path / "x.gains.toml").read_text()
+    line = next(row for row in text.splitlines() if row.startswith("Ki_i = [["))
+    (tmp_path / "x.gains.toml").write_text(text.replace(line, "Ki_i = [[nan, 0.0], [0.0, 0.1]]"))
+    assert_one_clear_line(mimopilot("generate", "x.gains.toml", "--out", "cpp"), "Ki_i[0][0]: got nan")
+    (tmp_path / "x.gains.toml").write_text(text.replace(line + "\n", ""))
+    assert_one_clear_line(mimopilot("fly", "adam0", "--gains", "x.gains.toml"), "roll_pitch.Ki_i: missing")
+    assert not (tmp_path / "cpp").exists()
+
+
+def test_without_a_compiler_the_package_is_named(mimopilot, tmp_path):
+    environment = {**os.environ, "PATH": "/nowhere", "XDG_CACHE_HOME": str(tmp_path)}
+    assert_one_clear_line(mimopilot("fly", "adam0", env=environment), "no C++ compiler", "apt-get install g++")
+
+
+def test_a_log_without_the_topics_names_them_and_its_own(mimopilot, tmp_path):
+    import numpy as np
+
+    from sitl.ulog_writer import ulog_bytes
+
+    topics = {
+        "vehicle_attitude": {"q": np.tile(np.float32([1, 0, 0, 0]), (3000, 1))},
+        "battery_status": {"voltage_v": np.ones(3000, np.float32)},
+    }
+    (tmp_path / "x.ulg").write_bytes(ulog_bytes(0.004, topics, {}, {}))
+    result = mimopilot("tune", "x.ulg", "--out", "x.toml")
+    assert_one_clear_line(
+        result, "vehicle_torque_setpoint", "vehicle_angular_velocity", "battery_status, vehicle_attitude"
+    )
+
+
+@pytest.mark.parametrize(("Ts", "seconds", "words"), [(0.02, 20, "too slow"), (0.004, 3, "too short")])
+def test_a_slow_or_short_log_is_refused(mimopilot, tmp_path, Ts, seconds, words):
+    import numpy as np
+
+    from sitl.ulog_writer import ulog_bytes
+
+    n = round(seconds / Ts)
+    xyz = np.random.default_rng(0).standard_normal((n, 3)).astype(np.float32)
+    topics = {
+        "vehicle_torque_setpoint": {"xyz": xyz},
+        "vehicle_angular_velocity": {"xyz": xyz},
+        "vehicle_attitude": {"q": np.tile(np.float32([1, 0, 0, 0]), (n, 1))},
+    }
+    (tmp_path / "x.ulg").write_bytes(ulog_bytes(Ts, topics, {}, {}))
+    assert_one_clear_line(mimopilot("tune", "x.ulg", "--out", "x.toml"), words)
+
+
+def test_a_full_disk_leaves_the_old_file_whole(tmp_path, monkeypatch):
+    from tuning.files import write_atomically
+
+    path = tmp_path / "x"
+    write_atomically(path, "old")
+
+    def fail(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(path, "new")
+    assert path.read_text() == "old"
+    assert [p.name for p in tmp_path.iterdir()] == ["x"]
+
+
+def test_the_demo_does_the_whole_way(mimopilot, tmp_path):
+    begin = time.monotonic()
+    result = mimopilot("demo", "--out", "out", "--seed", "1", "--json")
+    assert result.returncode == 0, result.stderr
+    assert time.monotonic() - begin < 60
+    found = json.loads(result.stdout)
+    assert set(found["gains"]) == {"default", "siso", "mimo"}
+    for path in (*found["gains"].values(), found["report"], found["log"]):
+        assert (tmp_path / path).stat().st_size > 500
+    for axis in ("roll", "pitch"):
+        methods = found["doublets"][axis]
+        assert set(methods) == {"default", "siso", "mimo"}
+        for figures in methods.values():
+            assert set(figures) == {
+                "J_M_o",
+                "J_M_i",
+                "J_r_o",
+                "J_r_i",
+                "offaxis_peak_deg",
+                "offaxis_rms_deg",
+                "effort_rms",
+            }
+        # What multivariable tuning is for: the coupling is answered before it is felt.
+        assert methods["mimo"]["offaxis_peak_deg"] < methods["siso"]["offaxis_peak_deg"] / 3
+        assert methods["mimo"]["J_M_o"] < 1.1 * methods["siso"]["J_M_o"]
+    assert found["mavlink"]["different"] == 0
+    page = (tmp_path / found["report"]).read_text()
+    assert page.count("<svg") == 3
+    assert "http" not in page.replace("http://www.w3.org", "").replace("https://www.w3.org", "").replace(
+        "http://purl.org", ""
+    ).replace("http://creativecommons.org", "")
+    again = mimopilot("demo", "--out", "again", "--seed", "1", "--json")
+    for name in ("flight.ulg", "mimo.gains.toml", "siso.gains.toml", "report.html", "firmware/mimo/manifest.json"):
+        assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
+    assert again.returncode == 0
