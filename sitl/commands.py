@@ -108,6 +108,7 @@ def sitl(
     gains: GainsOption = None,
     port: Annotated[int, typer.Option(help="TCP port of the plant (PX4's simulator API).")] = 4560,
     ground_port: Annotated[int, typer.Option(help="UDP port where the ground station listens.")] = 14550,
+    vehicle_port: Annotated[int, typer.Option(help="Local UDP port of the vehicle.")] = 18570,
     speed: Annotated[float, typer.Option(help="Times real time.")] = 1.0,
     seed: SeedOption = 0,
 ) -> None:
@@ -120,7 +121,7 @@ def sitl(
     body, controller = _load(airframe, gains)
     autopilot = Autopilot(body, controller)
     autopilot.warm_up()
-    ground = Ground(ParameterServer(autopilot.controller, controller), ground_port)
+    ground = Ground(ParameterServer(autopilot.controller, controller), ground_port, vehicle_port)
     with plant_process(airframe, port, controller.Ts, seed, speed) as plant_port:
         host = Host(autopilot, len(body.rotors), plant_port)
         print(

@@ -6,6 +6,7 @@ HIL_ACTUATOR_CONTROLS and only then steps.
 
 from __future__ import annotations
 
+import math
 import socket
 import time
 from collections.abc import Iterator
@@ -26,8 +27,9 @@ NOISE_BLOCK = 250
 EPOCH_US = 1_000_000
 HOME_LATITUDE, HOME_LONGITUDE = 473977420, 85455940  # 1e-7 deg
 METRES_PER_DEGREE = 111_319.5
+METRES_PER_DEGREE_EAST = METRES_PER_DEGREE * math.cos(math.radians(HOME_LATITUDE * 1e-7))
 ALL_FIELDS = 7 | 56 | 448 | 6656  # accelerometer, gyro, magnetometer, barometer
-EARTH_FIELD = np.array([0.21, 0.01, 0.43])  # Gauss, NED
+EARTH_FIELD = (0.21, 0.01, 0.43)  # Gauss, NED
 
 
 class PlantServer:
@@ -74,14 +76,12 @@ class PlantServer:
             frame = self._frame(count, measurement)
             try:
                 connection.sendall(frame)
-                if count == 0:
-                    connection.settimeout(FIRST_ANSWER_S)
+                connection.settimeout(FIRST_ANSWER_S if count == 0 else None)
                 answer = None
-                while answer is None:
-                    answer = next(answers)
+                while answer is None or answer.time_usec < EPOCH_US + round(count * self.Ts * 1e6):
+                    answer = next(answers)  # an answer to a repeated frame is older than this one
                     if answer is None:
                         connection.sendall(frame)
-                connection.settimeout(None)
             except (StopIteration, OSError):
                 return count
             commands = np.array(answer.controls, np.float32)
@@ -117,39 +117,39 @@ class PlantServer:
         stamp = EPOCH_US + round(count * self.Ts * 1e6)
         q = [float(v) for v in measurement[:4]]
         p, q_rate, r = (float(v) for v in measurement[4:7])
-        position, velocity = self.simulator.state[:3], self.simulator.state[3:6]
+        x, y, z, vx, vy = (float(v) for v in self.simulator.state[:5])
         speeds = self.simulator.state[13:]
         lift = self.simulator.plant.thrust_coefficient * float(speeds @ speeds) / self.simulator.plant.mass
-        magnetic = _to_body(q, EARTH_FIELD)
-        pressure = 1013.25 * (1 + position[2] / 44330.0) ** 5.255
+        pressure = 1013.25 * (1 + z / 44330.0) ** 5.255
         sensor = mavlink.MAVLink_hil_sensor_message(
             stamp,
             *(0.0, 0.0, -lift),
             *(p, q_rate, r),
-            *(float(v) for v in magnetic),
+            *_to_body(q, EARTH_FIELD),
             pressure,
             0.0,
-            float(-position[2]),
+            -z,
             20.0,
             ALL_FIELDS,
         )
-        down = _to_body(q, np.array([0.0, 0.0, GRAVITY]))
-        acceleration = [round(float(v) / GRAVITY * 1000) for v in (*down[:2], down[2] - lift)]
+        gx, gy, gz = _to_body(q, (0.0, 0.0, 1.0))
         state = mavlink.MAVLink_hil_state_quaternion_message(
             stamp,
             q,
             p,
             q_rate,
             r,
-            HOME_LATITUDE + round(float(position[0]) / METRES_PER_DEGREE * 1e7),
-            HOME_LONGITUDE
-            + round(float(position[1]) / METRES_PER_DEGREE / np.cos(np.radians(HOME_LATITUDE * 1e-7)) * 1e7),
+            HOME_LATITUDE + round(x / METRES_PER_DEGREE * 1e7),
+            HOME_LONGITUDE + round(y / METRES_PER_DEGREE_EAST * 1e7),
             int(measurement[7]),
-            *(_int16(float(v) * 100) for v in velocity[:2]),
+            _int16(vx * 100),
+            _int16(vy * 100),
             _int16(-float(measurement[8])),
             0,
             0,
-            *(_int16(v) for v in acceleration),
+            _int16(gx * 1000),
+            _int16(gy * 1000),
+            _int16((gz - lift / GRAVITY) * 1000),
         )
         return self.codec.pack(sensor) + self.codec.pack(state)
 
@@ -158,7 +158,12 @@ def _int16(value: float) -> int:
     return max(-32768, min(32767, round(value)))
 
 
-def _to_body(q: list[float], v: Any) -> Any:
-    """An earth vector in body axes."""
-    w, r = q[0], np.array(q[1:])
-    return v - 2 * w * np.cross(r, v) + 2 * np.cross(r, np.cross(r, v))
+def _to_body(q: list[float], v: tuple[float, float, float]) -> tuple[float, float, float]:
+    """An earth vector in body axes; plain floats, NumPy would cost more than the rest of the frame."""
+    w, x, y, z = q
+    a, b, c = v
+    return (
+        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
+        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
+        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
+    )

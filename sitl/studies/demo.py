@@ -245,7 +245,8 @@ def _write_report(
     ]
     lead = (
         "ADAM-0 with 10 % inertia coupling (class values: the thesis prints no inertia), tuned from one "
-        f"{2 * SECONDS_PER_AXIS:g} s closed-loop flight. Reference models: rate loop {inner.label} samples, attitude loop {outer.label} samples."
+        f"{2 * SECONDS_PER_AXIS:g} s closed-loop flight. Reference models (rad/s, damping, delay in samples): "
+        f"rate loop {inner.label}; attitude loop {outer.label}."
     )
     sections = [
         Section(

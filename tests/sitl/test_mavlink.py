@@ -51,6 +51,18 @@ def test_a_flight_over_mavlink_has_the_same_moments_bit_for_bit(vehicle):
     assert record.tobytes() == in_process.record.tobytes()
 
 
+def test_an_autopilot_that_starts_late_flies_the_same_flight(vehicle):
+    gains = vehicle.default_gains()
+    scenario = doublet("roll", 0.39, 0.42, TS, tail=0.1)
+    in_process = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), scenario, seed=5)
+    with plant_process("adam0", 0, TS, 5, None) as port:
+        host = Host(Autopilot(vehicle.airframe, gains), 4, port)
+        time.sleep(1.0)  # several copies of the first frame are waiting by now
+        record = host.fly(scenario)
+        host.close()
+    assert record.tobytes() == in_process.record.tobytes()
+
+
 def test_the_plant_repeats_its_first_frame_until_it_is_answered_and_then_keeps_lockstep():
     with plant_process("adam0", 0, TS, 0, None) as port, socket.create_connection(("127.0.0.1", port)) as link:
         link.settimeout(5)
@@ -140,24 +152,17 @@ def test_the_list_holds_the_whole_table_in_order(server):
 @contextmanager
 def running_sitl(*extra):
     """`mimopilot sitl` on ports of its own; yields the ground station's port."""
-    plant_port, ground_port = free_port(), free_port(socket.SOCK_DGRAM)
-    command = [
-        sys.executable,
-        "-u",
-        "-m",
-        "mimopilot",
-        "sitl",
-        "adam0",
-        "--port",
-        plant_port,
-        "--ground-port",
-        ground_port,
-        *extra,
-    ]
-    process = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    ports = {
+        "--port": free_port(),
+        "--ground-port": free_port(socket.SOCK_DGRAM),
+        "--vehicle-port": free_port(socket.SOCK_DGRAM),
+    }
+    options = [str(item) for pair in ports.items() for item in pair]
+    command = [sys.executable, "-u", "-m", "mimopilot", "sitl", "adam0", *options, *extra]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     try:
         assert "flies" in process.stdout.readline()
-        yield process, ground_port
+        yield process, ports["--ground-port"]
     finally:
         process.terminate()
         process.wait(timeout=10)
@@ -256,11 +261,9 @@ def test_mavproxy_fetches_and_sets_parameters(tmp_path):
 def test_a_plant_port_in_use_is_one_clear_line(mimopilot):
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
-        assert_one_clear_line(
-            mimopilot("sitl", "adam0", "--port", port, "--ground-port", free_port(socket.SOCK_DGRAM)),
-            f"TCP port {port}",
-            "is another simulator running?",
-        )
+        free = ("--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", free_port(socket.SOCK_DGRAM))
+        in_use = mimopilot("sitl", "adam0", "--port", port, *free)
+        assert_one_clear_line(in_use, f"TCP port {port}", "is another simulator running?")
         assert_one_clear_line(mimopilot("plant", "adam0", "--port", port), f"TCP port {port}")
 
 
@@ -268,8 +271,8 @@ def test_ctrl_c_ends_both_processes():
     import signal
 
     with running_sitl() as (process, _):
-        tasks = Path(f"/proc/{process.pid}/task").glob("*/children")
-        children = [child for task in tasks for child in task.read_text().split()]
+        parents = {p.parent.name: p.read_text().rsplit(")", 1)[1].split()[1] for p in Path("/proc").glob("[0-9]*/stat")}
+        children = [child for child, parent in parents.items() if parent == str(process.pid)]
         assert len(children) == 1
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=10) == 0

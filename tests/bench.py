@@ -1,0 +1,100 @@
+"""`make bench`: what is measured rather than tested, each figure beside what it is compared with, in one run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from codegen.native import NativeController, build_native, load_native
+from codegen.vectors import random_inputs, reference_outputs
+from sitl.airframe import load_airframe
+from sitl.autopilot import Autopilot
+from sitl.loop import fly
+from sitl.mavlink.host import Host, plant_process
+from sitl.scenario import doublet, excitation_flight
+from tuning.cascade import tune
+from tuning.controller import Controller
+from tuning.logs.ulog import read_ulog
+from tuning.output import print_table
+from tuning.spec import load_spec
+
+TS = 0.004
+
+
+def best(call: Callable[[], object], repeats: int = 5) -> float:
+    """Shortest of several runs, s."""
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def command(*arguments: str) -> Callable[[], object]:
+    line = [sys.executable, "-m", "mimopilot", *arguments]
+    return lambda: subprocess.run(line, check=True, capture_output=True)
+
+
+def main() -> None:
+    vehicle = load_airframe("adam0")
+    gains, airframe = vehicle.default_gains(), vehicle.airframe
+    rows: list[list[str]] = []
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+
+        rows.append(["mimopilot --help", f"{best(command('--help')):.2f} s", "under 0.5 s"])
+        rows.append(["mimopilot demo", f"{best(command('demo', '--out', name + '/demo'), 2):.1f} s", "under 60 s"])
+        numbers = iter(range(100))
+        build = best(lambda: build_native(gains, folder / f"b{next(numbers)}"), 3)
+        rows.append(["emit and compile the native library", f"{build:.2f} s", ""])
+
+        scenario = excitation_flight(20.0, 0.15, 50.0, TS, np.random.default_rng(0))
+        library = load_native(gains)
+
+        def flight() -> object:
+            return fly(airframe, Autopilot(airframe, gains, NativeController(library, gains)), scenario, 0)
+
+        flight()
+        speed = 40.0 / best(flight)
+        rows.append(["flight in process, 6 degrees of freedom, RK4 at 1 kHz", f"{speed:.0f} x real time", ""])
+
+        task = doublet("roll", 0.39, 4.0, TS, tail=20.0)
+        autopilot = Autopilot(airframe, gains, NativeController(library, gains))
+        autopilot.warm_up()
+        with plant_process("adam0", 0, TS, 0, None) as port:
+            host = Host(autopilot, 4, port)
+            begin = time.perf_counter()
+            host.fly(task)
+            over_wire = len(task.setpoint) * TS / (time.perf_counter() - begin)
+            host.close()
+        rows.append(
+            ["the same as two processes over MAVLink", f"{over_wire:.0f} x real time", f"1/{speed / over_wire:.0f}"]
+        )
+
+        inputs = random_inputs(2000, np.random.default_rng(0))
+        native = best(lambda: NativeController(library, gains).run(inputs)) / len(inputs)
+        reference = best(lambda: reference_outputs(Controller(gains), inputs), 2) / len(inputs)
+        rows.append(["one step of the controller, compiled", f"{native * 1e9:.0f} ns", ""])
+        rows.append(
+            ["one step of the controller, Python reference", f"{reference * 1e6:.0f} us", f"{reference / native:.0f} x"]
+        )
+
+        experiment = read_ulog(folder / "demo" / "flight.ulg")
+        identity = best(lambda: tune(experiment, load_spec(weight="identity")))
+        rows.append(["tune the cascade, N = 10^4, least squares", f"{identity * 1e3:.0f} ms", ""])
+        optimal = best(lambda: tune(experiment))
+        rows.append(
+            ["tune the cascade, N = 10^4, two-step weight", f"{optimal * 1e3:.0f} ms", f"{optimal / identity:.1f} x"]
+        )
+    print_table("mimopilot bench", ["what", "figure", "beside"], rows)
+
+
+if __name__ == "__main__":
+    main()
