@@ -62,7 +62,7 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
     gains : Gains
         The gains that become the library's defaults.
     folder : Path, optional
-        Where the tree is written; by default in the cache, by hash.
+        Where the tree is written and compiled; by default only the library is kept, in the cache.
 
     Returns
     -------
@@ -81,12 +81,22 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
         f"{name}\0{content}\0" for name, content in files.items() if name.startswith(("core/", "native/"))
     )
     key = sha256(f"{sources}{compiler}{CXX_FLAGS}{platform.machine()}")[:16]
-    folder = folder or cache_folder() / key
-    write_tree(files, folder)
-    library = folder / "build" / f"libmimo_pid-{key}.so"
+    name = f"libmimo_pid-{key}.so"
+    if folder is not None:
+        write_tree(files, folder)
+        return _compile(compiler, folder, folder / "build" / name)
+    library = cache_folder() / name
+    if library.is_file():
+        return library
+    with tempfile.TemporaryDirectory() as scratch:  # of its own: other processes may be building the same
+        write_tree(files, Path(scratch))
+        return _compile(compiler, Path(scratch), library)
+
+
+def _compile(compiler: str, tree: Path, library: Path) -> Path:
     if not library.is_file():
         library.parent.mkdir(exist_ok=True)
-        compile_shared(compiler, [folder / name for name in SOURCES], library)
+        compile_shared(compiler, [tree / name for name in SOURCES], library)
     return library
 
 
