@@ -76,7 +76,7 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
             segments=segments,
             window=spec.window,
             settling=settling,
-            weight=spec.weight,
+            weight="identity",  # the residual is what a P controller cannot do, not noise
         )
         for axes, segments in stretches
     ]

@@ -51,8 +51,9 @@ class TuningSpec(_Table):
     window : int or None, samples
         Lags of the instrument; None: from the reference model.
     weight : str
-        Of the equations of the instruments: ``optimal`` is (3.30), in two steps; ``identity`` is plain least
-        squares, with about twice the spread of Ki on recorded flights.
+        Of the rate loop's instruments: ``optimal`` is (3.30), in two steps; ``identity`` is plain least squares.
+        (3.30) holds where the residual is noise, so the attitude loop, whose residual is what a P controller
+        cannot do, always uses the latter.
     derivative_cutoff_hz : float or None, Hz
         Of the derivative filter that will fly; None: as flown.
     moment_scale : tuple of 3 float or None, N m

@@ -8,22 +8,18 @@ instrument is an external signal of the experiment at 2 l + 1 lags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky, lstsq
 
 from tuning.controller import filtered_derivative
-from tuning.correlations import autocorrelation, cross_correlation
 from tuning.errors import TuningError
+from tuning.instruments import Regression, Solution, solve
 from tuning.reference import ReferenceModel
 
 TERMS = "PIDF"
-#: Diagonal loading of the residual covariance: the instruments at neighbouring lags are almost the same.
-LOADING = 1e-3
-
 Signal = NDArray[np.float64]
 Segments = Sequence[tuple[int, int]]
 
@@ -42,12 +38,15 @@ class LoopEstimate:
         Samples used.
     window : int
         Lags l of the instrument.
+    solution : Solution
+        The regression behind it: covariance, strength of the instrument, fit.
     """
 
     gains: dict[str, Signal]
     deviations: dict[str, Signal]
     samples: int
     window: int
+    solution: Solution
 
     def gain(self, term: str) -> Signal:
         """Matrix of a term; zeros when the structure does not have it."""
@@ -131,6 +130,8 @@ def vrft(
     derivative_cutoff_hz: float = 0.0,
     settling: int = 0,
     weight: str = "optimal",
+    prior: Mapping[str, Signal] | None = None,
+    pull: float = 0.0,
 ) -> LoopEstimate:
     """Gains that bring the closed loop closest to the reference model.
 
@@ -157,6 +158,11 @@ def vrft(
         Further samples to drop at the start of each segment.
     weight : str
         ``identity``: least squares on the correlations, (3.28). ``optimal``: (3.30), in two steps.
+
+    prior : mapping, optional
+        Term -> (n_u, n_y) gains towards which the estimate is pulled.
+    pull : float
+        lambda of the pull, relative to the curvature of each gain: 1 goes half of the way.
 
     Returns
     -------
@@ -193,76 +199,22 @@ def vrft(
             f"too short: no stretch without a gap is longer than {(drop + 4 * lags) * Ts:.2f} s, which these reference "
             "models need; record a longer flight, or ask for faster models"
         )
-    memory = max(lags, 2 * drop)
-    return _solve(xs, us, ws, lags, memory, "".join(letters), y.shape[1], weight)
+    problem = Regression(xs, us, ws, lags, memory=max(lags, 2 * drop))
+    solution = solve(problem, weight, None if prior is None else np.hstack([prior[t] for t in letters]), pull)
+    n_y = y.shape[1]
+    split = {term: slice(i * n_y, (i + 1) * n_y) for i, term in enumerate(letters)}
+    variances = np.diagonal(solution.covariance, axis1=1, axis2=2)
+    deviations = np.sqrt(np.maximum(variances, 0.0))
+    return LoopEstimate(
+        {term: solution.B[:, columns] for term, columns in split.items()},
+        {term: deviations[:, columns] for term, columns in split.items()},
+        problem.samples,
+        lags,
+        solution,
+    )
 
 
 def _without(constant: Signal, signal: Signal) -> Signal:
     """`signal` (N, n) less its projection on `constant` (N, 1)."""
     rest: Signal = signal - constant @ (constant.T @ signal) / (constant.T @ constant)
     return rest
-
-
-def _solve(
-    xs: list[Signal], us: list[Signal], ws: list[Signal], lags: int, memory: int, terms: str, n_y: int, weight: str
-) -> LoopEstimate:
-    """Both steps of the estimate; `memory` is how many samples the residual may remember."""
-    samples = sum(len(x) for x in xs)
-
-    def correlate(signals: list[Signal]) -> Signal:
-        total = np.sum([cross_correlation(w, s, lags) for w, s in zip(ws, signals, strict=True)], axis=0)
-        return np.reshape(total, (-1, signals[0].shape[1])) / samples
-
-    scale = np.sqrt(sum((x**2).sum(axis=0) for x in xs) / samples)
-    if not (scale > 0).all():
-        raise TuningError("not excited: a measured signal is constant, so its gains cannot be found")
-    S, Q = correlate(xs) / scale, correlate(us)
-    B, _, rank, _ = lstsq(S, Q)
-    if rank < S.shape[1]:
-        raise TuningError("not excited: the injected signal does not reach every axis, so some gains cannot be found")
-    covariance = np.empty((Q.shape[1], S.shape[1]))
-    for row in range(Q.shape[1]):
-        gamma = _residual_covariance(xs, us, ws, B[:, row] / scale, row, lags, memory)
-        if weight == "optimal":
-            factor = (cholesky(gamma, lower=True), True)
-            solved = cho_solve(factor, S)
-            normal = np.linalg.inv(S.T @ solved)
-            B[:, row] = normal @ (solved.T @ Q[:, row])
-            covariance[row] = np.diag(normal) / samples
-        else:
-            H = np.linalg.pinv(S)
-            covariance[row] = np.einsum("ij,jk,ik->i", H, gamma, H) / samples
-    gains = (B / scale[:, None]).T
-    deviations = np.sqrt(covariance) / scale
-    split = {term: slice(i * n_y, (i + 1) * n_y) for i, term in enumerate(terms)}
-    return LoopEstimate(
-        {term: gains[:, columns] for term, columns in split.items()},
-        {term: deviations[:, columns] for term, columns in split.items()},
-        samples,
-        lags,
-    )
-
-
-def _residual_covariance(
-    xs: list[Signal], us: list[Signal], ws: list[Signal], b: Signal, row: int, lags: int, memory: int
-) -> Signal:
-    """Newey-West covariance of zeta(k) eps(k), Gamma of (3.30), for one row of the controller.
-
-    The residual is independent of the external instrument, so the covariance at lag h is the product of
-    their autocorrelations and Gamma is block Toeplitz: sum over h of R_eps(h) R_w(h + tau_1 - tau_2).
-    """
-    samples = sum(len(x) for x in xs)
-    eps = [(u[:, row] - x @ b)[:, None] for u, x in zip(us, xs, strict=True)]
-    taper = 1 - np.abs(np.arange(-memory, memory + 1)) / (memory + 1)
-    R_eps = np.sum([autocorrelation(e, memory) for e in eps], axis=0)[:, 0, 0] / samples * taper
-    R_w: Signal = np.sum([autocorrelation(w, 2 * lags + memory) for w in ws], axis=0) / samples
-    n_w = R_w.shape[1]
-    blocks = np.empty((4 * lags + 1, n_w, n_w))
-    for i in range(n_w):
-        for j in range(n_w):
-            blocks[:, i, j] = np.convolve(R_w[:, i, j], R_eps[::-1], "valid")
-    difference = np.arange(2 * lags + 1)[:, None] - np.arange(2 * lags + 1)[None, :]
-    gamma = blocks[difference + 2 * lags].transpose(0, 2, 1, 3).reshape((2 * lags + 1) * n_w, -1)
-    gamma = (gamma + gamma.T) / 2
-    loaded: Signal = gamma + LOADING * np.trace(gamma) / len(gamma) * np.eye(len(gamma))
-    return loaded
