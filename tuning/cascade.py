@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.closed_loop import plant_response, refine_outer
 from tuning.controller import rebuild_rate_setpoint
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
@@ -16,6 +17,8 @@ from tuning.spec import TuningSpec
 from tuning.vrft import LoopEstimate, Segments, vrft
 
 AXES = ("roll", "pitch")
+#: Highest frequency of the measured response, rad/s.
+UPPER = 300.0
 TERMS = {"P": "Kp_i", "I": "Ki_i", "D": "Kd_i"}
 
 
@@ -80,21 +83,27 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
         )
         for axes, segments in stretches
     ]
+    gains = replace(gains, Kp_o=_assemble(outer, stretches, "P"))
     deviations = {matrix: _assemble(inner, stretches, term, "deviations") for term, matrix in TERMS.items()}
     deviations["Kp_o"] = _assemble(outer, stretches, "P", "deviations")
+    if spec.refine:
+        plant = plant_response(experiment, instrument, UPPER)
+        full = spec.method == "mimo"
+        gains, deviations["Kp_o"] = refine_outer(gains, plant, spec.models("outer", experiment.Ts), full)
     provenance = {
         "method": spec.method,
         "log": experiment.source,
         "log_sha256": experiment.sha256,
         "instrument": name,
         "weight": spec.weight,
+        "refined": spec.refine,
         "inner_model": [list(model) for model in spec.inner],
         "outer_model": [list(model) for model in spec.outer],
         "window": [inner[0].window, outer[0].window],
         "samples": [inner[0].samples, outer[0].samples],
         "standard_deviation": {matrix: value.tolist() for matrix, value in deviations.items()},
     }
-    return replace(gains, Kp_o=_assemble(outer, stretches, "P"), provenance=provenance)
+    return replace(gains, provenance=provenance)
 
 
 def _base(experiment: Experiment, spec: TuningSpec) -> Gains:

@@ -1,0 +1,214 @@
+"""The cascade around a measured frequency response: loop transfers and the closed loop.
+
+With the plant's responses G_i (rates) and G_o (angles) to the moment u known at some frequencies, everything
+about the flown difference equation follows there: C_e = Kp + Ts Ki z/(z-1), C_d = Kd (1-a)(z-1)/(Ts (z-a)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from tuning.errors import TuningError
+from tuning.experiment import Experiment
+from tuning.frequency import local_response
+from tuning.gains import Gains
+from tuning.reference import ReferenceModel
+
+#: Frequencies count where the excitation explains more than this share of a rate's power.
+COHERENT = 0.7
+MIN_FREQUENCIES = 8
+DRAWS = 64
+
+Complex = NDArray[np.complex128]
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PlantResponse:
+    """What one experiment says of the plant, at K frequencies.
+
+    Attributes
+    ----------
+    omega : (K,) array, rad/s
+        Frequencies.
+    G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
+        Responses of rates and angles to the moment.
+    root_i, root_o : (K, 2, 2) arrays
+        Square roots of the row covariance: G + root @ X @ reach, X of unit complex normals, is as likely as G.
+    reach : (K, 2, 2) array
+        Square root of the column covariance.
+    coherence : (K,) array
+        Smaller multiple coherence of the two rates with the excitation.
+    Ts : float, s
+        Sampling period.
+    """
+
+    omega: Signal
+    G_i: Complex
+    G_o: Complex
+    root_i: Complex
+    root_o: Complex
+    reach: Complex
+    coherence: Signal
+    Ts: float
+
+    def at(self, which: NDArray[np.bool_]) -> PlantResponse:
+        """The response at some of the frequencies."""
+        arrays = {name: value[which] for name, value in vars(self).items() if name != "Ts"}
+        return PlantResponse(Ts=self.Ts, **arrays)
+
+    def draw(self, generator: np.random.Generator) -> PlantResponse:
+        """Another plant that the experiment allows, from its error distribution."""
+        shape = (2, *self.G_i.shape)
+        X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
+        # The two errors share the noise that came through u; taking them independent is the cautious side.
+        return replace(
+            self, G_i=self.G_i + self.root_i @ X[0] @ self.reach, G_o=self.G_o + self.root_o @ X[1] @ self.reach
+        )
+
+
+def plant_response(experiment: Experiment, instrument: Signal, upper: float) -> PlantResponse:
+    """Joint input-output estimate G = T_yw T_uw^-1, consistent in closed loop.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        One flight.
+    instrument : (N, 2) array
+        Its external signal w.
+    upper : float, rad/s
+        Largest frequency of interest.
+
+    Raises
+    ------
+    TuningError
+        When the flight is too short, or w does not reach both axes.
+    """
+    signals = np.hstack([experiment.u, experiment.y_i, experiment.y_o])
+    upper = min(upper, 0.95 * np.pi / experiment.Ts)
+    found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper)
+    T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
+    if np.any(np.linalg.matrix_rank(T_u) < 2):
+        raise TuningError("not excited: the external signal does not move both moments independently")
+    inverse = np.linalg.inv(T_u)
+    G_i, G_o = T_i @ inverse, T_o @ inverse
+
+    def root(G: Complex, rows: slice) -> Complex:
+        mix = np.zeros((len(G), 2, 6), complex)
+        mix[:, :, :2] = -G
+        mix[:, :, rows] = np.eye(2)
+        spectrum = mix @ found.noise @ mix.conj().transpose(0, 2, 1)
+        values, vectors = np.linalg.eigh(spectrum)
+        return vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
+
+    values, vectors = np.linalg.eigh(found.error)
+    half = np.sqrt(np.maximum(values, 0))[:, :, None] * vectors.conj().transpose(0, 2, 1)
+    return PlantResponse(
+        found.omega,
+        G_i,
+        G_o,
+        root(G_i, slice(2, 4)),
+        root(G_o, slice(4, 6)),
+        half.conj() @ inverse,
+        found.explained[:, 2:4].min(axis=1),
+        experiment.Ts,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class CascadeLoop:
+    """Transfers of a gain set around a plant, (K, 2, 2) each.
+
+    Attributes
+    ----------
+    L_i : rate loop alone, cut at u.
+    L_u : whole loop, cut at u: (C_e + C_d) G_i + (C_e + Kff) Kp_o G_o.
+    T_o : from attitude set-point to attitude.
+    U_o : from attitude set-point to u.
+    """
+
+    L_i: Complex
+    L_u: Complex
+    T_o: Complex
+    U_o: Complex
+
+
+def inner_controllers(gains: Gains, omega: Signal) -> tuple[Complex, Complex]:
+    """C_e and C_d at frequencies omega (rad/s), (K, 2, 2) each."""
+    z = np.exp(1j * omega * gains.Ts)[:, None, None]
+    a = gains.derivative_pole
+    C_e = gains.Kp_i + gains.Ts * gains.Ki_i * z / (z - 1)
+    C_d = gains.Kd_i * (1 - a) * (z - 1) / (gains.Ts * (z - a))
+    return C_e, C_d
+
+
+def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
+    """The transfers of `CascadeLoop` for a gain set on a measured plant."""
+    C_e, C_d = inner_controllers(gains, plant.omega)
+    forward = (C_e + gains.Kff_i) @ gains.Kp_o
+    L_i = (C_e + C_d) @ plant.G_i
+    L_u = L_i + forward @ plant.G_o
+    U_o = np.linalg.solve(np.eye(2) + L_u, forward)
+    return CascadeLoop(L_i, L_u, plant.G_o @ U_o, U_o)
+
+
+def refine_outer(
+    gains: Gains, plant: PlantResponse, models: Sequence[ReferenceModel], full: bool
+) -> tuple[Gains, Signal]:
+    """Kp_o that brings the measured closed loop closest to the outer reference model.
+
+    VRFT weighs what a P controller cannot do by the experiment's spectrum; here the same measured data weigh it by
+    that of set-points: |T_o - M_o|^2 / omega, between an impulse's (J_MR, (3.1)) and a step's. Gauss-Newton from
+    the VRFT gains, four numbers at most; no model is fitted.
+
+    Parameters
+    ----------
+    gains : Gains
+        A complete set; its rate loop is kept.
+    plant : PlantResponse
+        From the same experiment.
+    models : sequence of 2 ReferenceModel
+        Of the attitude loop.
+    full : bool
+        False: the diagonal only (SISO).
+
+    Returns
+    -------
+    gains : Gains
+        With the new Kp_o.
+    deviations : (2, 2) array, 1/s
+        Standard deviation of its elements, from the error of the measured response.
+
+    Raises
+    ------
+    TuningError
+        When too few frequencies are coherent with the excitation.
+    """
+    use = plant.coherence > COHERENT
+    if use.sum() < MIN_FREQUENCIES:
+        raise TuningError(f"not excited: only {use.sum()} frequencies are coherent with the excitation")
+    plant = plant.at(use)
+    target = np.stack([model.frequency_response(plant.omega) for model in models], axis=1)[:, :, None] * np.eye(2)
+    where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
+    weight = where * (plant.omega**-0.5)[:, None, None]
+
+    def placed(values: Signal) -> Gains:
+        Kp_o = np.zeros((2, 2))
+        Kp_o[where] = values
+        return replace(gains, Kp_o=Kp_o)
+
+    def distance(values: Signal, of: PlantResponse = plant) -> Signal:
+        error = (cascade_loop(placed(values), of).T_o - target) * weight
+        return np.concatenate([error.real.ravel(), error.imag.ravel()])
+
+    found = least_squares(distance, gains.Kp_o[where], x_scale="jac")
+    generator = np.random.default_rng(0)
+    shifts = np.array([distance(found.x, plant.draw(generator)) - found.fun for _ in range(DRAWS)])
+    deviations = np.zeros((2, 2))
+    deviations[where] = np.std(shifts @ np.linalg.pinv(found.jac).T, axis=0)
+    return placed(found.x), deviations
