@@ -21,6 +21,7 @@ from tuning.reference import ReferenceModel
 
 #: Frequencies count where the excitation explains more than this share of a rate's power.
 COHERENT = 0.7
+ACCURATE = 0.1
 MIN_FREQUENCIES = 8
 DRAWS = 64
 
@@ -38,10 +39,11 @@ class PlantResponse:
         Frequencies.
     G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
         Responses of rates and angles to the moment.
-    root_i, root_o : (K, 2, 2) arrays
-        Square roots of the row covariance: G + root @ X @ reach, X of unit complex normals, is as likely as G.
+    root : (K, 6, 6) array
+        Square root of the noise spectrum of [u, y_i, y_o].
     reach : (K, 2, 2) array
-        Square root of the column covariance.
+        With X (6, 2) of unit complex normals and E = root X reach, G_i + E_i - G_i E_u and G_o + E_o - G_o E_u are
+        as likely as G_i and G_o.
     coherence : (K,) array
         Smaller multiple coherence of the two rates with the excitation.
     Ts : float, s
@@ -51,11 +53,17 @@ class PlantResponse:
     omega: Signal
     G_i: Complex
     G_o: Complex
-    root_i: Complex
-    root_o: Complex
+    root: Complex
     reach: Complex
     coherence: Signal
     Ts: float
+
+    def relative_error(self) -> Signal:
+        """Standard deviation of G_o over its size, (K,), Frobenius norms."""
+        spread = (self.root[:, 4:] - self.G_o @ self.root[:, :2], self.reach, self.G_o)
+        noise, reach, size = (np.linalg.norm(matrix, axis=(1, 2)) for matrix in spread)
+        relative: Signal = noise * reach / size
+        return relative
 
     def at(self, which: NDArray[np.bool_]) -> PlantResponse:
         """The response at some of the frequencies."""
@@ -64,12 +72,11 @@ class PlantResponse:
 
     def draw(self, generator: np.random.Generator) -> PlantResponse:
         """Another plant that the experiment allows, from its error distribution."""
-        shape = (2, *self.G_i.shape)
+        shape = (len(self.omega), 6, 2)
         X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
-        # The two errors share the noise that came through u; taking them independent is the cautious side.
-        return replace(
-            self, G_i=self.G_i + self.root_i @ X[0] @ self.reach, G_o=self.G_o + self.root_o @ X[1] @ self.reach
-        )
+        E = self.root @ X @ self.reach
+        E_u, E_i, E_o = E[:, :2], E[:, 2:4], E[:, 4:]
+        return replace(self, G_i=self.G_i + E_i - self.G_i @ E_u, G_o=self.G_o + E_o - self.G_o @ E_u)
 
 
 def plant_response(experiment: Experiment, instrument: Signal, upper: float) -> PlantResponse:
@@ -96,28 +103,22 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float) -> 
     if np.any(np.linalg.matrix_rank(T_u) < 2):
         raise TuningError("not excited: the external signal does not move both moments independently")
     inverse = np.linalg.inv(T_u)
-    G_i, G_o = T_i @ inverse, T_o @ inverse
-
-    def root(G: Complex, rows: slice) -> Complex:
-        mix = np.zeros((len(G), 2, 6), complex)
-        mix[:, :, :2] = -G
-        mix[:, :, rows] = np.eye(2)
-        spectrum = mix @ found.noise @ mix.conj().transpose(0, 2, 1)
-        values, vectors = np.linalg.eigh(spectrum)
-        return vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
-
-    values, vectors = np.linalg.eigh(found.error)
-    half = np.sqrt(np.maximum(values, 0))[:, :, None] * vectors.conj().transpose(0, 2, 1)
     return PlantResponse(
-        found.omega,
-        G_i,
-        G_o,
-        root(G_i, slice(2, 4)),
-        root(G_o, slice(4, 6)),
-        half.conj() @ inverse,
-        found.explained[:, 2:4].min(axis=1),
-        experiment.Ts,
+        omega=found.omega,
+        G_i=T_i @ inverse,
+        G_o=T_o @ inverse,
+        root=_root(found.noise),
+        reach=_root(found.error).transpose(0, 2, 1) @ inverse,
+        coherence=found.explained[:, 2:4].min(axis=1),
+        Ts=experiment.Ts,
     )
+
+
+def _root(matrices: Complex) -> Complex:
+    """R with R R^H = each of the positive semidefinite `matrices`."""
+    values, vectors = np.linalg.eigh(matrices)
+    root: Complex = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
+    return root
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +154,7 @@ def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
     forward = (C_e + gains.Kff_i) @ gains.Kp_o
     L_i = (C_e + C_d) @ plant.G_i
     L_u = L_i + forward @ plant.G_o
-    U_o = np.linalg.solve(np.eye(2) + L_u, forward)
+    U_o: Complex = np.linalg.solve(np.eye(2) + L_u, forward).astype(np.complex128)
     return CascadeLoop(L_i, L_u, plant.G_o @ U_o, U_o)
 
 
@@ -187,11 +188,11 @@ def refine_outer(
     Raises
     ------
     TuningError
-        When too few frequencies are coherent with the excitation.
+        When the response is known well at too few frequencies.
     """
-    use = plant.coherence > COHERENT
+    use = (plant.coherence > COHERENT) & (plant.relative_error() < ACCURATE)
     if use.sum() < MIN_FREQUENCIES:
-        raise TuningError(f"not excited: only {use.sum()} frequencies are coherent with the excitation")
+        raise TuningError(f"not excited: only {use.sum()} frequencies of the response are known to 10 %")
     plant = plant.at(use)
     target = np.stack([model.frequency_response(plant.omega) for model in models], axis=1)[:, :, None] * np.eye(2)
     where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
