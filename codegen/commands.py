@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -19,11 +20,17 @@ def generate(
     target: Annotated[
         str, typer.Option(help="native: the controller, a C interface and tests for this machine.")
     ] = "native",
+    uncertified: Annotated[bool, typer.Option("--uncertified", help="Emit gains whose stability is in doubt.")] = False,
 ) -> None:
     """Emit the C++ controller with its gains, parameter table, build files and tests."""
+    from codegen.parameters import check_verdict
     from codegen.render import render, write_tree
     from tuning.gains import load_gains
 
-    files = render(load_gains(gains), target)
+    loaded = load_gains(gains)
+    warning = check_verdict(loaded, allow=uncertified)
+    if warning:
+        print(f"mimopilot: warning: {gains}: {warning}", file=sys.stderr)
+    files = render(loaded, target)
     written = write_tree(files, out)
     print(f"{out}: {len(files)} files, {len(written)} written, {len(files) - len(written)} unchanged")

@@ -128,6 +128,34 @@ def check_ranges(gains: Gains) -> None:
             )
 
 
+def check_verdict(gains: Gains, allow: bool) -> str:
+    """Refuse gains whose loop is unstable or cannot be shown to be stable.
+
+    Parameters
+    ----------
+    gains : Gains
+        The set, with its certificate.
+    allow : bool
+        Go on all the same.
+
+    Returns
+    -------
+    str
+        A warning to show; empty when the set is certified.
+
+    Raises
+    ------
+    CodegenError
+        When the verdict is ``unstable`` or ``not certified``, or the certificate is void, and `allow` is False.
+    """
+    verdict, reason = gains.verdict()
+    if verdict == "certified":
+        return ""
+    if verdict in ("unstable", "not certified", "void") and not allow:
+        raise CodegenError(f"{verdict}: {reason}; tune or certify again, or give --uncertified to go on all the same")
+    return f"certificate: {verdict}: {reason}"
+
+
 def to_array(gains: Gains) -> NDArray[np.float32]:
     """The (36,) float32 array that ``mimopilot::Gains`` is in memory."""
     values = gains.elements()

@@ -11,7 +11,7 @@ from pyulog import ULog
 
 from tests.conftest import assert_one_clear_line
 
-COMMANDS = ["demo", "experiment", "tune", "generate", "fly", "sitl", "plant"]
+COMMANDS = ["demo", "experiment", "tune", "certify", "generate", "fly", "sitl", "plant"]
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +65,23 @@ def test_from_a_log_to_a_flight_by_the_commands_alone(mimopilot, log, tmp_path):
     assert figures["axis"] == "pitch"
     assert figures["offaxis_peak_deg"] < 0.6
     assert ULog(str(tmp_path / "doublet.ulg")).get_dataset("vehicle_torque_setpoint")
+
+
+def test_gains_in_doubt_are_not_emitted_unless_asked(mimopilot, log, tmp_path):
+    assert mimopilot("tune", log, "--out", "x.gains.toml").returncode == 0
+    text = (tmp_path / "x.gains.toml").read_text()
+    assert 'verdict = "certified"' in text or 'verdict = "stable, thin margin"' in text
+    line = next(row for row in text.splitlines() if row.startswith("Kp_i = [["))
+    (tmp_path / "x.gains.toml").write_text(text.replace(line, "Kp_i = [[1.5, 0.0], [0.0, 1.5]]"))
+    assert_one_clear_line(mimopilot("generate", "x.gains.toml", "--out", "cpp"), "void", "edited", "--uncertified")
+    assert not (tmp_path / "cpp").exists()
+    examined = mimopilot("certify", log, "--gains", "x.gains.toml", "--out", "y.gains.toml", "--json")
+    assert examined.returncode == 1
+    assert json.loads(examined.stdout)["verdict"] == "unstable"
+    assert_one_clear_line(mimopilot("generate", "y.gains.toml", "--out", "cpp"), "unstable")
+    forced = mimopilot("generate", "y.gains.toml", "--out", "cpp", "--uncertified")
+    assert forced.returncode == 0
+    assert "unstable" in forced.stderr
 
 
 def test_tables_are_the_default_output(mimopilot, log):

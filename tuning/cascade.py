@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.certificate import certify
 from tuning.closed_loop import plant_response, refine_outer
 from tuning.controller import rebuild_rate_setpoint
 from tuning.errors import TuningError
@@ -19,6 +20,8 @@ from tuning.vrft import LoopEstimate, Segments, vrft
 AXES = ("roll", "pitch")
 #: Highest frequency of the measured response, rad/s.
 UPPER = 300.0
+#: Periods of a log and of a gain set may differ by this share.
+PERIOD_TOLERANCE = 0.02
 TERMS = {"P": "Kp_i", "I": "Ki_i", "D": "Kd_i"}
 
 
@@ -35,7 +38,7 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
     Returns
     -------
     Gains
-        With method, reference models, log and standard deviations in its provenance.
+        With method, reference models, log and standard deviations in its provenance, and certified.
 
     Raises
     ------
@@ -86,10 +89,11 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
     gains = replace(gains, Kp_o=_assemble(outer, stretches, "P"))
     deviations = {matrix: _assemble(inner, stretches, term, "deviations") for term, matrix in TERMS.items()}
     deviations["Kp_o"] = _assemble(outer, stretches, "P", "deviations")
+    plant = plant_response(experiment, instrument, UPPER)
+    outer_models = spec.models("outer", experiment.Ts)
     if spec.refine:
-        plant = plant_response(experiment, instrument, UPPER)
-        full = spec.method == "mimo"
-        gains, deviations["Kp_o"] = refine_outer(gains, plant, spec.models("outer", experiment.Ts), full)
+        gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full=spec.method == "mimo")
+    certificate = certify(gains, plant, spec.models("inner", experiment.Ts), outer_models, experiment.sha256)
     provenance = {
         "method": spec.method,
         "log": experiment.source,
@@ -103,7 +107,29 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
         "samples": [inner[0].samples, outer[0].samples],
         "standard_deviation": {matrix: value.tolist() for matrix, value in deviations.items()},
     }
-    return replace(gains, provenance=provenance)
+    return replace(gains, certificate=certificate.as_table(), provenance=provenance)
+
+
+def certify_from_log(experiment: Experiment, gains: Gains) -> Gains:
+    """The gains with a certificate made from a flight of the vehicle, whatever they come from.
+
+    Raises
+    ------
+    TuningError
+        When the log has no external signal, is too short or not excited, or has another period than the gains.
+    """
+    if abs(experiment.Ts / gains.Ts - 1) > PERIOD_TOLERANCE:
+        raise TuningError(
+            f"{experiment.source}: sampled every {experiment.Ts:g} s, the gains are for {gains.Ts:g} s; certify them "
+            "with a log of the same control rate"
+        )
+    instrument, _ = _instrument(experiment)
+    plant = plant_response(experiment, instrument, UPPER)
+    spec = TuningSpec()
+    certificate = certify(
+        gains, plant, spec.models("inner", gains.Ts), spec.models("outer", gains.Ts), experiment.sha256
+    )
+    return replace(gains, certificate=certificate.as_table())
 
 
 def _base(experiment: Experiment, spec: TuningSpec) -> Gains:

@@ -11,6 +11,7 @@ import typer
 def register(app: typer.Typer) -> None:
     """Add this room's commands to the front door."""
     app.command(epilog="Example: mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out my.gains.toml")(tune)
+    app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
 
 
 def tune(
@@ -50,10 +51,58 @@ def tune(
     deviations = gains.provenance["standard_deviation"]
     if as_json:
         matrices: dict[str, Any] = {name: getattr(gains, name).tolist() for name in MATRICES}
-        print_json({"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations})
+        found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}
+        print_json({**found, "certificate": gains.certificate})
         return
     print_gains(f"{task.method.upper()} gains from {log.name} (standard deviation)", gains, deviations)
+    print_certificate(gains)
     print(f"written to {out}")
+
+
+def certify(
+    log: Annotated[Path, typer.Argument(help="Flight log (PX4 ULog) of the vehicle, with an injected moment.")],
+    gains: Annotated[Path, typer.Option(help="Gains file to examine.")],
+    out: Annotated[Path | None, typer.Option(help="Write the gains with their certificate to this file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Say whether a loop will be stable, from a flight of the vehicle under any gains. Exit code 1: unstable."""
+    from tuning.cascade import certify_from_log
+    from tuning.certificate import UNSTABLE
+    from tuning.gains import load_gains
+    from tuning.logs.ulog import read_ulog
+    from tuning.output import print_json
+
+    examined = certify_from_log(read_ulog(log), load_gains(gains))
+    if out is not None:
+        examined.save(out)
+    if as_json:
+        print_json(examined.certificate or {})
+    else:
+        print_certificate(examined)
+    if examined.verdict()[0] == UNSTABLE:
+        raise typer.Exit(1)
+
+
+def print_certificate(gains: Any) -> None:
+    """Verdict, reason and margins of a certified set."""
+    from tuning.output import print_table
+
+    certificate = gains.certificate
+    figures = certificate["figures"]
+    print(f"{certificate['verdict']}: {certificate['reason']}")
+    if not figures:
+        return
+    rows = [
+        ["peak of the sensitivity, Ms", f"{figures['Ms']:.2f} +- {figures['Ms_error']:.2f}"],
+        ["small gain of the rate loop, delta", f"{figures['delta']:.2f} +- {figures['delta_error']:.2f}"],
+        ["disk margin", f"{figures['disk_margin']:.2f}"],
+        ["all axes at once", f"{figures['simultaneous_gain_db']:.1f} dB, {figures['simultaneous_phase_deg']:.0f} deg"],
+    ]
+    for axis in ("roll", "pitch"):
+        margins = (figures[name][axis] for name in ("gain_margin_db", "phase_margin_deg", "delay_margin_ms"))
+        rows.append([axis, "{:.1f} dB, {:.0f} deg, {:.1f} ms".format(*margins)])
+    low, high = certificate["band"]
+    print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)
 
 
 def print_gains(title: str, gains: Any, deviations: dict[str, Any]) -> None:

@@ -77,7 +77,7 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
         cutoff = float(f"{-math.log(pole) / (2 * math.pi * Ts):.6g}") if pole > 0 else 0.0
     scale = [values.get(f"{PARAMETER_PREFIX}{SCALE}_{letter}") for letter in "RPY"]
     return Gains(
-        **matrices,
+        **matrices,  # type: ignore[arg-type]
         yaw=yaw,
         Ts=Ts,
         derivative_cutoff_hz=cutoff,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
-from tuning.files import write_atomically
+from tuning.files import sha256, write_atomically
 
 SCHEMA = 1
 PARAMETER_PREFIX = "MIMO_"
@@ -85,6 +85,9 @@ class Gains:
         Saturations.
     moment_scale : tuple of 3 float or None, N m
         Moment that one unit of u stands for on roll, pitch and yaw. None: the log did not say.
+    certificate : mapping or None
+        What `tuning.certificate` found: verdict, reason, figures, band and the hashes of log and matrices. It
+        counts only while the matrices are those that it names; see `verdict`. None: never examined.
     provenance : mapping
         Where the gains come from: method, log, reference models, standard deviations. Plain TOML values.
 
@@ -104,6 +107,7 @@ class Gains:
     derivative_cutoff_hz: float
     limits: Limits = Limits()
     moment_scale: Triple | None = None
+    certificate: Mapping[str, Any] | None = None
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -140,6 +144,18 @@ class Gains:
     def derivative_pole(self) -> float:
         """Pole a = exp(-2 pi f_d Ts) of the derivative filter; 0 when f_d = 0."""
         return derivative_pole(self.derivative_cutoff_hz, self.Ts)
+
+    def matrices_sha256(self) -> str:
+        """Hash of everything that the loop's stability depends on: all elements, in their exact values."""
+        return sha256(repr(list(self.elements().items())))
+
+    def verdict(self) -> tuple[str, str]:
+        """Verdict of the certificate and its reason; ``none`` without one, ``void`` when the gains were edited."""
+        if self.certificate is None:
+            return "none", "stability was never examined"
+        if self.certificate.get("matrices_sha256") != self.matrices_sha256():
+            return "void", "the gains were edited after the certificate was made"
+        return str(self.certificate.get("verdict")), str(self.certificate.get("reason"))
 
     def elements(self) -> dict[str, float]:
         """Every number that the controller runs on, by code, in the order of the C++ struct."""
@@ -234,7 +250,17 @@ def gains_from_toml(text: str, where: str) -> Gains:
         raise TuningError(
             f"{where}: schema: got {table.get('schema')!r}, expected {SCHEMA}; not a mimopilot gains file?"
         )
-    known = {"schema", "Ts", "derivative_cutoff_hz", "moment_scale", "roll_pitch", "yaw", "limits", "provenance"}
+    known = {
+        "schema",
+        "Ts",
+        "derivative_cutoff_hz",
+        "moment_scale",
+        "roll_pitch",
+        "yaw",
+        "limits",
+        "certificate",
+        "provenance",
+    }
     for key in sorted(set(table) - known):
         raise TuningError(f"{where}: {key}: unknown entry; known: {', '.join(sorted(known))}")
     try:
@@ -246,6 +272,7 @@ def gains_from_toml(text: str, where: str) -> Gains:
             derivative_cutoff_hz=_number(table, "derivative_cutoff_hz", ""),
             limits=Limits(**{name: _triple(_get(_get(table, "limits", ""), name, "limits"), name) for name in LIMITS}),
             moment_scale=None if scale == "unknown" else _triple(scale, "moment_scale"),
+            certificate=table.get("certificate"),
             provenance=table.get("provenance", {}),
         )
     except TuningError as error:
@@ -314,8 +341,10 @@ def gains_to_toml(gains: Gains) -> str:
         "[limits]  # roll, pitch, yaw",
         *(f"{name} = {toml_value(list(getattr(gains.limits, name)))}" for name in LIMITS),
     ]
-    if gains.provenance:
-        lines += ["", "[provenance]", *(f"{key} = {toml_value(value)}" for key, value in gains.provenance.items())]
+    for name in ("certificate", "provenance"):
+        if getattr(gains, name):
+            entries = (f"{key} = {toml_value(value)}" for key, value in getattr(gains, name).items())
+            lines += ["", f"[{name}]", *entries]
     return "\n".join(lines) + "\n"
 
 

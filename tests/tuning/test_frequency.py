@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from tuning.errors import TuningError
+from tuning.frequency import local_response
+
+
+def signals(n=4000, noise=0.0, seed=0):
+    """Two independent inputs, two outputs through known second-order filters, white noise on the outputs."""
+    rng = np.random.default_rng(seed)
+    w = rng.standard_normal((n, 2))
+    a, b = [1, -1.5, 0.7], [0.5]
+    y0 = lfilter(b, a, w[:, 0]) + 0.3 * w[:, 1]
+    y1 = lfilter([0, 0.2], [1, -0.8], w[:, 1])
+    return w, np.column_stack([y0, y1]) + noise * rng.standard_normal((n, 2))
+
+
+def truth(omega):
+    z = np.exp(-1j * omega)
+    G = np.zeros((len(omega), 2, 2), complex)
+    G[:, 0, 0] = 0.5 / (1 - 1.5 * z + 0.7 * z**2)
+    G[:, 0, 1] = 0.3
+    G[:, 1, 1] = 0.2 * z / (1 - 0.8 * z)
+    return G
+
+
+def test_a_known_response_is_found_without_leakage():
+    w, y = signals()
+    found = local_response(w, y, 1.0, [(0, 4000)])
+    error = np.abs(found.response - truth(found.omega)).max()
+    assert error < 0.02 * np.abs(truth(found.omega)).max()
+    assert (found.explained > 0.99).all()
+
+
+def test_two_segments_share_one_response_but_not_their_transients():
+    w, y = signals(6000)
+    offset = y.copy()
+    offset[3000:] += 5.0
+    joined = local_response(w, offset, 1.0, [(0, 3000), (3000, 6000)])
+    assert np.abs(joined.response - truth(joined.omega)).max() < 0.05
+
+
+def test_the_noise_spectrum_is_that_of_the_noise():
+    w, y = signals(8000, noise=0.5)
+    found = local_response(w, y, 1.0, [(0, 8000)])
+    power = np.real(np.diagonal(found.noise, axis1=1, axis2=2)).mean(axis=0)
+    assert power == pytest.approx(0.25, rel=0.1)
+
+
+def test_errors_of_the_response_are_those_of_repeated_experiments():
+    estimates, predicted = [], []
+    for seed in range(40):
+        w, y = signals(2000, noise=0.3, seed=seed)
+        found = local_response(w, y, 1.0, [(0, 2000)])
+        estimates.append(found.response)
+        variance = np.real(np.einsum("kvv,kww->kvw", found.noise, found.error))
+        predicted.append(variance)
+    spread = np.var(estimates, axis=0).mean(axis=0)
+    assert spread == pytest.approx(np.mean(predicted, axis=(0, 1)), rel=0.25)
+
+
+def test_data_too_short_for_any_frequency_are_refused():
+    w, y = signals(12)
+    with pytest.raises(TuningError, match="too short"):
+        local_response(w, y, 1.0, [(0, 12)])

@@ -1,0 +1,291 @@
+"""Will the loop be stable? Answered before flight, from the log that the gains were tuned on.
+
+The measured frequency response decides by Nyquist's count: det(n (I + L)) must not go round 0, for the rate loop
+alone and for the whole cascade cut at u, n = 1 - m cancelling the integrators at z = 1. Other plants that the
+experiment allows are drawn from its error; what happens to any of them counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.closed_loop import CascadeLoop, PlantResponse, cascade_loop, inner_controllers
+from tuning.gains import Gains
+from tuning.reference import ReferenceModel
+
+COHERENT = 0.7
+MIN_FREQUENCIES = 8
+DRAWS = 64
+#: Above the band sigma_max(G) sup sigma_max(K) may be at most this.
+HIGH_FREQUENCY_LOOP = 0.5
+
+CERTIFIED = "certified"
+THIN = "stable, thin margin"
+NOT_CERTIFIED = "not certified"
+UNSTABLE = "unstable"
+
+Complex = NDArray[np.complex128]
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """What makes a margin thin.
+
+    Attributes
+    ----------
+    Ms : float
+        Largest peak of the sensitivity.
+    phase_deg : float, deg
+        Smallest phase margin.
+    """
+
+    Ms: float = 2.5
+    phase_deg: float = 25.0
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """What the log says of a gain set.
+
+    Attributes
+    ----------
+    verdict : str
+        ``certified``, ``stable, thin margin``, ``not certified`` or ``unstable``.
+    reason : str
+        Why, and the assumptions made outside of the band.
+    figures : mapping
+        ``Ms``, ``Ms_error`` (two standard errors), ``delta``, ``delta_error``, ``distance`` of the determinant to
+        0, ``disk_margin``, and by axis ``gain_margin_db``, ``phase_margin_deg``, ``delay_margin_ms``;
+        ``simultaneous_gain_db`` and ``simultaneous_phase_deg`` for all axes at once.
+    band : tuple of 2 float, rad/s
+        Where the response is known.
+    log_sha256, matrices_sha256 : str
+        What it was made from, and for which matrices: an edited matrix voids it.
+    """
+
+    verdict: str
+    reason: str
+    figures: Mapping[str, Any]
+    band: tuple[float, float]
+    log_sha256: str
+    matrices_sha256: str
+
+    def as_table(self) -> dict[str, Any]:
+        """Plain values, for the gains file and JSON."""
+        table = asdict(self)
+        table["band"] = list(self.band)
+        return table
+
+
+def certify(
+    gains: Gains,
+    plant: PlantResponse,
+    inner: Sequence[ReferenceModel],
+    outer: Sequence[ReferenceModel],
+    log_sha256: str = "",
+    thresholds: Thresholds | None = None,
+) -> Certificate:
+    """Verdict on a gain set.
+
+    Parameters
+    ----------
+    gains : Gains
+        The set.
+    plant : PlantResponse
+        Measured response, from `tuning.closed_loop.plant_response`.
+    inner, outer : sequence of 2 ReferenceModel
+        Of the rate and the attitude loop, roll and pitch; they only normalise the determinants.
+    log_sha256 : str
+        Of the log that the response comes from.
+    thresholds : Thresholds, optional
+        What is thin.
+    """
+    thresholds = thresholds or Thresholds()
+    known = np.flatnonzero(plant.coherence > COHERENT)
+    known = _longest_run(known)
+
+    def verdict(text: str, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
+        return Certificate(text, reason, figures, band, log_sha256, gains.matrices_sha256())
+
+    if len(known) < MIN_FREQUENCIES:
+        return verdict(NOT_CERTIFIED, "the excitation reaches fewer than 8 frequencies", {}, (0.0, 0.0))
+    gains_above = _controller_gain_above(gains, plant.omega[known])
+    small = np.linalg.norm(plant.G_i[known], ord=2, axis=(1, 2)) * gains_above <= HIGH_FREQUENCY_LOOP
+    # Where the loop is small for good nothing more has to be known: the noisy end of the band is left out.
+    settled = len(known) - int(np.argmin(small[::-1])) if not small.all() else 1
+    known = known[: max(settled + 1, MIN_FREQUENCIES)]
+    which = np.zeros(len(plant.omega), bool)
+    which[known] = True
+    plant = plant.at(which)
+    band = (float(plant.omega[0]), float(plant.omega[-1]))
+    normal = _Normaliser(inner, outer, plant.omega)
+
+    generator = np.random.default_rng(0)
+    draws = [cascade_loop(gains, plant.draw(generator)) for _ in range(DRAWS)]
+    nominal = cascade_loop(gains, plant)
+    windings = [normal.windings(loop) for loop in draws]
+    figures = _figures(gains, plant, nominal, draws, inner)
+    beyond = _beyond_the_band(gains, plant)
+    if beyond:
+        return verdict(NOT_CERTIFIED, beyond, figures, band)
+    doubtful = sum(any(w) for w in windings)
+    if any(normal.windings(nominal)) and doubtful > DRAWS / 2:
+        where = "the rate loop alone" if normal.windings(nominal)[0] else "the whole cascade"
+        return verdict(UNSTABLE, f"the determinant goes round 0: {where} is unstable", figures, band)
+    if doubtful:
+        reason = f"too close to the limit to tell: {doubtful} of {DRAWS} plants that the log allows are unstable"
+        return verdict(NOT_CERTIFIED, reason, figures, band)
+    assumed = (
+        f"assumed: above {band[1]:.0f} rad/s the plant's gain does not grow; below {band[0]:.1f} rad/s the integral "
+        "term acts as there"
+    )
+    thin = []
+    if figures["Ms"] + figures["Ms_error"] > thresholds.Ms:
+        thin.append(f"Ms {figures['Ms']:.2f} + {figures['Ms_error']:.2f} is above {thresholds.Ms:g}")
+    phase = min(figures["phase_margin_deg"].values())
+    if phase < thresholds.phase_deg:
+        thin.append(f"phase margin {phase:.0f} degrees is below {thresholds.phase_deg:g}")
+    return verdict(THIN if thin else CERTIFIED, "; ".join([*thin, assumed]), figures, band)
+
+
+def _longest_run(indices: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Longest stretch of neighbours, single holes forgiven."""
+    if not len(indices):
+        return indices
+    runs = np.split(indices, np.flatnonzero(np.diff(indices) > 2) + 1)
+    longest = max(runs, key=len)
+    return np.arange(longest[0], longest[-1] + 1)
+
+
+class _Normaliser:
+    """det(n (I + L)) along the band and how often it goes round 0."""
+
+    def __init__(
+        self,
+        inner: Sequence[ReferenceModel],
+        outer: Sequence[ReferenceModel],
+        omega: Signal,
+    ) -> None:
+        # n is a product of scalars 1 - m: its phase is followed on a fine grid from 0 to Nyquist, once.
+        fine = np.linspace(omega[0], np.pi / inner[0].Ts, 4000)
+
+        def ones_minus(models: Sequence[ReferenceModel], at: Signal) -> Complex:
+            return np.stack([1 - model.frequency_response(at) for model in models], axis=1)
+
+        self.n_i = np.prod(ones_minus(inner, omega), axis=1)
+        self.n_o = self.n_i * np.prod(ones_minus(outer, omega), axis=1)
+        tail_i = np.prod(ones_minus(inner, fine), axis=1)
+        tail_o = tail_i * np.prod(ones_minus(outer, fine), axis=1)
+        last = np.searchsorted(fine, omega[-1])
+        self.after = [float(_turn(tail[last:])) for tail in (tail_i, tail_o)]
+
+    def windings(self, loop: CascadeLoop) -> tuple[int, int]:
+        """Encirclements of 0: rate loop, whole cascade."""
+        identity = np.eye(2)
+        counts = []
+        for n, L, after in ((self.n_i, loop.L_i, self.after[0]), (self.n_o, loop.L_u, self.after[1])):
+            f = n * np.linalg.det(identity + L)
+            # Below the band f goes to a positive number; above it I + L goes to I, by the nearest way.
+            closing = -float(np.angle(np.linalg.det(identity + L[-1]))) + after
+            total = float(np.angle(f[0])) + float(_turn(f)) + closing
+            counts.append(round(total / np.pi))
+        return counts[0], counts[1]
+
+
+def _turn(f: Complex) -> float:
+    """Change of phase along a curve, rad."""
+    return float(np.sum(np.angle(f[1:] / f[:-1])))
+
+
+def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
+    """Why nothing can be said outside of the band; empty when the assumptions hold."""
+    K = _controller_gain_above(gains, plant.omega[-1:])[0]
+    loop = float(np.linalg.norm(plant.G_i[-1], ord=2) * K)
+    if loop > HIGH_FREQUENCY_LOOP:
+        return (
+            f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
+            f"(at most {HIGH_FREQUENCY_LOOP:g}): excite a wider band"
+        )
+    integral = gains.Ts * gains.Ki_i @ plant.G_i[0].real
+    if np.any(gains.Ki_i) and np.linalg.eigvalsh(integral + integral.T)[0] <= 0:
+        return (
+            f"excitation begins at {plant.omega[0]:.1f} rad/s, where the loop's integral term is not positive: "
+            "excite lower frequencies, or record longer"
+        )
+    if np.linalg.eigvalsh(gains.Kp_o + gains.Kp_o.T)[0] <= 0:
+        return f"below {plant.omega[0]:.1f} rad/s the attitude loop's gain is not positive in every direction"
+    return ""
+
+
+def _controller_gain_above(gains: Gains, omega: Signal) -> Signal:
+    """Supremum of sigma_max(C_e + C_d) above each frequency."""
+    grid = np.concatenate([omega, np.linspace(omega[-1], np.pi / gains.Ts, 200)[1:]])
+    C_e, C_d = inner_controllers(gains, grid)
+    size = np.linalg.norm(C_e + C_d, ord=2, axis=(1, 2))
+    highest: Signal = np.maximum.accumulate(size[::-1])[::-1]
+    return highest[: len(omega)]
+
+
+def _figures(
+    gains: Gains,
+    plant: PlantResponse,
+    nominal: CascadeLoop,
+    draws: list[CascadeLoop],
+    inner: Sequence[ReferenceModel],
+) -> dict[str, Any]:
+    identity = np.eye(2)
+
+    def peak(loop: CascadeLoop) -> float:
+        return float(np.linalg.norm(np.linalg.inv(identity + loop.L_u), ord=2, axis=(1, 2)).max())
+
+    m = np.stack([model.frequency_response(plant.omega) for model in inner], axis=1)[:, :, None] * identity
+
+    def delta(loop: CascadeLoop) -> float:
+        # D_M = M - (I - M) G K; G K and K G have the same loop, here cut at u.
+        return float(np.linalg.norm(m - (identity - m) @ loop.L_i, ord=2, axis=(1, 2)).max())
+
+    S = np.linalg.inv(identity + nominal.L_u)
+    disk = 1 / float(np.linalg.norm(S - identity / 2, ord=2, axis=(1, 2)).max())
+    ratio = (2 + disk) / (2 - disk) if disk < 2 else np.inf
+    by_axis = {
+        axis: _axis_margins((1 / S[:, i, i] - 1).astype(np.complex128), plant.omega)
+        for i, axis in enumerate(("roll", "pitch"))
+    }
+    # Above the band the loop is at most this large: no gain margin is claimed beyond what that leaves.
+    rest = np.linalg.norm(plant.G_i[-1], ord=2) * _controller_gain_above(gains, plant.omega[-1:])[0]
+    ceiling = -20 * float(np.log10(rest))
+    distance = np.abs(np.linalg.det(identity + nominal.L_u)).min()
+    return {
+        "Ms": peak(nominal),
+        "Ms_error": 2 * float(np.std([peak(loop) for loop in draws])),
+        "delta": delta(nominal),
+        "delta_error": 2 * float(np.std([delta(loop) for loop in draws])),
+        "distance": float(distance),
+        "disk_margin": disk,
+        "simultaneous_gain_db": float(20 * np.log10(ratio)),
+        "simultaneous_phase_deg": float(2 * np.degrees(np.arctan(disk / 2))),
+        "gain_margin_db": {axis: min(margins[0], ceiling) for axis, margins in by_axis.items()},
+        "phase_margin_deg": {axis: margins[1] for axis, margins in by_axis.items()},
+        "delay_margin_ms": {axis: margins[2] for axis, margins in by_axis.items()},
+    }
+
+
+def _axis_margins(loop: Complex, omega: Signal) -> tuple[float, float, float]:
+    """Smallest gain (dB, up or down), phase (deg) and delay (ms) margin of one loop, the other axis closed."""
+    from control import stability_margins  # takes longer to import than all of the rest
+
+    data = (np.abs(loop), np.degrees(np.unwrap(np.angle(loop))), omega)
+    gains, phases, _, _, crossings, _ = (np.atleast_1d(part) for part in stability_margins(data, returnall=True))
+    delays = np.radians(phases % 360.0) / crossings * 1e3
+    decibels = np.abs(20 * np.log10(gains[gains > 0]))
+
+    def smallest(values: Signal) -> float:
+        return float(np.min(values, initial=np.inf))
+
+    return smallest(decibels), smallest(np.abs(phases)), smallest(delays)
