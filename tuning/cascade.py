@@ -14,6 +14,7 @@ from tuning.controller import rebuild_rate_setpoint
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.gains import Gains, Limits, YawGains
+from tuning.gates import examine
 from tuning.spec import TuningSpec
 from tuning.vrft import LoopEstimate, Segments, vrft
 
@@ -62,9 +63,12 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
             window=spec.window,
             derivative_cutoff_hz=base.derivative_cutoff_hz,
             weight=spec.weight,
+            prior=_prior(experiment, spec, axes),
+            pull=spec.pull,
         )
         for axes, segments in stretches
     ]
+    warnings = examine(experiment, [(axes, loop) for (axes, _), loop in zip(stretches, inner, strict=True)])
     Kp, Ki, Kd = (_assemble(inner, stretches, term) for term in TERMS)
     gains = replace(base, Kp_i=Kp, Ki_i=Ki, Kd_i=Kd)
 
@@ -100,7 +104,9 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
         "log_sha256": experiment.sha256,
         "instrument": name,
         "weight": spec.weight,
+        "pull": spec.pull,
         "refined": spec.refine,
+        "warnings": warnings,
         "inner_model": [list(model) for model in spec.inner],
         "outer_model": [list(model) for model in spec.outer],
         "window": [inner[0].window, outer[0].window],
@@ -160,6 +166,16 @@ def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
         limits=limits,
         moment_scale=spec.moment_scale or (flown.moment_scale if flown else None),
     )
+
+
+def _prior(experiment: Experiment, spec: TuningSpec, axes: slice) -> dict[str, NDArray[np.float64]] | None:
+    """The flying rate gains by term, when the estimate is to be pulled towards them."""
+    if spec.pull == 0:
+        return None
+    flown = experiment.flown
+    if flown is None:
+        raise TuningError(f"{experiment.source}: pull: the log does not say which gains flew; leave it at 0")
+    return {term: getattr(flown, matrix)[axes, axes] for term, matrix in TERMS.items()}
 
 
 def _instrument(experiment: Experiment) -> tuple[NDArray[np.float64], str]:

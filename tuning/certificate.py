@@ -212,7 +212,9 @@ def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
             f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
             f"(at most {HIGH_FREQUENCY_LOOP:g}): excite a wider band"
         )
-    integral = gains.Ts * gains.Ki_i @ plant.G_i[0].real
+    # The plant there is a real matrix times a scalar between a gain and an integrator: take that phase off.
+    turned = plant.G_i[0] * np.exp(-1j * np.angle(np.trace(plant.G_i[0])))
+    integral = gains.Ki_i @ turned.real
     if np.any(gains.Ki_i) and np.linalg.eigvalsh(integral + integral.T)[0] <= 0:
         return (
             f"excitation begins at {plant.omega[0]:.1f} rad/s, where the loop's integral term is not positive: "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -49,6 +50,8 @@ def tune(
     gains = tune_cascade(read_ulog(log), task)
     gains.save(out)
     deviations = gains.provenance["standard_deviation"]
+    for warning in gains.provenance["warnings"]:
+        print(f"mimopilot: warning: {log}: {warning}", file=sys.stderr)
     if as_json:
         matrices: dict[str, Any] = {name: getattr(gains, name).tolist() for name in MATRICES}
         found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}

@@ -54,6 +54,9 @@ class TuningSpec(_Table):
         Of the rate loop's instruments: ``optimal`` is (3.30), in two steps; ``identity`` is plain least squares.
         (3.30) holds where the residual is noise, so the attitude loop, whose residual is what a P controller
         cannot do, always uses the latter.
+    pull : float
+        Pull of the rate gains towards the flying ones, the safe choice on a short log: 1 goes half of the way for a
+        gain that stands alone; 0 none.
     refine : bool
         Refine the attitude gains on the measured frequency response, `tuning.closed_loop.refine_outer`; False
         leaves them as VRFT gives them.
@@ -70,6 +73,7 @@ class TuningSpec(_Table):
     outer: tuple[Model, Model] = ((10.0, 0.7, 0), (10.0, 0.7, 0))
     window: Annotated[int, Field(ge=1)] | None = None
     weight: Literal["identity", "optimal"] = "optimal"
+    pull: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     refine: bool = True
     derivative_cutoff_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     moment_scale: Triple | None = None

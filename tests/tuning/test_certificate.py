@@ -53,7 +53,7 @@ class Linear:
         F[6:8], F[8:10], F[10:12], F[12:14] = u, integral, d, take["y"]
         if late_roll:  # a chain between the controller's roll output and the state that acts
             F[6] = np.eye(n)[14]
-            F[14:] = np.eye(n)[15:].tolist() + [u[0].tolist()]
+            F[14:] = [*np.eye(n)[15:].tolist(), u[0].tolist()]
         return float(np.abs(np.linalg.eigvals(F)).max())
 
     def response(self, omega):
