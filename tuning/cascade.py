@@ -49,7 +49,7 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
     """
     spec = spec or TuningSpec()
     base = _base(experiment, spec)
-    instrument, name = _instrument(experiment)
+    instrument, name = external_signal(experiment)
     stretches = _stretches(experiment, instrument, spec.method)
 
     inner = [
@@ -106,6 +106,7 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
         "weight": spec.weight,
         "pull": spec.pull,
         "refined": spec.refine,
+        "fit": [float(value) for loop in inner for value in loop.solution.r_squared],
         "warnings": warnings,
         "inner_model": [list(model) for model in spec.inner],
         "outer_model": [list(model) for model in spec.outer],
@@ -129,7 +130,7 @@ def certify_from_log(experiment: Experiment, gains: Gains) -> Gains:
             f"{experiment.source}: sampled every {experiment.Ts:g} s, the gains are for {gains.Ts:g} s; certify them "
             "with a log of the same control rate"
         )
-    instrument, _ = _instrument(experiment)
+    instrument, _ = external_signal(experiment)
     plant = plant_response(experiment, instrument, UPPER)
     spec = TuningSpec()
     certificate = certify(
@@ -178,7 +179,14 @@ def _prior(experiment: Experiment, spec: TuningSpec, axes: slice) -> dict[str, N
     return {term: getattr(flown, matrix)[axes, axes] for term, matrix in TERMS.items()}
 
 
-def _instrument(experiment: Experiment) -> tuple[NDArray[np.float64], str]:
+def external_signal(experiment: Experiment) -> tuple[NDArray[np.float64], str]:
+    """The experiment's instrument, (N, 2), and its name: the injected moment when it is logged, else the set-point.
+
+    Raises
+    ------
+    TuningError
+        When neither moves.
+    """
     for name in ("u_bar", "r_o"):
         signal = getattr(experiment, name)
         if signal is not None and any(np.ptp(signal[start:stop]) > 0 for start, stop in experiment.segments):

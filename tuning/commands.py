@@ -13,6 +13,7 @@ def register(app: typer.Typer) -> None:
     """Add this room's commands to the front door."""
     app.command(epilog="Example: mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out my.gains.toml")(tune)
     app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
+    app.command(epilog="Example: mimopilot advise flight.ulg --outer 10,0.7,0 --out my.gains.toml")(advise)
 
 
 def tune(
@@ -84,6 +85,49 @@ def certify(
         print_certificate(examined)
     if examined.verdict()[0] == UNSTABLE:
         raise typer.Exit(1)
+
+
+def advise(
+    log: Annotated[Path, typer.Argument(help="Flight log (PX4 ULog) with an injected moment.")],
+    outer: Annotated[str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY; 10,0.7,0.")] = None,
+    spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Scan bandwidth, damping and delay of the rate loop's model; recommend one and say why."""
+    from dataclasses import asdict
+
+    from rich.progress import track
+
+    from tuning.advisor import advise as scan
+    from tuning.logs.ulog import read_ulog
+    from tuning.output import print_json, print_table, progress_console
+    from tuning.spec import load_spec, parse_model
+
+    task = load_spec(spec, outer=parse_model(outer) if outer else None)
+    candidates, best = scan(
+        read_ulog(log), task, watch=lambda grid: track(list(grid), "tuning", console=progress_console(), transient=True)
+    )
+    assert best.gains is not None
+    if out is not None:
+        best.gains.save(out)
+    shown = [{k: v for k, v in asdict(c).items() if k != "gains"} for c in candidates]
+    recommended = next(row for row, c in zip(shown, candidates, strict=True) if c is best)
+    if as_json:
+        print_json({"recommended": recommended, "candidates": shown})
+        return
+    rows = []
+    for c in candidates:
+        pairs = [f"{a:.2f} / {b:.2f}" for a, b in (c.follow_deg, c.offaxis_deg, c.effort)]
+        name = "{:g}, {:g}, {}".format(*c.inner)
+        rows.append(["* " + name if c is best else name, f"{c.fit:.2f}", *pairs, c.verdict])
+    title = "Rate loop: rad/s, damping, delay in samples; predicted RMS of an 18 degree doublet, roll / pitch"
+    print_table(title, ["model", "fit", "to the model [deg]", "off-axis [deg]", "moment", "certificate"], rows)
+    print(
+        "recommended: {:g},{:g},{}: certified, follows within 10 % of the best of those, with the least moment".format(
+            *best.inner
+        )
+    )
 
 
 def print_certificate(gains: Any) -> None:

@@ -37,6 +37,15 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
     Console(width=None if _is_terminal() else 160, highlight=False).print(table)
 
 
+def progress_console() -> Any:
+    """Where progress bars go: standard error, and only when it is a terminal."""
+    import sys
+
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=not sys.stderr.isatty())
+
+
 def _is_terminal() -> bool:
     import sys
 

@@ -115,7 +115,7 @@ def test_a_flight_without_excitation_or_on_one_axis_only_is_refused(log):
 def test_noise_in_place_of_flight_is_refused_by_the_gates(log):
     rng = np.random.default_rng(0)
     noise = dataclasses.replace(log, u=0.1 * rng.standard_normal(log.u.shape), y_i=rng.standard_normal(log.u.shape))
-    with pytest.raises(TuningError, match="the excitation explains .* of what the roll gains are found from"):
+    with pytest.raises(TuningError, match=r"the excitation explains .* of what the roll gains are found from"):
         tune(noise)
 
 
