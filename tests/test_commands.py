@@ -11,7 +11,7 @@ from pyulog import ULog
 
 from tests.conftest import assert_one_clear_line
 
-COMMANDS = ["demo", "experiment", "tune", "certify", "generate", "fly", "sitl", "plant"]
+COMMANDS = ["demo", "experiment", "tune", "certify", "advise", "generate", "fly", "sitl", "plant"]
 
 
 @pytest.fixture(scope="module")

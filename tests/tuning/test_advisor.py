@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+import tuning.advisor as advisor
+from sitl.airframe import load_airframe
+from sitl.autopilot import Autopilot
+from sitl.loop import fly
+from sitl.scenario import doublet
+from tests.tuning.test_certificate import experiment
+from tuning.advisor import Doublet, advise, predict
+from tuning.cascade import tune
+from tuning.certificate import CERTIFIED
+from tuning.closed_loop import plant_response
+from tuning.errors import TuningError
+from tuning.spec import TuningSpec
+
+TS = 0.004
+
+
+@pytest.fixture(scope="module")
+def log():
+    return experiment("adam0")
+
+
+def rms(signal):
+    return float(np.sqrt(np.mean(signal**2)))
+
+
+def test_the_predicted_doublet_is_the_flown_one(log):
+    airframe = load_airframe("adam0").airframe
+    plant = plant_response(log, log.u_bar, 300.0)
+    spec = TuningSpec()
+    for gains in (log.flown, tune(log)):
+        follow, offaxis, effort = predict(gains, plant, spec, Doublet(amplitude_deg=10.0, period_s=0.8))
+        for column, axis in enumerate(("roll", "pitch")):
+            task = doublet(axis, np.radians(10.0), 0.8, TS, tail=0.8)
+            flight = fly(airframe, Autopilot(airframe, gains), task, noise=False)
+            rows = slice(task.window[0], task.window[0] + round(1.6 / TS))
+            model = spec.models("outer", TS)[column].response(task.setpoint[:, column])
+            angles, moments = flight.truth["attitude"][rows], flight.record["moment"][rows, :2]
+            away = np.degrees(angles[:, column] - model[rows])
+            assert follow[column] == pytest.approx(rms(away), rel=0.1)
+            # The edges of the moment are faster than what the log knows.
+            assert effort[column] == pytest.approx(np.sqrt(2) * rms(moments), rel=0.15)
+            # Off-axis is small: the response is known to a few hundredths of a degree.
+            assert offaxis[column] == pytest.approx(rms(np.degrees(angles[:, 1 - column])), rel=0.15, abs=0.06)
+
+
+def test_the_recommended_model_follows_better_than_the_thesis_one_and_is_certified(log, monkeypatch):
+    monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 30.0))
+    monkeypatch.setattr(advisor, "DAMPINGS", (0.4, 1.0))
+    monkeypatch.setattr(advisor, "DELAYS", (0, 2))
+    candidates, best = advise(log, TuningSpec())
+    assert len(candidates) == 8
+    thesis = next(c for c in candidates if c.inner == (20.0, 0.4, 0))
+    assert best.verdict == CERTIFIED
+    assert np.hypot(*best.follow_deg) < 0.6 * np.hypot(*thesis.follow_deg)
+    for other in candidates:
+        if other.verdict == CERTIFIED and np.hypot(*other.follow_deg) <= np.hypot(*best.follow_deg):
+            assert np.hypot(*other.effort) >= np.hypot(*best.effort)
+
+
+def test_without_a_certified_candidate_nothing_is_recommended(log, monkeypatch):
+    monkeypatch.setattr(advisor, "BANDWIDTHS", (60.0,))
+    monkeypatch.setattr(advisor, "DAMPINGS", (0.2,))
+    monkeypatch.setattr(advisor, "DELAYS", (0,))
+    with pytest.raises(TuningError, match="none of 1 rate loops is certified"):
+        advise(log, TuningSpec())
