@@ -16,6 +16,9 @@ from sitl.compiled import compiled
 from sitl.errors import SitlError
 
 
+ROUNDING = 1e-9  # of the thrust: a command this far out of range is clipped, not a lack of authority
+
+
 class Allocation(NamedTuple):
     """Mixer of a vehicle.
 
@@ -99,9 +102,9 @@ def _largest_share(base, part, collective, allocation):  # type: ignore[no-untyp
             else:
                 room = collective + base[i] / h_i
                 slope = -part[i] / h_i
-            if room < -1e-12:
+            if room < -ROUNDING:
                 return -1.0
-            if slope > 0.0 and slope * share > room:
+            if slope > 0.0 and slope * share > room + ROUNDING:
                 share = max(room, 0.0) / slope
     return share
 

@@ -72,7 +72,7 @@ def test_gains_in_doubt_are_not_emitted_unless_asked(mimopilot, log, tmp_path):
     text = (tmp_path / "x.gains.toml").read_text()
     assert 'verdict = "certified"' in text or 'verdict = "stable, thin margin"' in text
     line = next(row for row in text.splitlines() if row.startswith("Kp_i = [["))
-    (tmp_path / "x.gains.toml").write_text(text.replace(line, "Kp_i = [[1.5, 0.0], [0.0, 1.5]]"))
+    (tmp_path / "x.gains.toml").write_text(text.replace(line, "Kp_i = [[-0.15, 0.0], [0.0, 0.12]]"))
     assert_one_clear_line(mimopilot("generate", "x.gains.toml", "--out", "cpp"), "void", "edited", "--uncertified")
     assert not (tmp_path / "cpp").exists()
     examined = mimopilot("certify", log, "--gains", "x.gains.toml", "--out", "y.gains.toml", "--json")
