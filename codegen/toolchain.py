@@ -55,6 +55,6 @@ def compile_shared(compiler: str, sources: Sequence[Path], output: Path) -> None
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     if result.returncode != 0:
         temporary.unlink(missing_ok=True)
-        first = "\n".join(result.stderr.splitlines()[:5])
+        first = "\n".join(result.stderr.splitlines()[:5]) or f"exit status {result.returncode}, no message"
         raise CodegenError(f"the C++ compiler failed:\n{first}\nto repeat: {' '.join(command)}", exit_code=1)
     temporary.replace(output)

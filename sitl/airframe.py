@@ -13,13 +13,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sitl.allocation import Allocation, make_allocation, moment_scale
 from sitl.errors import SitlError
-from sitl.plant import PlantParameters, checked_inertia
+from sitl.plant import GRAVITY, PlantParameters, checked_inertia
 from tuning.gains import Gains, load_gains
 
+MAX_HOVER = 0.9  # share of the thrust that may carry the weight
 FOLDER = Path(__file__).resolve().parent / "airframes"
 
-Vector = tuple[float, float, float]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
+Vector = tuple[Finite, Finite, Finite]
+Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
@@ -80,8 +82,8 @@ class Airframe(_Table):
         See their classes.
     """
 
-    name: str
-    description: str = ""
+    name: Annotated[str, Field(min_length=1, max_length=40)]
+    description: Annotated[str, Field(max_length=400)] = ""
     mass: Positive
     inertia: tuple[Vector, Vector, Vector]
     rate_damping: NotNegative
@@ -161,6 +163,16 @@ def combine_masses(
     return float(masses.sum()), centre, total
 
 
+def _check_flies(airframe: Airframe) -> None:
+    """Refuse a vehicle that cannot lift itself with some authority left."""
+    weight, thrust = airframe.plant().mass * GRAVITY, len(airframe.rotors) * airframe.motors.thrust_max
+    if weight > MAX_HOVER * thrust:
+        raise SitlError(
+            f"mass, motors.thrust_max: a weight of {weight:.4g} N against {thrust:.4g} N of thrust does not fly; "
+            f"expected at most {MAX_HOVER:.0%}"
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Vehicle:
     """An airframe and where its file is: what commands work with."""
@@ -169,8 +181,9 @@ class Vehicle:
     path: Path
 
     def default_gains(self) -> Gains:
-        """The gains that the airframe's file names."""
-        return load_gains(self.path.parent / self.airframe.gains)
+        """The gains that the airframe's file names: a file beside it, else one that comes with mimopilot."""
+        beside, shipped = self.path.parent / self.airframe.gains, FOLDER / self.airframe.gains
+        return load_gains(shipped if shipped.is_file() and not beside.is_file() else beside)
 
 
 def known_airframes() -> list[str]:
@@ -197,6 +210,7 @@ def load_airframe(name_or_path: str) -> Vehicle:
         airframe = Airframe.model_validate(tomllib.loads(path.read_text()))
         checked_inertia(airframe.inertia)
         airframe.allocation()
+        _check_flies(airframe)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SitlError(f"{path}: not an airframe file: {error}") from error
     except ValidationError as error:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from sitl.compiled import compiled
 from sitl.errors import SitlError
 
-
 ROUNDING = 1e-9  # of the thrust: a command this far out of range is clipped, not a lack of authority
 
 
@@ -71,6 +70,8 @@ def make_allocation(
         When the rotors cannot make roll, pitch, yaw and thrust independently, or one would have to pull down.
     """
     scale = moment_scale(rotors, spin, thrust, ratio)
+    if not (np.isfinite(scale).all() and (scale > 0).all()):
+        raise SitlError("rotors: these positions and directions make no moment on some axis")
     moments = np.array([-rotors[:, 1], rotors[:, 0], spin * ratio]) * thrust / scale[:, None]
     effectiveness = np.vstack([moments, np.full(len(rotors), 1 / len(rotors))])
     if np.linalg.matrix_rank(effectiveness) < 4:

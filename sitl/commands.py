@@ -11,8 +11,21 @@ AirframeArgument = Annotated[
     str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, or a TOML file.")
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
-SeedOption = Annotated[int, typer.Option(help="Seed of all randomness.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+#: Figure -> how it is called in tables.
+UNITS = {
+    "J_M_o": "J_M,o [rad^2]",
+    "J_M_i": "J_M,i [rad^2/s^2]",
+    "J_r_o": "J_r,o [rad^2]",
+    "J_r_i": "J_r,i [rad^2/s^2]",
+    "offaxis_peak_deg": "off-axis peak [deg]",
+    "offaxis_rms_deg": "off-axis RMS [deg]",
+    "effort_rms": "effort, RMS of u [-]",
+    "crashed_at_s": "lost at [s]",
+}
 
 
 def register(app: typer.Typer) -> None:
@@ -96,20 +109,24 @@ def fly(
     if as_json:
         print_json({"airframe": body.name, "scenario": scenario, "axis": axis, "seed": seed, **figures})
     else:
-        rows = [[name, "-" if value is None else f"{value:.5g}"] for name, value in figures.items()]
+        rows = [[UNITS.get(name, name), "-" if value is None else f"{value:.5g}"] for name, value in figures.items()]
         title = f"{body.name}, {scenario} on {axis}, against {inner.label} (inner) and {outer.label} (outer)"
         print_table(title, ["figure", "value"], rows)
     if flight.crashed_at is not None:
         raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s", exit_code=1)
+    if flight.record["fault"].any():
+        raise SitlError("the controller refused its inputs for too long and only damped the rates", exit_code=1)
 
 
 def sitl(
     airframe: AirframeArgument,
     gains: GainsOption = None,
-    port: Annotated[int, typer.Option(help="TCP port of the plant (PX4's simulator API).")] = 4560,
-    ground_port: Annotated[int, typer.Option(help="UDP port where the ground station listens.")] = 14550,
-    vehicle_port: Annotated[int, typer.Option(help="Local UDP port of the vehicle.")] = 18570,
-    speed: Annotated[float, typer.Option(help="Times real time.")] = 1.0,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the plant (PX4's simulator API).")] = 4560,
+    ground_port: Annotated[
+        int, typer.Option(min=1, max=65535, help="UDP port where the ground station listens.")
+    ] = 14550,
+    vehicle_port: Annotated[int, typer.Option(min=0, max=65535, help="Local UDP port of the vehicle.")] = 18570,
+    speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Times real time.")] = 1.0,
     seed: SeedOption = 0,
 ) -> None:
     """Run the vehicle as two processes that talk MAVLink, for a ground station. Ctrl-C ends it."""
@@ -139,7 +156,7 @@ def sitl(
 
 def plant(
     airframe: AirframeArgument,
-    port: Annotated[int, typer.Option(help="TCP port to listen on; 0: any free one.")] = 4560,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port to listen on; 0: any free one.")] = 4560,
     rate: Annotated[float, typer.Option(help="Frames a second (the autopilot's control rate), Hz.")] = 250.0,
     speed: Annotated[str, typer.Option(help="Times real time, or max.")] = "1",
     seed: SeedOption = 0,
@@ -152,11 +169,13 @@ def plant(
 
     try:
         times = None if speed == "max" else float(speed)
-        if rate <= 0 or (times is not None and times <= 0):
+        if not 1 <= rate <= 1e4 or not (times is None or 0 < times < 1e6):
             raise ValueError
     except ValueError:
-        raise SitlError(f"--rate {rate}, --speed {speed}: expected numbers above 0, or max for the speed") from None
-    server = PlantServer(load_airframe(airframe).airframe, 1 / rate, seed, times)
+        raise SitlError(
+            f"--rate {rate}, --speed {speed}: expected 1 to 10000 Hz, and a number above 0 or max"
+        ) from None
+    server = PlantServer(load_airframe(airframe).airframe, round(1 / rate, 9), seed, times)
     with listen(LOOPBACK, port) as socket:
         print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
         try:

@@ -42,15 +42,16 @@ class Flight:
 
     @property
     def crashed_at(self) -> float | None:
-        """Time (s) at which the crash rule was met: more than 60 degrees for 0.3 s, or a value that is not finite."""
+        """Time (s) of the loss: more than 60 degrees for 0.3 s, the ground, or a value that is not finite."""
         angles = self.truth["attitude"][:, :2]
         finite = np.isfinite(angles).all(axis=1) & np.isfinite(self.record["moment"]).all(axis=1)
+        grounded = self.truth["position"][:, 2] > 0
         tilted = ~(np.abs(angles) <= CRASH_ANGLE).all(axis=1)
         samples = max(1, round(CRASH_SECONDS / self.scenario.Ts))
         run = 0
         for k in range(len(tilted)):
             run = run + 1 if tilted[k] else 0
-            if run >= samples or not finite[k]:
+            if run >= samples or not finite[k] or grounded[k]:
                 return k * self.scenario.Ts
         return None
 

@@ -219,10 +219,16 @@ def integrate_moments(
         When a shape is wrong, a number is not finite, or the tensor is not symmetric and positive definite.
     """
     J = checked_inertia(inertia)
-    M = np.ascontiguousarray(moments, dtype=np.float64)
-    x = np.concatenate([np.ravel(quaternion0), np.ravel(omega0)]).astype(np.float64)
-    if M.ndim != 2 or M.shape[1] != 3 or x.shape != (7,):
-        raise SitlError(f"moments: got shape {M.shape} and {len(x)} initial states, expected (N, 3), 4 and 3")
+    try:
+        M = np.ascontiguousarray(moments, dtype=np.float64)
+        q0, w0 = np.array(quaternion0, dtype=np.float64), np.array(omega0, dtype=np.float64)
+    except ValueError as error:
+        raise SitlError(f"moments, omega0, quaternion0: expected arrays of numbers: {error}") from error
+    if M.ndim != 2 or M.shape[1] != 3 or w0.shape != (3,) or q0.shape != (4,):
+        raise SitlError(
+            f"got moments {M.shape}, omega0 {w0.shape}, quaternion0 {q0.shape}; expected (N, 3), (3,) and (4,)"
+        )
+    x = np.concatenate([q0, w0])
     length = float(np.linalg.norm(x[:4]))
     if not (np.isfinite(M).all() and np.isfinite(x).all() and length > 0):
         raise SitlError("moments and initial state: expected finite numbers and a quaternion that is not zero")

@@ -12,6 +12,8 @@ from tuning.excitation import hold_from_bandwidth, prbs
 
 AXES = ("roll", "pitch")
 LEAD = 1.0  # s of hover before a manoeuvre
+MAX_ANGLE = np.radians(60.0)  # a vehicle that tilts further counts as lost
+MIN_SAMPLES, MAX_SECONDS = 10, 3600.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +50,15 @@ def _axis_index(axis: str) -> int:
     return AXES.index(axis)
 
 
-def _positive(**values: float) -> None:
-    for name, value in values.items():
-        if not (np.isfinite(value) and value > 0):
-            raise SitlError(f"{name}: got {value}, expected a number above 0")
+def _check_length(name: str, seconds: float, Ts: float) -> None:
+    if not MIN_SAMPLES * Ts <= seconds <= MAX_SECONDS:
+        raise SitlError(f"{name}: got {seconds} s, expected {MIN_SAMPLES * Ts:g} to {MAX_SECONDS:g} s")
+
+
+def _check_angle(amplitude: float) -> None:
+    if not 0 < amplitude <= MAX_ANGLE:
+        got, limit = np.degrees(amplitude), np.degrees(MAX_ANGLE)
+        raise SitlError(f"amplitude: got {got:.6g} degrees, expected above 0 and at most {limit:.0f}")
 
 
 def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float = 1.5) -> Scenario:
@@ -70,7 +77,8 @@ def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float =
     tail : float, s
         Level flight after it.
     """
-    _positive(amplitude=amplitude, period=period, Ts=Ts)
+    _check_angle(amplitude)
+    _check_length("period", period, Ts)
     column = _axis_index(axis)
     start, half = round(LEAD / Ts), round(period / 2 / Ts)
     setpoint = np.zeros((start + 2 * half + round(tail / Ts), 3))
@@ -81,7 +89,8 @@ def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float =
 
 def step(axis: str, amplitude: float, period: float, Ts: float) -> Scenario:
     """Set-point A for `period` seconds; arguments as `doublet`."""
-    _positive(amplitude=amplitude, period=period, Ts=Ts)
+    _check_angle(amplitude)
+    _check_length("period", period, Ts)
     column = _axis_index(axis)
     start = round(LEAD / Ts)
     setpoint = np.zeros((start + round(period / Ts), 3))
@@ -91,7 +100,7 @@ def step(axis: str, amplitude: float, period: float, Ts: float) -> Scenario:
 
 def hover(axis: str, period: float, Ts: float) -> Scenario:
     """Level set-point for `period` seconds; arguments as `doublet`."""
-    _positive(period=period, Ts=Ts)
+    _check_length("period", period, Ts)
     setpoint = np.zeros((round(period / Ts), 3))
     return Scenario("hover", Ts, setpoint, np.zeros_like(setpoint), _axis_index(axis), (0, len(setpoint)))
 
@@ -125,10 +134,15 @@ def excitation_flight(
     generator : numpy.random.Generator
         Source of all randomness.
     """
-    _positive(seconds_per_axis=seconds_per_axis, amplitude=amplitude, bandwidth=bandwidth)
-    if amplitude > 1:
-        raise SitlError(f"amplitude: got {amplitude}, expected at most 1, the largest moment")
+    _check_length("seconds_per_axis", seconds_per_axis, Ts)
+    if not 0 < amplitude <= 1:
+        raise SitlError(f"amplitude: got {amplitude}, expected above 0 and at most 1, the largest moment")
     hold_min, hold_max = hold_from_bandwidth(bandwidth, Ts)
+    if hold_max * Ts > seconds_per_axis:
+        raise SitlError(
+            f"bandwidth: at {bandwidth:g} rad/s one pulse may last {hold_max * Ts:.3g} s, longer than the "
+            f"{seconds_per_axis:g} s on each axis"
+        )
     samples = round(seconds_per_axis / Ts)
     excitation = np.zeros((2 * samples, 3))
     for axis in range(2):

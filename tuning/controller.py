@@ -156,8 +156,8 @@ class Controller:
         fault = sum(1 << (3 * kind + i) for kind in range(3) for i in range(3) if self.age[kind][i] > HOLD_SAMPLES)
         for i in range(3):
             if not -f(MAX_EXCITATION) <= u_bar[i] <= f(MAX_EXCITATION):
+                self.fault_count += not np.isnan(u_bar[i])  # NaN: nothing is injected
                 u_bar[i] = f(0)
-                self.fault_count += 1
         if fault:
             return self._damp_rates(valid, fault, armed)
 
@@ -240,7 +240,7 @@ def rebuild_rate_setpoint(
     gains : Gains
         The inner loop's gains (roll and pitch).
     u : (N, 2) array
-        Control moment without the excitation's part that the controller did not make; dimensionless.
+        Control moment applied to the plant, injection included: the virtual controller makes all of it.
     y_i : (N, 2) array, rad/s
         Measured body rates.
 

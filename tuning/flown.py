@@ -76,6 +76,8 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     else:
         cutoff = float(f"{-math.log(pole) / (2 * math.pi * Ts):.6g}") if pole > 0 else 0.0
     scale = [values.get(f"{PARAMETER_PREFIX}{SCALE}_{letter}") for letter in "RPY"]
+    if min(*limits.rate_max, *limits.moment_max, *limits.integral_max) <= 0:
+        return None
     return Gains(
         **matrices,  # type: ignore[arg-type]
         yaw=yaw,

@@ -12,6 +12,7 @@ import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from datetime import date, time
 from pathlib import Path
 from typing import Any
 
@@ -124,10 +125,12 @@ class Gains:
             raise TuningError(f"Ts: got {self.Ts} s, expected 0.0001 to 1 s")
         if self.derivative_cutoff_hz < 0:
             raise TuningError(f"derivative_cutoff_hz: got {self.derivative_cutoff_hz}, expected 0 (no filter) or more")
-        for name in LIMITS:
-            for axis, value in zip(AXES, getattr(self.limits, name), strict=True):
+        triples = {f"limits.{name}": getattr(self.limits, name) for name in LIMITS}
+        triples["moment_scale"] = self.moment_scale or ()
+        for name, triple in triples.items():
+            for axis, value in zip(AXES, triple, strict=False):
                 if value <= 0:
-                    raise TuningError(f"limits.{name} ({axis}): got {value}, expected more than 0")
+                    raise TuningError(f"{name} ({axis}): got {value}, expected more than 0")
 
     def _numbers(self) -> dict[str, float]:
         numbers = {"Ts": self.Ts, "derivative_cutoff_hz": self.derivative_cutoff_hz}
@@ -244,7 +247,7 @@ def gains_from_toml(text: str, where: str) -> Gains:
     """Parse the text of a gains file; `where` names it in messages. See `load_gains`."""
     try:
         table = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise TuningError(f"{where}: not a TOML file: {error}") from error
     if table.get("schema") != SCHEMA:
         raise TuningError(
@@ -263,6 +266,9 @@ def gains_from_toml(text: str, where: str) -> Gains:
     }
     for key in sorted(set(table) - known):
         raise TuningError(f"{where}: {key}: unknown entry; known: {', '.join(sorted(known))}")
+    for name in ("certificate", "provenance"):
+        if not isinstance(table.get(name, {}), dict):
+            raise TuningError(f"{where}: {name}: got {table[name]!r}, expected a table")
     try:
         scale = _get(table, "moment_scale", "")
         return Gains(
@@ -275,7 +281,7 @@ def gains_from_toml(text: str, where: str) -> Gains:
             certificate=table.get("certificate"),
             provenance=table.get("provenance", {}),
         )
-    except TuningError as error:
+    except (TuningError, OverflowError) as error:
         raise TuningError(f"{where}: {error}") from error
 
 
@@ -361,4 +367,6 @@ def toml_value(value: Any) -> str:
         return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, date | time):
+        return value.isoformat()
     return "[" + ", ".join(toml_value(item) for item in value) + "]"

@@ -10,6 +10,9 @@ from scipy.signal import cont2discrete, lfilter
 
 from tuning.errors import TuningError
 
+MAX_DAMPING = 10
+MAX_DELAY = 100
+
 
 @dataclass(frozen=True)
 class ReferenceModel:
@@ -83,12 +86,13 @@ def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceM
     Raises
     ------
     TuningError
-        When omega or zeta is not positive, omega is above Nyquist, or the delay is negative.
+        When omega is above Nyquist, or a number is out of the range of any attitude loop.
     """
-    if not (0 < omega < np.pi / Ts and zeta > 0 and delay >= 0):
+    if not (1e-3 <= omega < np.pi / Ts and 0 < zeta <= MAX_DAMPING and 0 <= delay <= MAX_DELAY):
         raise TuningError(
             f"reference model: got omega {omega} rad/s, damping {zeta}, delay {delay}; "
-            f"expected 0 < omega < {np.pi / Ts:.4g} rad/s, damping > 0, delay >= 0 samples"
+            f"expected 0.001 <= omega < {np.pi / Ts:.4g} rad/s, 0 < damping <= {MAX_DAMPING}, "
+            f"delay 0 to {MAX_DELAY} samples"
         )
     num, den, _ = cont2discrete(([omega**2], [1, 2 * zeta * omega, omega**2]), Ts, method="zoh")
     return ReferenceModel(

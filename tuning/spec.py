@@ -71,7 +71,7 @@ class TuningSpec(_Table):
     method: Literal["mimo", "siso"] = "mimo"
     inner: tuple[Model, Model] = ((20.0, 0.4, 0), (20.0, 0.4, 0))
     outer: tuple[Model, Model] = ((10.0, 0.7, 0), (10.0, 0.7, 0))
-    window: Annotated[int, Field(ge=1)] | None = None
+    window: Annotated[int, Field(ge=1, le=500)] | None = None
     weight: Literal["identity", "optimal"] = "optimal"
     pull: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     refine: bool = True

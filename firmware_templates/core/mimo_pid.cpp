@@ -224,10 +224,10 @@ void step(State &state, const Input &input, Output &output)
 	for (int j = 0; j < kAxes; j++) {
 		float excitation = input.excitation[j];
 
-		if (!within(excitation, kMaxExcitation)) {
-			excitation = 0.0F;
-			state.fault_count++;
-		}
+		// NaN means that nothing is injected; anything else out of range is a fault.
+		if (excitation > kMaxExcitation || excitation < -kMaxExcitation) { state.fault_count++; }
+
+		if (!within(excitation, kMaxExcitation)) { excitation = 0.0F; }
 
 		if (failed == 0) {
 			const float limit = gains.moment_max[j];

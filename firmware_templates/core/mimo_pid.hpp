@@ -76,7 +76,8 @@ bool initialise(State &state, const Gains &gains);
 // Returns false, and changes nothing, when a number is not finite, too large, or out of its range.
 bool set_gains(State &state, const Gains &gains);
 
-// One control period.
+// One control period. When an input has been invalid for more than kHoldSamples the controller only damps the
+// measured rates, u = -Kp y_i - Kd d, integrators frozen; an axis whose rate is the invalid input gets 0.
 void step(State &state, const Input &input, Output &output);
 
 }  // namespace mimopilot

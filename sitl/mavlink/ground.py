@@ -21,6 +21,14 @@ CAPABILITIES = (
     | mavlink.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
     | mavlink.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
 )
+HEALTHY = (
+    mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
+    | mavlink.MAV_SYS_STATUS_SENSOR_3D_ACCEL
+    | mavlink.MAV_SYS_STATUS_SENSOR_ANGULAR_RATE_CONTROL
+    | mavlink.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
+    | mavlink.MAV_SYS_STATUS_GEOFENCE
+    | mavlink.MAV_SYS_STATUS_PREARM_CHECK
+)
 #: Message -> how many a second.
 RATES = {"heartbeat": 1.0, "system": 1.0, "attitude": 20.0}
 
@@ -106,7 +114,7 @@ class Ground:
                 )
             )
         if "system" in due:
-            self.send(mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 65535, -1, -1, 0, 0, 0, 0, 0, 0))
+            self.send(mavlink.MAVLink_sys_status_message(HEALTHY, HEALTHY, HEALTHY, 0, 65535, -1, -1, 0, 0, 0, 0, 0, 0))
         if "attitude" in due and stamp_us > 0:
             milliseconds = stamp_us // 1000 % 2**32
             roll, pitch, yaw = (float(v) for v in row["attitude"])

@@ -24,7 +24,6 @@ from sitl.sensors import SIZE
 
 ARMED = 128
 LOCKSTEP = 1
-START_S = 60.0
 
 
 @contextmanager

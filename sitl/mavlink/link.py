@@ -56,7 +56,8 @@ def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
     except OSError as error:
         server.close()
         raise SitlError(
-            f"TCP port {port} on {host} cannot be used: {error.strerror}; is another simulator running?"
+            f"TCP port {port} on {host} cannot be used: {error.strerror}; is another simulator "
+            "running? Choose another port with --port"
         ) from error
     return server
 
@@ -75,7 +76,8 @@ def udp_socket(host: str, port: int) -> socket.socket:
     except OSError as error:
         link.close()
         raise SitlError(
-            f"UDP port {port} on {host} cannot be used: {error.strerror}; is another vehicle running?"
+            f"UDP port {port} on {host} cannot be used: {error.strerror}; is another vehicle "
+            "running? Choose another port with --vehicle-port"
         ) from error
     link.setblocking(False)
     return link

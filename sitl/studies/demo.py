@@ -61,7 +61,7 @@ class Summary:
                 axis: {method: asdict(figures) for method, figures in methods.items()}
                 for axis, methods in self.figures.items()
             },
-            "mavlink": {"samples": self.mavlink_samples, "different": 0, "times_real_time": self.mavlink_speed},
+            "mavlink": {"samples": self.mavlink_samples, "times_real_time": self.mavlink_speed},
             "seconds": self.seconds,
         }
 

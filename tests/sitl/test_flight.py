@@ -192,7 +192,7 @@ def test_a_doublet_is_up_then_down_then_level():
     [
         (lambda: make_scenario("loop", "roll", 10, 1, TS), "scenario: got 'loop'"),
         (lambda: make_scenario("doublet", "yaw", 10, 1, TS), "axis: got 'yaw'"),
-        (lambda: step("roll", -1, 1, TS), "amplitude: got -1"),
+        (lambda: step("roll", -1, 1, TS), "amplitude: got -57.2958 degrees"),
         (lambda: step("roll", 0.1, float("nan"), TS), "period: got nan"),
         (lambda: excitation_flight(20, 1.5, 50, TS, np.random.default_rng(0)), "amplitude: got 1.5"),
     ],

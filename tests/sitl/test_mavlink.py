@@ -263,7 +263,7 @@ def test_a_plant_port_in_use_is_one_clear_line(mimopilot):
         port = taken.getsockname()[1]
         free = ("--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", free_port(socket.SOCK_DGRAM))
         in_use = mimopilot("sitl", "adam0", "--port", port, *free)
-        assert_one_clear_line(in_use, f"TCP port {port}", "is another simulator running?")
+        assert_one_clear_line(in_use, f"TCP port {port}", "--port")
         assert_one_clear_line(mimopilot("plant", "adam0", "--port", port), f"TCP port {port}")
 
 

@@ -15,7 +15,7 @@ from tuning.files import sha256
 from tuning.flown import flown_gains
 from tuning.logs.resample import Series, on_common_grid
 
-#: Signal -> the (topic, fields) that hold it, newest PX4 first; see the table in the README.
+#: Signal -> the (topic, fields) that hold it, newest PX4 first.
 LAYOUTS = {
     "u": (("vehicle_torque_setpoint", ("xyz[0]", "xyz[1]")), ("actuator_controls_0", ("control[0]", "control[1]"))),
     "y_i": (("vehicle_angular_velocity", ("xyz[0]", "xyz[1]")), ("vehicle_attitude", ("rollspeed", "pitchspeed"))),
