@@ -42,8 +42,8 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
     """
     spec = spec or TuningSpec()
     base = _base(experiment, spec)
-    instrument, name = _instrument(experiment)
-    stretches = _stretches(experiment, instrument, spec.method)
+    instrument, name = external_signal(experiment)
+    stretches = excited_stretches(experiment, instrument, spec.method)
 
     inner = [
         vrft(
@@ -127,7 +127,14 @@ def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
     )
 
 
-def _instrument(experiment: Experiment) -> tuple[NDArray[np.float64], str]:
+def external_signal(experiment: Experiment) -> tuple[NDArray[np.float64], str]:
+    """The instrument, (N, 2), and its name: the injected moment, else the attitude set-point (rad).
+
+    Raises
+    ------
+    TuningError
+        When neither is logged and moves.
+    """
     for name in ("u_bar", "r_o"):
         signal = getattr(experiment, name)
         if signal is not None and any(np.ptp(signal[start:stop]) > 0 for start, stop in experiment.segments):
@@ -138,10 +145,16 @@ def _instrument(experiment: Experiment) -> tuple[NDArray[np.float64], str]:
     )
 
 
-def _stretches(
+def excited_stretches(
     experiment: Experiment, instrument: NDArray[np.float64], method: str
 ) -> list[tuple[slice, list[tuple[int, int]]]]:
-    """Which axes are tuned together, and on which samples: SISO uses an axis' own part of the flight."""
+    """Which axes are tuned together, and on which samples: SISO uses an axis' own part of the flight.
+
+    Raises
+    ------
+    TuningError
+        When an axis is not excited.
+    """
     if method == "mimo":
         for axis in range(2):
             if all(np.ptp(instrument[start:stop, axis]) == 0 for start, stop in experiment.segments):

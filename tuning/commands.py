@@ -10,11 +10,18 @@ import typer
 
 def register(app: typer.Typer) -> None:
     """Add this room's commands to the front door."""
+    app.command(epilog="Example: mimopilot inspect flight.ulg")(inspect)
     app.command(epilog="Example: mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out my.gains.toml")(tune)
 
 
+LOG = Annotated[Path, typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, CSV or MATLAB file.")]
+COLUMNS = Annotated[
+    Path | None, typer.Option(help="Names, units and signs of the columns of a CSV or MATLAB file (TOML).")
+]
+
+
 def tune(
-    log: Annotated[Path, typer.Argument(help="Flight log (PX4 ULog) with an injected moment.")],
+    log: LOG,
     out: Annotated[Path, typer.Option(help="Where the gains are written: FILE.gains.toml.")],
     method: Annotated[
         str | None, typer.Option(help="mimo (full matrices, the default) or siso (each axis by itself).")
@@ -29,12 +36,14 @@ def tune(
     spec: Annotated[
         Path | None, typer.Option(help="Specification (TOML): the above, and what the log does not say.")
     ] = None,
+    columns: COLUMNS = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Find the gains of the attitude cascade from one flight."""
     from tuning.cascade import tune as tune_cascade
     from tuning.gains import MATRICES
-    from tuning.logs.ulog import read_ulog
+    from tuning.logs.columns import load_columns
+    from tuning.logs.reader import read_log
     from tuning.output import print_json
     from tuning.spec import load_spec, parse_model
 
@@ -45,7 +54,7 @@ def tune(
         outer=parse_model(outer) if outer else None,
         window=window,
     )
-    gains = tune_cascade(read_ulog(log), task)
+    gains = tune_cascade(read_log(log, load_columns(columns) if columns else None), task)
     gains.save(out)
     deviations = gains.provenance["standard_deviation"]
     if as_json:
@@ -54,6 +63,24 @@ def tune(
         return
     print_gains(f"{task.method.upper()} gains from {log.name} (standard deviation)", gains, deviations)
     print(f"written to {out}")
+
+
+def inspect(
+    log: LOG,
+    columns: COLUMNS = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Show what is in a flight log, and whether gains can be tuned from it."""
+    from tuning.logs.columns import load_columns
+    from tuning.logs.inspection import inspect_log
+    from tuning.logs.inspection_report import as_mapping, print_inspection
+    from tuning.output import print_json
+
+    found = inspect_log(log, load_columns(columns) if columns else None)
+    if as_json:
+        print_json(as_mapping(found))
+    else:
+        print_inspection(found)
 
 
 def print_gains(title: str, gains: Any, deviations: dict[str, Any]) -> None:

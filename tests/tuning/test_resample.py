@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 
 from tuning.errors import TuningError
-from tuning.logs.resample import Series, on_common_grid
+from tuning.logs.resample import Series, held_samples, monotone, on_common_grid
 
-HELD = ("u",)
+ALWAYS = [(-np.inf, np.inf)]
 
 
 def series(time, offset=0.0):
@@ -12,8 +12,8 @@ def series(time, offset=0.0):
     return Series(time, np.column_stack([np.sin(time) + offset, np.cos(time)]), "topic")
 
 
-def grid(**signals):
-    return on_common_grid(signals, HELD, -np.inf, np.inf, "log", primary="u")
+def grid(parts=ALWAYS, **signals):
+    return on_common_grid({name: monotone(s) for name, s in signals.items()}, parts, "log", "set SDLOG_PROFILE to 17")
 
 
 def uniform(seconds=10.0, Ts=0.004, start=1.0):
