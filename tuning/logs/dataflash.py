@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import io
-from collections.abc import Sequence
+import os
+import sys
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -117,16 +118,34 @@ class _Log:
         columns = self.fields(message, ("TimeUS", *names))
         if columns is None or any(column.dtype.kind == "S" for column in columns) or len(columns[0]) < 2:
             return None
-        time, *values = (column.astype(np.float64) for column in columns)
+        with np.errstate(invalid="ignore"):  # a damaged float may be a signalling NaN
+            time, *values = (column.astype(np.float64) for column in columns)
         return Series(time * 1e-6, np.column_stack(values) * factor, message)
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Drop what is printed meanwhile: DFReader tells of every damaged byte, its indexer past Python's own streams."""
+    sys.stderr.flush()
+    saved = os.dup(2)
+    try:
+        with (
+            Path(os.devnull).open("w") as nothing,
+            contextlib.redirect_stdout(nothing),
+            contextlib.redirect_stderr(nothing),
+        ):
+            os.dup2(nothing.fileno(), 2)
+            yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
 
 
 def _open(path: Path) -> _Log:
     from pymavlink.DFReader import DFReader_binary
 
-    silence = io.StringIO()  # DFReader prints every damaged byte
     try:
-        with contextlib.redirect_stdout(silence), contextlib.redirect_stderr(silence):
+        with _silence():
             reader = DFReader_binary(str(path))
         with contextlib.closing(reader):
             offsets = {name: np.array(reader.offsets[kind], np.int64) for name, kind in reader.name_to_id.items()}

@@ -109,7 +109,7 @@ def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], sour
 
 def monotone(signal: Series) -> Series:
     """The signal with time stamps that rise: of equal ones the last is kept, those out of order are dropped."""
-    keep = np.append(np.diff(signal.time) != 0, True)
+    keep = np.append(np.diff(signal.time) != 0, True)[: len(signal.time)]
     time, values = signal.time[keep], signal.values[keep]
     if np.any(np.diff(time) < 0):
         order = _longest_rise(time)

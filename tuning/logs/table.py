@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -59,7 +60,13 @@ def record_csv(path: Path, columns: Columns) -> Recording:
             if set(twice) & set(used):
                 raise TuningError(f"{path}: column {', '.join(twice)} appears twice; rename one")
             places = [i for i, name in enumerate(header) if name in used]
-            rows = np.loadtxt(stream, delimiter=delimiter, usecols=places, ndmin=2, converters=_cell, quotechar='"')
+            filled = (line for line in stream if line.strip())
+            if (row := next(filled, None)) is None:
+                raise TuningError(f"{path}: no samples below the header line; export the log again")
+            rows = np.empty((0, 0))
+            if places:
+                lines = itertools.chain([row], filled)
+                rows = np.loadtxt(lines, delimiter=delimiter, usecols=places, ndmin=2, converters=_cell, quotechar='"')
     except TuningError:
         raise
     except (ValueError, UnicodeDecodeError, csv.Error, OverflowError, IndexError) as error:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,6 +89,7 @@ def record_ulog(path: Path) -> Recording:
         airborne,
         evidence,
         parameters,
+        ("the file is damaged: what could be read of it is used",) if log.ulog.file_corruption else (),
     )
 
 
@@ -96,7 +99,8 @@ class _Log:
 
     def fields(self, topic: str) -> dict[str, NDArray[Any]]:
         """Field -> values of the first instance of a topic; empty when it is not logged."""
-        found = (d.data for d in self.ulog.data_list if d.name == topic and d.multi_id == 0)
+        named = (d.data for d in self.ulog.data_list if d.name == topic and d.multi_id == 0)
+        found = (data for data in named if len(data.get("timestamp", ())))
         return next(found, {})
 
     def is_sampled(self, topic: str) -> bool:
@@ -114,7 +118,8 @@ class _Log:
         data = self.fields(topic)
         if not all(name in data for name in names):
             return None
-        values = np.column_stack([data[name] for name in names]).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a damaged float may be a signalling NaN
+            values = np.column_stack([data[name] for name in names]).astype(np.float64)
         return Series(self.published(topic)[1], values, topic)
 
 
@@ -122,7 +127,8 @@ def _open(path: Path) -> Any:
     from pyulog import ULog
 
     try:
-        return ULog(str(path))
+        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints what it skips
+            return ULog(str(path))
     except Exception as error:  # pyulog raises whatever a damaged file makes of its parser
         raise TuningError(f"{path}: damaged ULog file: {error or type(error).__name__}; download it again") from error
 
