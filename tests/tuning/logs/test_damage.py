@@ -50,7 +50,7 @@ def damaged(content, seed):
     return data
 
 
-@pytest.mark.filterwarnings("error")
+@pytest.mark.filterwarnings("error::RuntimeWarning", "error::UserWarning")
 def test_a_damaged_log_gives_an_experiment_or_one_message_and_prints_nothing(whole, tmp_path, capfd):
     read_log(whole)
     path = tmp_path / whole.name
