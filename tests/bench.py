@@ -20,7 +20,7 @@ from sitl.mavlink.host import Host, plant_process
 from sitl.scenario import doublet, excitation_flight
 from tuning.cascade import tune
 from tuning.controller import Controller
-from tuning.logs.ulog import read_ulog
+from tuning.logs.reader import read_log
 from tuning.output import print_table
 from tuning.spec import load_spec
 
@@ -86,7 +86,7 @@ def main() -> None:
             ["one step of the controller, Python reference", f"{reference * 1e6:.0f} us", f"{reference / native:.0f} x"]
         )
 
-        experiment = read_ulog(folder / "demo" / "flight.ulg")
+        experiment = read_log(folder / "demo" / "flight.ulg")
         identity = best(lambda: tune(experiment, load_spec(weight="identity")))
         rows.append(["tune the cascade, N = 10^4, least squares", f"{identity * 1e3:.0f} ms", ""])
         optimal = best(lambda: tune(experiment))

@@ -11,7 +11,7 @@ from pyulog import ULog
 
 from tests.conftest import assert_one_clear_line
 
-COMMANDS = ["demo", "experiment", "tune", "certify", "advise", "generate", "fly", "sitl", "plant"]
+COMMANDS = ["demo", "experiment", "inspect", "tune", "certify", "advise", "generate", "fly", "sitl", "plant"]
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +120,7 @@ def test_models_window_and_specification_are_taken(mimopilot, log, tmp_path):
         (("fly", "adam0", "--scenario", "spin"), ("scenario: got 'spin'",)),
         (("fly", "adam0", "--amplitude-deg", "nan"), ("amplitude: got nan",)),
         (("tune", "none.ulg", "--out", "x.toml"), ("none.ulg", "no such file")),
-        (("tune", "text.ulg", "--out", "x.toml"), ("text.ulg", "not a ULog")),
+        (("tune", "text.ulg", "--out", "x.toml"), ("text.ulg", "not a flight log")),
         (("tune", "cut.ulg", "--out", "x.toml"), ("cut.ulg",)),
         (("tune", "LOG", "--inner", "20", "--out", "x.toml"), ("expected OMEGA,ZETA,DELAY",)),
         (("tune", "LOG", "--inner", "20,-1,0", "--out", "x.toml"), ("inner.0.1",)),

@@ -50,7 +50,7 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
     spec = spec or TuningSpec()
     base = _base(experiment, spec)
     instrument, name = external_signal(experiment)
-    stretches = _stretches(experiment, instrument, spec.method)
+    stretches = excited_stretches(experiment, instrument, spec.method)
 
     inner = [
         vrft(
@@ -180,12 +180,12 @@ def _prior(experiment: Experiment, spec: TuningSpec, axes: slice) -> dict[str, N
 
 
 def external_signal(experiment: Experiment) -> tuple[NDArray[np.float64], str]:
-    """The experiment's instrument, (N, 2), and its name: the injected moment when it is logged, else the set-point.
+    """The instrument, (N, 2), and its name: the injected moment, else the attitude set-point (rad).
 
     Raises
     ------
     TuningError
-        When neither moves.
+        When neither is logged and moves.
     """
     for name in ("u_bar", "r_o"):
         signal = getattr(experiment, name)
@@ -197,10 +197,16 @@ def external_signal(experiment: Experiment) -> tuple[NDArray[np.float64], str]:
     )
 
 
-def _stretches(
+def excited_stretches(
     experiment: Experiment, instrument: NDArray[np.float64], method: str
 ) -> list[tuple[slice, list[tuple[int, int]]]]:
-    """Which axes are tuned together, and on which samples: SISO uses an axis' own part of the flight."""
+    """Which axes are tuned together, and on which samples: SISO uses an axis' own part of the flight.
+
+    Raises
+    ------
+    TuningError
+        When an axis is not excited.
+    """
     if method == "mimo":
         for axis in range(2):
             if all(np.ptp(instrument[start:stop, axis]) == 0 for start, stop in experiment.segments):

@@ -11,13 +11,20 @@ import typer
 
 def register(app: typer.Typer) -> None:
     """Add this room's commands to the front door."""
+    app.command(epilog="Example: mimopilot inspect flight.ulg")(inspect)
     app.command(epilog="Example: mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out my.gains.toml")(tune)
     app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
     app.command(epilog="Example: mimopilot advise flight.ulg --outer 10,0.7,0 --out my.gains.toml")(advise)
 
 
+LOG = Annotated[Path, typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, CSV or MATLAB file.")]
+COLUMNS = Annotated[
+    Path | None, typer.Option(help="Names, units and signs of the columns of a CSV or MATLAB file (TOML).")
+]
+
+
 def tune(
-    log: Annotated[Path, typer.Argument(help="Flight log (PX4 ULog) with an injected moment.")],
+    log: LOG,
     out: Annotated[Path, typer.Option(help="Where the gains are written: FILE.gains.toml.")],
     method: Annotated[
         str | None, typer.Option(help="mimo (full matrices, the default) or siso (each axis by itself).")
@@ -32,12 +39,14 @@ def tune(
     spec: Annotated[
         Path | None, typer.Option(help="Specification (TOML): the above, and what the log does not say.")
     ] = None,
+    columns: COLUMNS = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Find the gains of the attitude cascade from one flight."""
     from tuning.cascade import tune as tune_cascade
     from tuning.gains import MATRICES
-    from tuning.logs.ulog import read_ulog
+    from tuning.logs.columns import load_columns
+    from tuning.logs.reader import read_log
     from tuning.output import print_json
     from tuning.spec import load_spec, parse_model
 
@@ -48,7 +57,7 @@ def tune(
         outer=parse_model(outer) if outer else None,
         window=window,
     )
-    gains = tune_cascade(read_ulog(log), task)
+    gains = tune_cascade(read_log(log, load_columns(columns) if columns else None), task)
     gains.save(out)
     deviations = gains.provenance["standard_deviation"]
     for warning in gains.provenance["warnings"]:
@@ -64,19 +73,21 @@ def tune(
 
 
 def certify(
-    log: Annotated[Path, typer.Argument(help="Flight log (PX4 ULog) of the vehicle, with an injected moment.")],
+    log: LOG,
     gains: Annotated[Path, typer.Option(help="Gains file to examine.")],
     out: Annotated[Path | None, typer.Option(help="Write the gains with their certificate to this file.")] = None,
+    columns: COLUMNS = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Say whether a loop will be stable, from a flight of the vehicle under any gains. Exit code 1: unstable."""
     from tuning.cascade import certify_from_log
     from tuning.certificate import UNSTABLE
     from tuning.gains import load_gains
-    from tuning.logs.ulog import read_ulog
+    from tuning.logs.columns import load_columns
+    from tuning.logs.reader import read_log
     from tuning.output import print_json
 
-    examined = certify_from_log(read_ulog(log), load_gains(gains))
+    examined = certify_from_log(read_log(log, load_columns(columns) if columns else None), load_gains(gains))
     if out is not None:
         examined.save(out)
     if as_json:
@@ -88,10 +99,11 @@ def certify(
 
 
 def advise(
-    log: Annotated[Path, typer.Argument(help="Flight log (PX4 ULog) with an injected moment.")],
+    log: LOG,
     outer: Annotated[str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY; 10,0.7,0.")] = None,
     spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
+    columns: COLUMNS = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Scan bandwidth, damping and delay of the rate loop's model; recommend one and say why."""
@@ -100,13 +112,16 @@ def advise(
     from rich.progress import track
 
     from tuning.advisor import advise as scan
-    from tuning.logs.ulog import read_ulog
+    from tuning.logs.columns import load_columns
+    from tuning.logs.reader import read_log
     from tuning.output import print_json, print_table, progress_console
     from tuning.spec import load_spec, parse_model
 
     task = load_spec(spec, outer=parse_model(outer) if outer else None)
     candidates, best = scan(
-        read_ulog(log), task, watch=lambda grid: track(list(grid), "tuning", console=progress_console(), transient=True)
+        read_log(log, load_columns(columns) if columns else None),
+        task,
+        watch=lambda grid: track(list(grid), "tuning", console=progress_console(), transient=True),
     )
     assert best.gains is not None
     if out is not None:
@@ -150,6 +165,24 @@ def print_certificate(gains: Any) -> None:
         rows.append([axis, "{:.1f} dB, {:.0f} deg, {:.1f} ms".format(*margins)])
     low, high = certificate["band"]
     print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)
+
+
+def inspect(
+    log: LOG,
+    columns: COLUMNS = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Show what is in a flight log, and whether gains can be tuned from it."""
+    from tuning.logs.columns import load_columns
+    from tuning.logs.inspection import inspect_log
+    from tuning.logs.inspection_report import as_mapping, print_inspection
+    from tuning.output import print_json
+
+    found = inspect_log(log, load_columns(columns) if columns else None)
+    if as_json:
+        print_json(as_mapping(found))
+    else:
+        print_inspection(found)
 
 
 def print_gains(title: str, gains: Any, deviations: dict[str, Any]) -> None:

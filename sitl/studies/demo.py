@@ -27,7 +27,7 @@ from sitl.report import Section, Table, write_report
 from sitl.scenario import AXES, Scenario, doublet, excitation_flight
 from tuning.cascade import tune
 from tuning.gains import MATRICES, Gains
-from tuning.logs.ulog import read_ulog
+from tuning.logs.reader import read_log
 from tuning.output import print_table
 from tuning.spec import load_spec
 
@@ -107,7 +107,7 @@ def run_demo(out: Path, seed: int) -> Summary:
         save_flight(log, flight, airframe, gains["default"])
 
     with _stage("tuning: SISO and MIMO VRFT from the log"):
-        experiment = read_ulog(log)
+        experiment = read_log(log)
         for method in ("siso", "mimo"):
             gains[method] = tune(experiment, load_spec(method=method))
         paths = {method: out / f"{method}.gains.toml" for method in METHODS}

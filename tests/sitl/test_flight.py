@@ -16,7 +16,7 @@ from sitl.recorder import quaternions, record_flight, save_flight
 from sitl.scenario import doublet, excitation_flight, hover, make_scenario, step
 from sitl.sensors import euler_angles, measure
 from tuning.controller import Controller
-from tuning.logs.ulog import read_ulog
+from tuning.logs.reader import read_log
 from tuning.reference import second_order
 
 TS = 0.004
@@ -88,7 +88,7 @@ def test_altitude_is_held_through_the_experiment(vehicle):
 def test_a_recorded_flight_reads_back_as_it_was_flown(vehicle, tmp_path):
     flight = short_experiment(vehicle)
     save_flight(tmp_path / "a.ulg", flight, vehicle.airframe, vehicle.default_gains())
-    read = read_ulog(tmp_path / "a.ulg")
+    read = read_log(tmp_path / "a.ulg")
     # The experiment ends with its last injected sample; here the whole flight is excited.
     assert read.Ts == TS
     assert read.segments == ((0, len(flight.record)),)

@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+import bisect
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
 
-MIN_RATE = 100.0  # Hz, of the torque: below it gains come out wrong
+MIN_RATE = 100.0  # Hz, of torque, rates and angles: below it gains come out wrong
 MAX_GAP = 5  # samples
 MIN_SECONDS = 5.0
+SAME_RATE = 1.1  # periods closer than this factor count as equal
+MAX_EMPTY = 20  # a grid with more than this many points a sample is the work of a damaged time stamp
+
+#: Signals that make the experiment: all must be there, and none may be slow.
+REQUIRED = ("u", "y_i", "y_o")
+#: Signals that are constant between samples; the others are interpolated.
+HELD = ("u", "u_bar", "r_o", "r_i")
+
+Interval = tuple[float, float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,26 +45,23 @@ class Grid:
     segments: tuple[tuple[int, int], ...]
 
 
-def on_common_grid(
-    series: Mapping[str, Series], held: Sequence[str], begin: float, end: float, source: str, primary: str
-) -> Grid:
-    """Signals on the grid of the `primary` one, between two times.
+def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], source: str, advice: str) -> Grid:
+    """Torque, rates, angles and what else is logged on the grid of the torque.
 
-    Set-points, torque and excitation are held, measurements interpolated. Where a signal pauses for more
-    than five periods the grid is cut; a repeated or backward time stamp is dropped, the last value kept.
+    Set-points, torque and excitation are held, measurements interpolated. Where torque, rates or angles
+    pause for more than five periods the grid is cut. Where one of the three is slower than the others, all
+    signals are brought to its rate through one and the same zero-phase anti-alias filter.
 
     Parameters
     ----------
     series : mapping
-        Name -> signal.
-    held : sequence of str
-        Names of the signals that are constant between samples.
-    begin, end : float, s
-        Part of the log to use.
+        Name -> signal with time stamps that rise (see `monotone`); `REQUIRED` must be among them.
+    parts : sequence of (begin, end), s
+        Parts of the log to use, in order.
     source : str
         Name of the log, for messages.
-    primary : str
-        The signal whose sampling makes the grid: the torque.
+    advice : str
+        What to change on the vehicle when a signal is slow, for messages.
 
     Returns
     -------
@@ -61,57 +70,117 @@ def on_common_grid(
     Raises
     ------
     TuningError
-        When the primary signal is slower than 100 Hz, or less than 5 s are left.
+        When torque, rates or angles are slower than 100 Hz, or less than 5 s are left.
     """
-    clean = {name: _monotone(signal) for name, signal in series.items()}
-    main = clean[primary]
-    inside = (main.time >= begin - 1e-9) & (main.time <= end + 1e-9)
-    time = main.time[inside]
-    if len(time) < 3:
-        raise TuningError(f"{source}: too short: {main.topic} has {len(time)} samples where the experiment is")
-    Ts = _period(time)
-    if 1 / Ts < MIN_RATE * 0.99:
-        raise TuningError(
-            f"{source}: too slow: {main.topic} is logged at {1 / Ts:.1f} Hz, tuning needs {MIN_RATE:g} Hz or more; "
-            "set SDLOG_PROFILE to 17 (high rate) and fly again"
-        )
+    begin, end = parts[0][0], parts[-1][1]
+    periods = {name: _rate_of(name, series[name], begin, end, source, advice) for name in REQUIRED}
+    slowest, fastest = max(periods.values()), min(periods.values())
+    filtered = slowest > SAME_RATE * fastest
+    leader = min(REQUIRED, key=lambda name: periods[name]) if filtered else "u"
+    time = _inside(series[leader].time, begin, end)
+    Ts = sampling_period(time)
     start, stop = time[0], time[-1]
-    for name in ("y_i", "y_o"):
-        start, stop = max(start, clean[name].time[0]), min(stop, clean[name].time[-1])
-    count = int(np.floor((stop - start) / Ts + 0.5)) + 1
-    if count * Ts < MIN_SECONDS:
+    for name in REQUIRED:
+        start, stop = max(start, series[name].time[0]), min(stop, series[name].time[-1])
+    if stop - start > MAX_EMPTY * Ts * (len(time) + 1000):
         raise TuningError(
-            f"{source}: too short: {max(count, 0) * Ts:.1f} s of flight, tuning needs {MIN_SECONDS:g} s or more"
+            f"{source}: damaged time stamps: {len(time)} samples in {stop - start:.3g} s; download it again"
         )
+    count = max(0, int(np.floor((stop - start) / Ts + 0.5)) + 1)
     grid = start + Ts * np.arange(count)
-    gap_free = np.ones(count, bool)
+    usable = np.zeros(count, bool)
+    for a, b in parts:
+        usable |= (grid >= a - 1e-9) & (grid <= b + 1e-9)
     signals = {}
-    for name, signal in clean.items():
-        signals[name] = _place(signal, grid, Ts, name in held)
-        if name in ("u", "y_i", "y_o"):
-            gap_free &= _covered(signal.time, grid, Ts)
-    segments = _runs(gap_free & np.all([np.isfinite(s).all(axis=1) for s in signals.values()], axis=0))
-    usable = sum(b - a for a, b in segments) * Ts
-    if usable < MIN_SECONDS:
-        raise TuningError(f"{source}: too short: {usable:.1f} s without a gap, tuning needs {MIN_SECONDS:g} s or more")
+    for name, signal in series.items():
+        signals[name] = _place(signal, grid, Ts, name in HELD)
+        if name in REQUIRED:
+            usable &= _covered(signal.time, grid, max(Ts, periods[name]))
+    segments = _runs(usable)
+    if filtered:
+        Ts, signals, segments = _decimate(Ts, signals, segments, slowest)
+    seconds = sum(b - a for a, b in segments) * Ts
+    if seconds < MIN_SECONDS:
+        raise TuningError(
+            f"{source}: too short: {seconds:.1f} s of flight without a gap, tuning needs {MIN_SECONDS:g} s or more"
+        )
     return Grid(Ts, signals, segments)
 
 
-def _monotone(signal: Series) -> Series:
-    """Drop repeated and backward time stamps; of equal ones the last is kept."""
-    order = np.flatnonzero(np.append(np.diff(signal.time) > 0, True))
-    time, values = signal.time[order], signal.values[order]
-    rising = time >= np.maximum.accumulate(time)
-    return Series(time[rising], values[rising], signal.topic)
+def monotone(signal: Series) -> Series:
+    """The signal with time stamps that rise: of equal ones the last is kept, those out of order are dropped."""
+    keep = np.append(np.diff(signal.time) != 0, True)[: len(signal.time)]
+    time, values = signal.time[keep], signal.values[keep]
+    if np.any(np.diff(time) < 0):
+        order = _longest_rise(time)
+        time, values = time[order], values[order]
+    return Series(time, values, signal.topic)
 
 
-def _period(time: NDArray[np.float64]) -> float:
+def sampling_period(time: NDArray[np.float64]) -> float:
     """Sampling period, s: the median interval, refined over the log where single samples are missing."""
     median = float(np.median(np.diff(time)))
     index = np.concatenate([[0], np.cumsum(np.maximum(1, np.round(np.diff(time) / median)))])
     refined = float(np.polyfit(index, time, 1)[0])
     period = refined if abs(refined / median - 1) < 0.01 else median
     return round(period, 9) if abs(period - round(period, 6)) > 2e-9 else round(period, 6)
+
+
+def held_samples(values: NDArray[np.float64]) -> int:
+    """Rows for which each value is repeated because a slower signal was held; 1 when it is not.
+
+    Quantisation repeats values too, but now and then; a hold never gives runs much below its length.
+    """
+    changes = np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1))
+    if len(changes) < 10:
+        return 1
+    runs = np.diff(changes)
+    hold = int(np.median(runs))
+    return hold if np.percentile(runs, 10) > hold / 2 else 1
+
+
+def _rate_of(name: str, signal: Series, begin: float, end: float, source: str, advice: str) -> float:
+    """Period (s) at which a signal brings news, refused when it is too long."""
+    inside = (signal.time >= begin - 1e-9) & (signal.time <= end + 1e-9)
+    if np.count_nonzero(inside) < 3:
+        raise TuningError(
+            f"{source}: too short: {signal.topic} has {np.count_nonzero(inside)} samples where the experiment is"
+        )
+    period = sampling_period(signal.time[inside])
+    # Angles are quantised in many logs, so that only torque and rates show a hold for certain.
+    hold = held_samples(signal.values[inside]) if name != "y_o" else 1
+    if 1 / (period * hold) < MIN_RATE * 0.99:
+        logged = f"is logged at {1 / period:.1f} Hz"
+        if hold > 1:
+            logged += f" but each value is held for {hold} samples, so its rate is {1 / (period * hold):.1f} Hz"
+        raise TuningError(
+            f"{source}: too slow: {signal.topic} {logged}, tuning needs {MIN_RATE:g} Hz or more; {advice}"
+        )
+    return period * hold
+
+
+def _inside(time: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:
+    return time[(time >= begin - 1e-9) & (time <= end + 1e-9)]
+
+
+def _longest_rise(time: NDArray[np.float64]) -> list[int]:
+    """Indices of the longest rising subsequence: one wild stamp costs one sample, whichever way it jumps."""
+    tails: list[float] = []
+    at: list[int] = []
+    before = [-1] * len(time)
+    for i, stamp in enumerate(time.tolist()):
+        place = bisect.bisect_left(tails, stamp)
+        if place == len(tails):
+            tails.append(stamp)
+            at.append(i)
+        else:
+            tails[place], at[place] = stamp, i
+        before[i] = at[place - 1] if place else -1
+    rise, i = [], at[-1]
+    while i >= 0:
+        rise.append(i)
+        i = before[i]
+    return rise[::-1]
 
 
 def _place(signal: Series, grid: NDArray[np.float64], Ts: float, hold: bool) -> NDArray[np.float64]:
@@ -136,3 +205,22 @@ def _covered(time: NDArray[np.float64], grid: NDArray[np.float64], Ts: float) ->
 def _runs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     return tuple((int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True))
+
+
+def _decimate(
+    Ts: float, signals: Mapping[str, NDArray[np.float64]], segments: Sequence[tuple[int, int]], slow: float
+) -> tuple[float, dict[str, NDArray[np.float64]], tuple[tuple[int, int], ...]]:
+    """Every signal at the slow period, segment by segment, so that nothing is filtered across a gap."""
+    from scipy.signal import resample_poly
+
+    ratio = Fraction(Ts / slow).limit_denominator(16)
+    up, down = ratio.numerator, ratio.denominator
+    long_enough = [(a, b) for a, b in segments if b - a > 2 * down]
+    pieces: dict[str, list[NDArray[np.float64]]] = {name: [np.empty((0, 2))] for name in signals}
+    stops = [0]
+    for a, b in long_enough:
+        for name, signal in signals.items():
+            pieces[name].append(resample_poly(signal[a:b], up, down, axis=0, padtype="line"))
+        stops.append(stops[-1] + len(pieces["u"][-1]))
+    joined = {name: np.concatenate(rows) for name, rows in pieces.items()}
+    return Ts * down / up, joined, tuple(itertools.pairwise(stops))

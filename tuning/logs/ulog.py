@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
-from tuning.experiment import Experiment
-from tuning.files import sha256
-from tuning.flown import flown_gains
-from tuning.logs.resample import Series, on_common_grid
+from tuning.logs.flight import bridged, intersection, intervals
+from tuning.logs.recording import Recording
+from tuning.logs.resample import Interval, Series, sampling_period
 
 #: Signal -> the (topic, fields) that hold it, newest PX4 first.
 LAYOUTS = {
@@ -26,35 +27,15 @@ LAYOUTS = {
     ),
     "r_i": (("vehicle_rates_setpoint", ("roll", "pitch")),),
 }
-REQUIRED = ("u", "y_i", "y_o")
-HELD = ("u", "r_o", "r_i", "u_bar")
 EXCITATION_TOPIC, EXCITATION_NAME = "debug_vect", "MIMO_EXC"
+#: Upward thrust, newest PX4 first: (topic, field, sign).
+THRUSTS = (("vehicle_thrust_setpoint", "xyz[2]", -1.0), ("actuator_controls_0", "control[3]", 1.0))
+MIN_THRUST = 0.1
+ARMED = (("actuator_armed", "armed", 1), ("vehicle_status", "arming_state", 2))
 
 
-@dataclass(frozen=True, eq=False)
-class _Log:
-    path: Path
-    ulog: Any
-
-    def topics(self) -> dict[str, list[str]]:
-        return {d.name: sorted(d.data) for d in self.ulog.data_list if d.multi_id == 0}
-
-    def series(self, topic: str, fields: tuple[str, ...]) -> Series | None:
-        for dataset in self.ulog.data_list:
-            if dataset.name == topic and dataset.multi_id == 0 and all(field in dataset.data for field in fields):
-                stamps = dataset.data.get("timestamp_sample", dataset.data["timestamp"])
-                if not np.any(stamps):
-                    stamps = dataset.data["timestamp"]
-                values = np.column_stack([dataset.data[field] for field in fields]).astype(np.float64)
-                return Series(stamps.astype(np.float64) * 1e-6, values, topic)
-        return None
-
-
-def read_ulog(path: Path) -> Experiment:
-    """Read an experiment from a ULog file.
-
-    Torque and rates are paired by ``timestamp_sample``. Where our excitation topic is logged, only the
-    part of the flight between its first and last injected sample is used.
+def record_ulog(path: Path) -> Recording:
+    """Read a ULog file of PX4 1.8 to 1.17.
 
     Parameters
     ----------
@@ -63,58 +44,91 @@ def read_ulog(path: Path) -> Experiment:
 
     Returns
     -------
-    Experiment
+    Recording
+        Measurements and torque at the time of the gyro sample that they belong to, so that one control
+        cycle has one time; set-points and excitation at the cycle that used them.
 
     Raises
     ------
     TuningError
-        When the file is not a ULog, lacks a topic (naming it and the log's own), or is too slow or too short.
+        When the file is damaged.
     """
-    log = _Log(path, _open(path))
-    series: dict[str, Series] = {}
+    log = _Log(_open(path))
+    signals: dict[str, Series] = {}
     for signal, layouts in LAYOUTS.items():
-        found = next((s for s in (log.series(topic, fields) for topic, fields in layouts) if s is not None), None)
-        if found is not None:
-            series[signal] = found
-    missing = [signal for signal in REQUIRED if signal not in series]
-    if missing:
-        wanted = "; ".join(" or ".join(f"{t} ({', '.join(f)})" for t, f in LAYOUTS[signal]) for signal in missing)
-        raise TuningError(
-            f"{path}: lacks {wanted}; set SDLOG_PROFILE to 17 and fly again. "
-            f"Topics in this log: {', '.join(sorted(log.topics())) or 'none'}"
-        )
-    series["y_o"] = _angles(series["y_o"])
-    if "r_o" in series:
-        series["r_o"] = _angles(series["r_o"])
+        for topic, fields in layouts:
+            series = log.series(topic, fields)
+            if series is not None:
+                series = _angles(series) if signal in ("y_o", "r_o") else series
+                if np.count_nonzero(np.isfinite(series.values).all(axis=1)) > 1:
+                    signals[signal] = series
+                    break
     excitation = _excitation(log)
     if excitation is not None:
-        series["u_bar"], begin, end = excitation
-    else:
-        begin, end = -np.inf, np.inf
-    grid = on_common_grid(series, HELD, begin, end, str(path), primary="u")
-    parameters = {**log.ulog.initial_parameters}
-    return Experiment(
-        Ts=grid.Ts,
-        segments=grid.segments,
-        source=path.name,
-        sha256=sha256(path.read_bytes()),
-        flown=flown_gains(parameters, grid.Ts),
-        **grid.signals,
+        signals["u_bar"] = excitation
+    for signal in ("r_o", "r_i", "u_bar"):
+        if signal in signals and not log.is_sampled(signals[signal].topic) and "u" in signals:
+            signals[signal] = _at_cycle(signals[signal], log.published(signals["u"].topic))
+    airborne, evidence = _airborne(log)
+    parameters = {
+        name: float(value) for name, value in log.ulog.initial_parameters.items() if isinstance(value, int | float)
+    }
+    profile = parameters.get("SDLOG_PROFILE")
+    now = f", it is {profile:.0f}" if profile is not None else ""
+    wanted = {
+        signal: " or ".join(f"{topic} ({', '.join(fields)})" for topic, fields in layouts)
+        for signal, layouts in LAYOUTS.items()
+    }
+    return Recording(
+        path,
+        _firmware(log.ulog.msg_info_dict),
+        signals,
+        wanted,
+        sorted({dataset.name for dataset in log.ulog.data_list}),
+        f"set SDLOG_PROFILE to 17 (default and high rate{now}) and fly again",
+        airborne,
+        evidence,
+        parameters,
+        ("the file is damaged: what could be read of it is used",) if log.ulog.file_corruption else (),
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Log:
+    ulog: Any
+
+    def fields(self, topic: str) -> dict[str, NDArray[Any]]:
+        """Field -> values of the first instance of a topic; empty when it is not logged."""
+        named = (d.data for d in self.ulog.data_list if d.name == topic and d.multi_id == 0)
+        found = (data for data in named if len(data.get("timestamp", ())))
+        return next(found, {})
+
+    def is_sampled(self, topic: str) -> bool:
+        """Whether a topic says of which gyro sample it was made."""
+        return bool(np.any(self.fields(topic).get("timestamp_sample", 0)))
+
+    def published(self, topic: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times (s) at which the messages of a topic were published, and of the samples that they were made of."""
+        data = self.fields(topic)
+        stamps = data["timestamp"]
+        samples = data.get("timestamp_sample", stamps)
+        return stamps * 1e-6, np.where(samples == 0, stamps, samples) * 1e-6
+
+    def series(self, topic: str, names: tuple[str, ...]) -> Series | None:
+        data = self.fields(topic)
+        if not all(name in data for name in names):
+            return None
+        with np.errstate(invalid="ignore"):  # a damaged float may be a signalling NaN
+            values = np.column_stack([data[name] for name in names]).astype(np.float64)
+        return Series(self.published(topic)[1], values, topic)
 
 
 def _open(path: Path) -> Any:
     from pyulog import ULog
 
-    if not path.is_file():
-        raise TuningError(f"{path}: no such file; give the path of a ULog (.ulg)")
     try:
-        with path.open("rb") as stream:
-            if stream.read(4) != b"ULog":
-                raise TuningError(f"{path}: not a ULog file: it does not start with 'ULog'")
-        return ULog(str(path))
-    except TuningError:
-        raise
+        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints what it skips
+            return ULog(str(path))
     except Exception as error:  # pyulog raises whatever a damaged file makes of its parser
         raise TuningError(f"{path}: damaged ULog file: {error or type(error).__name__}; download it again") from error
 
@@ -126,17 +140,64 @@ def _angles(series: Series) -> Series:
     w, x, y, z = series.values.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    return Series(series.time, np.column_stack([roll, pitch]), series.topic)
+    # A set-point that is not used is all zeros.
+    unit = np.abs(w**2 + x**2 + y**2 + z**2 - 1) < 0.1
+    return Series(series.time, np.where(unit[:, None], np.column_stack([roll, pitch]), np.nan), series.topic)
 
 
-def _excitation(log: _Log) -> tuple[Series, float, float] | None:
-    """The injected moment, and the time (s) of its first and last sample that is not zero."""
+def _excitation(log: _Log) -> Series | None:
+    """The injected moment, where one was logged."""
     series = log.series(EXCITATION_TOPIC, ("x", "y", *(f"name[{i}]" for i in range(len(EXCITATION_NAME)))))
     if series is None:
         return None
     ours = (series.values[:, 2:] == np.frombuffer(EXCITATION_NAME.encode(), np.uint8)).all(axis=1)
-    series = Series(series.time[ours], series.values[ours, :2], series.topic)
-    active: NDArray[np.intp] = np.flatnonzero(series.values.any(axis=1))
-    if not len(active):
-        return None
-    return series, float(series.time[active[0]]), float(series.time[active[-1]])
+    values = series.values[ours, :2]
+    return Series(series.time[ours], values, series.topic) if values.any() else None
+
+
+def _at_cycle(series: Series, torque: tuple[NDArray[np.float64], NDArray[np.float64]]) -> Series:
+    """A signal that only knows when it was published, at the gyro sample of the control cycle that used it.
+
+    That is the first one whose torque was published after it, or up to a quarter of a period before, as
+    excitation is published beside the torque of its own cycle.
+    """
+    published, sampled = torque
+    if len(published) < 3 or np.any(np.diff(published) < 0):
+        return series
+    Ts = sampling_period(published)
+    cycle = np.searchsorted(published, series.time - Ts / 4)
+    near = np.minimum(cycle, len(published) - 1)
+    used = (cycle < len(published)) & (np.abs(published[near] - series.time) <= Ts)
+    lag = float(np.median(published - sampled))
+    return Series(np.where(used, sampled[near], series.time - lag), series.values, series.topic)
+
+
+def _airborne(log: _Log) -> tuple[tuple[Interval, ...] | None, str]:
+    """When the vehicle was armed and not landed, as far as the log says, and what says so."""
+    states: list[tuple[str, NDArray[np.float64], NDArray[np.bool_]]] = []
+    landed = log.fields("vehicle_land_detected")
+    if "landed" in landed:
+        states.append(("vehicle_land_detected.landed", landed["timestamp"] * 1e-6, landed["landed"] == 0))
+    else:
+        for topic, field, sign in THRUSTS:
+            data = log.fields(topic)
+            if field in data:
+                states.append((f"{topic}.{field}", data["timestamp"] * 1e-6, sign * data[field] > MIN_THRUST))
+                break
+    for topic, field, value in ARMED:
+        data = log.fields(topic)
+        if field in data:
+            states.append((f"{topic}.{field}", data["timestamp"] * 1e-6, data[field] == value))
+            break
+    if not states:
+        return None, ""
+    airborne: tuple[Interval, ...] = ((-np.inf, np.inf),)
+    for _, time, flag in states:
+        airborne = intersection(airborne, bridged(intervals(time, flag)))
+    return airborne, " with ".join(name for name, _, _ in states)
+
+
+def _firmware(information: dict[str, Any]) -> str:
+    release = information.get("ver_sw_release")
+    version = f" {release >> 24 & 255}.{release >> 16 & 255}.{release >> 8 & 255}" if isinstance(release, int) else ""
+    return f"ULog, {information.get('sys_name', 'unknown system')}{version}"

@@ -1,0 +1,144 @@
+"""A made-up flight whose rates are the derivative of its angles, and writers of logs that hold it."""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from sitl.recorder import quaternions
+from sitl.ulog_writer import HEADER, _declare, _keyed, _message
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Signals (N, 2) of torque, rad/s, rad, and the time (N,), s."""
+
+    t: np.ndarray
+    u: np.ndarray
+    y_i: np.ndarray
+    y_o: np.ndarray
+    r_o: np.ndarray
+
+
+def make_flight(seconds=8.0, Ts=0.004, start=10.0, still=(0.0, 0.0)):
+    """A flight; for `still` seconds at its begin and its end the vehicle stands on the ground."""
+    k = np.arange(round(seconds / Ts))
+    t = start + k * Ts
+    tones = [(0.10, 2.0, 0.3), (0.05, 7.0, 1.1), (0.01, 31.0, 2.0)]
+    y_o = np.column_stack([sum(a * np.sin(w * t + f + axis) for a, w, f in tones) for axis in range(2)])
+    y_i = np.column_stack([sum(a * w * np.cos(w * t + f + axis) for a, w, f in tones) for axis in range(2)])
+    u = 0.05 * np.random.default_rng(1).standard_normal((len(t), 2)) + 0.02 * y_i
+    r_o = np.column_stack([np.where(np.sin(0.9 * t + axis) > 0, 0.2, -0.2) for axis in range(2)])
+    ground = (t < start + still[0]) | (t > t[-1] - still[1])
+    y_o[ground], y_i[ground], r_o[ground] = 0.0, 0.0, 0.0
+    return Flight(t, u, y_i, y_o, r_o)
+
+
+def three(values):
+    """The pair of signals as float32 x, y, z."""
+    return np.column_stack([values, np.zeros(len(values))]).astype(np.float32)
+
+
+def microseconds(t):
+    return np.round(np.asarray(t) * 1e6).astype(np.uint64)
+
+
+def attitude(y_o):
+    return quaternions(three(y_o))
+
+
+def write_ulog(path, topics, parameters=()):
+    """A ULog file of topics (name, instance, fields), each with its own time stamps, which `fields` hold."""
+    head = [HEADER, struct.pack("<Q", 0), _message("B", bytes(40)), _keyed("I", "char[3] sys_name", b"PX4")]
+    head += [_keyed("I", "uint32_t ver_sw_release", struct.pack("<I", 0x010D02FF))]
+    formats = {name: fields for name, _, fields in topics}
+    head += [
+        _message("F", f"{name}:{''.join(_declare(k, v) for k, v in fields.items())}".encode())
+        for name, fields in formats.items()
+    ]
+    head += [_keyed("P", f"float {name}", struct.pack("<f", value)) for name, value in dict(parameters).items()]
+    body = []
+    for number, (name, instance, fields) in enumerate(topics):
+        body.append(_message("A", struct.pack("<BH", instance, number) + name.encode()))
+        columns = [(field, values.dtype.str, values.shape[1:]) for field, values in fields.items()]
+        rows = np.zeros(len(next(iter(fields.values()))), np.dtype(columns))
+        for field, values in fields.items():
+            rows[field] = values
+        body += [_message("D", struct.pack("<H", number) + row.tobytes()) for row in rows]
+    path.write_bytes(b"".join(head + body))
+    return path
+
+
+def px4_topics(flight, **extra):
+    """The topics of a PX4 1.14 log at full rate, every torque published 0.4 ms after its gyro sample."""
+    sample = {"timestamp": microseconds(flight.t + 0.0004), "timestamp_sample": microseconds(flight.t)}
+    topics = {
+        "vehicle_torque_setpoint": {**sample, "xyz": three(flight.u)},
+        "vehicle_angular_velocity": {**sample, "xyz": three(flight.y_i)},
+        "vehicle_attitude": {**sample, "q": attitude(flight.y_o)},
+        "vehicle_attitude_setpoint": {"timestamp": sample["timestamp"], "q_d": attitude(flight.r_o)},
+        **extra,
+    }
+    return [(name, 0, fields) for name, fields in topics.items()]
+
+
+KINDS = {"Q": "<u8", "f": "<f4", "B": "u1", "c": "<i2", "N": "S16", "Z": "S64", "b": "i1"}
+
+
+def dataflash_bytes(messages):
+    """A dataflash log of messages (name, format letters, column names, columns)."""
+    out = [struct.pack("<3sBB4s16s64s", b"\xa3\x95\x80", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")]
+    for kind, (name, letters, names, columns) in enumerate(messages, 1):
+        record = np.dtype(
+            [("head", "S2"), ("kind", "u1"), *((n, KINDS[c]) for n, c in zip(names, letters, strict=True))]
+        )
+        description = struct.pack(
+            "<3sBB4s16s64s",
+            b"\xa3\x95\x80",
+            kind,
+            record.itemsize,
+            name.encode(),
+            letters.encode(),
+            ",".join(names).encode(),
+        )
+        rows = np.zeros(len(columns[0]), record)
+        rows["head"], rows["kind"] = b"\xa3\x95", kind
+        for n, values in zip(names, columns, strict=True):
+            rows[n] = values
+        out += [description, rows.tobytes()]
+    return b"".join(out)
+
+
+def ardupilot_messages(flight, angles="ANG"):
+    """RATE and the angles in degrees, as ArduPilot logs them in every loop."""
+    degrees = 180 / np.pi
+    rate = [*(degrees * flight.y_i.T), *flight.u.T]
+    angle = [*(degrees * flight.y_o.T), *(degrees * flight.r_o.T)]
+    if angles == "ATT":
+        angle = [np.round(100 * a) for a in angle]
+    stamps = microseconds(flight.t)
+    return [
+        ("RATE", "Qffff", ("TimeUS", "R", "P", "ROut", "POut"), [stamps, *rate]),
+        (
+            angles,
+            "Qffff" if angles == "ANG" else "Qcccc",
+            ("TimeUS", "Roll", "Pitch", "DesRoll", "DesPitch"),
+            [stamps, *angle],
+        ),
+    ]
+
+
+COLUMNS = ("t", "u_roll", "u_pitch", "p", "q", "roll", "pitch", "roll_sp", "pitch_sp")
+
+
+def table(flight):
+    """The columns of a flight, SI units, by their default names."""
+    signals = (flight.t[:, None], flight.u, flight.y_i, flight.y_o, flight.r_o)
+    return dict(zip(COLUMNS, np.column_stack(signals).T, strict=True))
+
+
+def write_csv(path, columns, delimiter=","):
+    rows = np.column_stack(list(columns.values()))
+    lines = [delimiter.join(f"{value:.9g}" for value in row) for row in rows]
+    path.write_text("\n".join([delimiter.join(columns), *lines]) + "\n")
+    return path

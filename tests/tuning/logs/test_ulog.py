@@ -1,0 +1,168 @@
+"""PX4 logs of every layout, written here; genuine ones are other people's data."""
+
+import numpy as np
+import pytest
+
+from tests.tuning.logs.flights import attitude, make_flight, microseconds, px4_topics, three, write_ulog
+from tuning.errors import TuningError
+from tuning.logs.reader import open_log, read_log
+
+PERIOD = 0.004
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return make_flight()
+
+
+def layout(flight, release):
+    """Topics as a PX4 release named them; torque, rates and attitude share the stamps of the gyro."""
+    stamps = {"timestamp": microseconds(flight.t), "timestamp_sample": microseconds(flight.t)}
+    plain = {"timestamp": stamps["timestamp"]}
+    p, q = flight.y_i.T.astype(np.float32)
+    roll, pitch = flight.r_o.T.astype(np.float32)
+    angles = {"roll_body": roll, "pitch_body": pitch}
+    unused = {"q_d": np.zeros((len(flight.t), 4), np.float32)}
+    control = {**stamps, "control": np.column_stack([flight.u, 0 * flight.u + 0.4, 0 * flight.u]).astype(np.float32)}
+    q_att = attitude(flight.y_o)
+    if release == "1.8":
+        return [
+            ("actuator_controls_0", 0, control),
+            ("vehicle_attitude", 0, {**plain, "q": q_att, "rollspeed": p, "pitchspeed": q}),
+            ("vehicle_attitude_setpoint", 0, {**plain, **angles, **unused}),
+        ]
+    if release == "1.11":
+        return [
+            ("actuator_controls_0", 0, control),
+            ("vehicle_angular_velocity", 0, {**stamps, "xyz": three(flight.y_i)}),
+            ("vehicle_attitude", 0, {**plain, "q": q_att}),
+            ("vehicle_attitude_setpoint", 0, {**plain, **angles, "q_d": attitude(flight.r_o)}),
+        ]
+    setpoint = {**plain, "q_d": attitude(flight.r_o)} | (angles if release == "1.14" else {})
+    return [
+        ("vehicle_torque_setpoint", 0, {**stamps, "xyz": three(flight.u)}),
+        ("vehicle_angular_velocity", 0, {**stamps, "xyz": three(flight.y_i)}),
+        ("vehicle_attitude", 0, {**stamps, "q": q_att}),
+        ("vehicle_attitude_setpoint", 0, setpoint),
+    ]
+
+
+@pytest.mark.parametrize("release", ["1.8", "1.11", "1.14", "1.17"])
+def test_the_signals_of_every_layout_are_found(tmp_path, flight, release):
+    log = read_log(write_ulog(tmp_path / "x.ulg", layout(flight, release)))
+    assert log.Ts == PERIOD
+    assert log.segments == ((0, len(flight.t)),)
+    assert log.u == pytest.approx(flight.u, abs=1e-6)
+    assert log.y_i == pytest.approx(flight.y_i, abs=1e-6)
+    assert log.y_o == pytest.approx(flight.y_o, abs=1e-6)
+    assert log.r_o == pytest.approx(flight.r_o, abs=1e-6)
+
+
+def test_torque_and_rates_of_one_cycle_are_paired_although_published_at_different_times(tmp_path, flight):
+    late = np.random.default_rng(2).integers(300, 2500, (2, len(flight.t)))
+    sample = microseconds(flight.t)
+    topics = [
+        (
+            "vehicle_torque_setpoint",
+            0,
+            {"timestamp": sample + late[0].astype(np.uint64), "timestamp_sample": sample, "xyz": three(flight.u)},
+        ),
+        (
+            "vehicle_angular_velocity",
+            0,
+            {"timestamp": sample + late[1].astype(np.uint64), "timestamp_sample": sample, "xyz": three(flight.y_i)},
+        ),
+        ("vehicle_attitude", 0, {"timestamp": sample, "q": attitude(flight.y_o)}),
+    ]
+    log = read_log(write_ulog(tmp_path / "x.ulg", topics))
+    assert log.u == pytest.approx(flight.u, abs=1e-6)
+    assert log.y_i == pytest.approx(flight.y_i, abs=1e-6)
+
+
+@pytest.mark.parametrize("zeros", ["all", "first hundred"])
+def test_where_timestamp_sample_is_zero_the_publication_time_stands_in(tmp_path, flight, zeros):
+    topics = px4_topics(flight)
+    for _, _, fields in topics:
+        fields["timestamp"] = microseconds(flight.t)
+        if "timestamp_sample" in fields:
+            fields["timestamp_sample"] = np.where(
+                np.arange(len(flight.t)) < (100 if zeros != "all" else 1 << 30), 0, fields["timestamp"]
+            ).astype(np.uint64)
+    log = read_log(write_ulog(tmp_path / "x.ulg", topics))
+    assert log.segments == ((0, len(flight.t)),)
+    assert log.u == pytest.approx(flight.u, abs=1e-6)
+
+
+def excitation(flight, publication):
+    """An injected moment, zero in the first second, published so long after the gyro sample."""
+    u_bar = np.where(flight.t < flight.t[0] + 1, 0, np.sign(np.sin(40 * flight.t))).astype(np.float32)
+    name = np.full(len(flight.t), b"MIMO_EXC", "S10")
+    return {"timestamp": microseconds(flight.t + publication), "x": u_bar, "y": -u_bar, "name": name}
+
+
+@pytest.mark.parametrize("publication", [0.0001, 0.0004, 0.0006])
+def test_excitation_belongs_to_the_cycle_that_published_it_beside_its_torque(tmp_path, flight, publication):
+    topic = excitation(flight, publication)
+    log = read_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight, debug_vect=topic)))
+    assert log.u_bar[:, 0] == pytest.approx(topic["x"][250:])
+    assert log.u == pytest.approx(flight.u[250:], abs=1e-6)
+
+
+def test_a_set_point_published_between_two_cycles_is_used_by_the_second(tmp_path, flight):
+    rates = {
+        "timestamp": microseconds(flight.t + 0.0025),
+        "roll": flight.t.astype(np.float32),
+        "pitch": flight.t.astype(np.float32),
+    }
+    log = read_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight, vehicle_rates_setpoint=rates)))
+    # Torque is published 0.4 ms after its sample: the value of 2.5 ms is there for the next one.
+    assert log.r_i[1:, 0] == pytest.approx(flight.t[:-1], abs=1e-5)
+
+
+def test_only_the_first_instance_of_a_topic_counts(tmp_path, flight):
+    topics = px4_topics(flight)
+    other = {**topics[1][2], "xyz": three(7 * flight.y_i)}
+    log = read_log(write_ulog(tmp_path / "x.ulg", [("vehicle_angular_velocity", 1, other), *topics]))
+    assert log.y_i == pytest.approx(flight.y_i, abs=1e-6)
+
+
+def test_of_set_points_with_repeated_stamps_the_last_counts(tmp_path, flight):
+    topics = px4_topics(flight)
+    stamps = np.repeat(microseconds(flight.t[::2]), 2)
+    roll = np.arange(len(stamps)) * 1e-4
+    topics[3] = ("vehicle_attitude_setpoint", 0, {"timestamp": stamps, "q_d": attitude(np.column_stack([roll, roll]))})
+    log = read_log(write_ulog(tmp_path / "x.ulg", topics))
+    assert log.r_o[::2, 0] == pytest.approx(roll[1::2], abs=1e-6)
+
+
+def test_a_dropout_splits_the_log_and_nothing_is_made_up_in_it(tmp_path, flight):
+    keep = (flight.t < 13) | (flight.t > 13.164)
+    topics = [(name, i, {k: v[keep] for k, v in fields.items()}) for name, i, fields in px4_topics(flight)]
+    log = read_log(write_ulog(tmp_path / "x.ulg", topics))
+    assert len(log.segments) == 2
+    for start, stop in log.segments:
+        assert log.u[start:stop] == pytest.approx(flight.u[start:stop], abs=1e-6)
+    assert (log.segments[1][0] - log.segments[0][1]) * PERIOD == pytest.approx(0.16, abs=0.009)
+
+
+def test_the_message_names_the_missing_topic_the_logging_profile_and_the_topics_that_are_there(tmp_path, flight):
+    topics = px4_topics(flight)[1:]
+    path = write_ulog(tmp_path / "x.ulg", topics, {"SDLOG_PROFILE": 1.0})
+    with pytest.raises(
+        TuningError,
+        match=r"lacks vehicle_torque_setpoint .*actuator_controls_0.*SDLOG_PROFILE to 17.*it is 1\).*vehicle_attitude",
+    ):
+        read_log(path)
+
+
+def test_default_logging_is_refused_as_too_slow(tmp_path, flight):
+    topics = px4_topics(flight)
+    topics[0] = ("vehicle_torque_setpoint", 0, {k: v[::12] for k, v in topics[0][2].items()})
+    with pytest.raises(
+        TuningError, match=r"too slow: vehicle_torque_setpoint is logged at 20\.8 Hz.*SDLOG_PROFILE to 17"
+    ):
+        read_log(write_ulog(tmp_path / "x.ulg", topics))
+
+
+def test_the_release_is_read(tmp_path, flight):
+    assert open_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight))).format == "ULog, PX4 1.13.2"

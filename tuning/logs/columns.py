@@ -1,0 +1,111 @@
+"""Names, units and signs of the columns of a CSV or MATLAB file. TOML in, validated."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from tuning.errors import TuningError
+
+_FACTORS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180}
+
+Name = Annotated[str, Field(min_length=1)]
+Sign = Literal[1, -1]
+
+
+class _Column(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    column: Name | None = None
+    sign: Sign = 1
+
+    @property
+    def factor(self) -> float:
+        """What a value in the file is multiplied by to be in SI units."""
+        return self.sign * _FACTORS[getattr(self, "unit", "s")]
+
+
+class Time(_Column):
+    """Time stamps."""
+
+    sign: Literal[1] = 1
+    unit: Literal["s", "ms", "us"] = "s"
+
+
+class Moment(_Column):
+    """A normalised moment: no unit."""
+
+
+class Rate(_Column):
+    """A body rate or its set-point."""
+
+    unit: Literal["rad/s", "deg/s"] = "rad/s"
+
+
+class Angle(_Column):
+    """An angle or its set-point."""
+
+    unit: Literal["rad", "deg"] = "rad"
+
+
+class Columns(BaseModel):
+    """Where the signals of a table are; an entry without `column` has the field's own name.
+
+    Attributes
+    ----------
+    t
+        Time.
+    u_roll, u_pitch
+        Torque set-point after injection, normalised.
+    p, q
+        Body rates.
+    roll, pitch
+        Angles.
+    roll_sp, pitch_sp, p_sp, q_sp
+        Set-points of the angles and rates; may be absent.
+    u_bar_roll, u_bar_pitch
+        Injected moment; may be absent.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    t: Time = Time()
+    u_roll: Moment = Moment()
+    u_pitch: Moment = Moment()
+    p: Rate = Rate()
+    q: Rate = Rate()
+    roll: Angle = Angle()
+    pitch: Angle = Angle()
+    roll_sp: Angle = Angle()
+    pitch_sp: Angle = Angle()
+    p_sp: Rate = Rate()
+    q_sp: Rate = Rate()
+    u_bar_roll: Moment = Moment()
+    u_bar_pitch: Moment = Moment()
+
+    def name(self, field: str) -> str:
+        """Name of a signal's column in the file."""
+        return getattr(self, field).column or field
+
+
+def load_columns(path: Path) -> Columns:
+    """Read a column file.
+
+    Raises
+    ------
+    TuningError
+        When it cannot be read, is not TOML, or holds an unknown signal, unit or sign.
+    """
+    try:
+        return Columns.model_validate(tomllib.loads(path.read_text()))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        known = f"; known signals: {', '.join(Columns.model_fields)}" if first["type"] == "extra_forbidden" else ""
+        raise TuningError(f"{path}: {where}: {first['msg']}, got {first.get('input')!r}{known}") from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise TuningError(f"{path}: cannot read the column file: {error}") from error

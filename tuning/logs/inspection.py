@@ -1,0 +1,187 @@
+"""What is in a log, and whether gains can be tuned from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.cascade import excited_stretches, external_signal
+from tuning.errors import TuningError
+from tuning.experiment import Experiment
+from tuning.gains import Gains
+from tuning.logs.columns import Columns
+from tuning.logs.flight import flying_parts, intersection
+from tuning.logs.reader import experiment_of, open_log
+from tuning.logs.recording import Recording
+from tuning.logs.resample import MAX_GAP, Interval, Series, held_samples, sampling_period
+
+AXES = ("roll", "pitch")
+BAND_POWER = (0.05, 0.95)  # the band of a signal is where this share of its power lies
+
+
+@dataclass(frozen=True)
+class SignalReport:
+    """One signal as logged, roll then pitch.
+
+    Attributes
+    ----------
+    source : str
+        Topic, message or columns.
+    rate_hz : float, Hz
+        Messages a second.
+    held : int
+        Messages for which a value is repeated; 1 when it is fresh in each.
+    gaps : int
+        Pauses of more than five periods.
+    longest_gap_s : float, s
+        The longest pause.
+    minimum, maximum : tuple of 2 float
+        Extremes, in SI units.
+    saturated : tuple of 2 float or None
+        Share of the samples at the limit of the moment; None for other signals.
+    """
+
+    source: str
+    rate_hz: float
+    held: int
+    gaps: int
+    longest_gap_s: float
+    minimum: tuple[float, float]
+    maximum: tuple[float, float]
+    saturated: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class ExcitationReport:
+    """The external signal on one axis: RMS in its own unit, and the band (Hz) that holds 90 % of its power."""
+
+    rms: float
+    band_hz: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Inspection:
+    """The findings about one log.
+
+    Attributes
+    ----------
+    recording : Recording
+        The log as it was read.
+    seconds : float, s
+        From the first to the last sample of any of its signals.
+    airborne : tuple of (begin, end) or None, s
+        When the vehicle says it flew, since the first sample. None: the log does not say.
+    signals : dict
+        Name -> what was logged.
+    parts : tuple of (begin, end) in s
+        What may be used, since the first sample; empty when the vehicle did not fly.
+    experiment : Experiment or None
+        The usable part; None when there is none.
+    excitation : dict
+        Name of the external signal and axis -> its strength; empty when there is none.
+    reason : str or None
+        Why gains cannot be tuned from the log and what to change; None when they can.
+    """
+
+    recording: Recording
+    seconds: float
+    airborne: tuple[Interval, ...] | None
+    signals: dict[str, SignalReport]
+    parts: tuple[Interval, ...]
+    experiment: Experiment | None
+    excitation: dict[str, ExcitationReport]
+    reason: str | None
+
+    @property
+    def flown(self) -> Gains | None:
+        """The controller that flew, where the log says so."""
+        return self.experiment.flown if self.experiment else None
+
+
+def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
+    """Look into a log without tuning from it.
+
+    Parameters
+    ----------
+    path : Path
+        A log of any format that `tuning.logs.reader.read_log` knows.
+    columns : Columns, optional
+        Names and units in a CSV or MATLAB file.
+
+    Returns
+    -------
+    Inspection
+
+    Raises
+    ------
+    TuningError
+        When the file cannot be read at all.
+    """
+    recording = open_log(path, columns)
+    limit = 1.0
+    parts: tuple[Interval, ...] = ()
+    experiment, reason = None, None
+    excitation: dict[str, ExcitationReport] = {}
+    try:
+        recording.require_signals()
+        parts = flying_parts(recording)
+        experiment = experiment_of(recording)
+        if experiment.flown is not None:
+            limit = min(experiment.flown.limits.moment_max[:2])
+        instrument, name = external_signal(experiment)
+        excitation = {f"{name} {axis}": _excitation(instrument[:, i], experiment) for i, axis in enumerate(AXES)}
+        excited_stretches(experiment, instrument, "mimo")
+    except TuningError as error:
+        reason = str(error).removeprefix(f"{path}: ").removeprefix(f"{path.name}: ")
+    # Without signals the vehicle's own clock has to do.
+    begin = min((float(s.time[0]) for s in recording.signals.values()), default=0.0)
+    end = max((float(s.time[-1]) for s in recording.signals.values()), default=np.inf)
+
+    def since_begin(intervals: tuple[Interval, ...]) -> tuple[Interval, ...]:
+        return tuple((a - begin, b - begin) for a, b in intersection(intervals, ((begin, end),)))
+
+    return Inspection(
+        recording=recording,
+        seconds=end - begin if recording.signals else 0.0,
+        airborne=None if recording.airborne is None else since_begin(recording.airborne),
+        signals={name: _signal(name, signal, limit) for name, signal in recording.signals.items()},
+        parts=since_begin(parts),
+        experiment=experiment,
+        excitation=excitation,
+        reason=reason,
+    )
+
+
+def _signal(name: str, signal: Series, limit: float) -> SignalReport:
+    period = sampling_period(signal.time)
+    pauses = np.diff(signal.time)
+    low, high = signal.values.min(axis=0), signal.values.max(axis=0)
+    share = np.mean(np.abs(signal.values) >= 0.999 * limit, axis=0)
+    return SignalReport(
+        source=signal.topic,
+        rate_hz=1 / period,
+        held=held_samples(signal.values),
+        gaps=int(np.count_nonzero(pauses > MAX_GAP * period * 1.001)),
+        longest_gap_s=float(pauses.max()),
+        minimum=(float(low[0]), float(low[1])),
+        maximum=(float(high[0]), float(high[1])),
+        saturated=(float(share[0]), float(share[1])) if name == "u" else None,
+    )
+
+
+def _excitation(signal: NDArray[np.float64], experiment: Experiment) -> ExcitationReport:
+    """Strength and band of one axis of the external signal, over the segments."""
+    from scipy.signal import periodogram
+
+    rows = [signal[a:b] for a, b in experiment.segments]
+    used = np.concatenate(rows)
+    longest = max(rows, key=len)
+    frequency, power = periodogram(longest, 1 / experiment.Ts, detrend="constant")
+    total = np.cumsum(power)
+    if total[-1] <= 0:
+        return ExcitationReport(float(np.std(used)), (0.0, 0.0))
+    low, high = (float(frequency[np.searchsorted(total, share * total[-1])]) for share in BAND_POWER)
+    return ExcitationReport(float(np.std(used)), (low, high))

@@ -1,0 +1,79 @@
+"""An inspection as people and as programs read it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from tuning.gains import MATRICES
+from tuning.logs.inspection import Inspection
+from tuning.output import print_table
+
+#: Signal -> its name, unit for people, and what an SI value is multiplied by for it.
+_NAMES = {
+    "u": ("torque u", "", 1.0),
+    "y_i": ("rates y_i", "deg/s", 180 / math.pi),
+    "y_o": ("angles y_o", "deg", 180 / math.pi),
+    "u_bar": ("injected u_bar", "", 1.0),
+    "r_o": ("attitude set-point r_o", "deg", 180 / math.pi),
+    "r_i": ("rate set-point r_i", "deg/s", 180 / math.pi),
+}
+
+
+def as_mapping(found: Inspection) -> dict[str, Any]:
+    """An inspection as plain values, in SI units, for `tuning.output.print_json`."""
+    recording, experiment = found.recording, found.experiment
+    return {
+        "log": str(recording.path),
+        "format": recording.format,
+        "seconds": found.seconds,
+        "signals": {name: asdict(report) for name, report in found.signals.items()},
+        "contents": list(recording.contents),
+        "airborne_s": None if found.airborne is None else [list(part) for part in found.airborne],
+        "usable_s": [list(part) for part in found.parts],
+        "experiment": None
+        if experiment is None
+        else {"Ts": experiment.Ts, "seconds": experiment.seconds, "segments": [list(s) for s in experiment.segments]},
+        "excitation": {name: asdict(report) for name, report in found.excitation.items()},
+        "flown": None if found.flown is None else {name: getattr(found.flown, name).tolist() for name in MATRICES},
+        "notes": list(recording.notes),
+        "tunable": found.reason is None,
+        "reason": found.reason,
+    }
+
+
+def print_inspection(found: Inspection) -> None:
+    """An inspection as tables on standard output."""
+    recording, experiment = found.recording, found.experiment
+    rows = []
+    for name, (title, unit, factor) in _NAMES.items():
+        report = found.signals.get(name)
+        if report is None:
+            rows.append([title, "not logged", *[""] * 5])
+            continue
+        held = f" (held for {report.held})" if report.held > 1 else ""
+        ends = zip(report.minimum, report.maximum, strict=True)
+        spans = [f"{factor * low:.3g} .. {factor * high:.3g} {unit}".rstrip() for low, high in ends]
+        gaps = f"{report.gaps} ({report.longest_gap_s * 1e3:.0f} ms)"
+        saturated = "" if report.saturated is None else " / ".join(f"{100 * share:.1f} %" for share in report.saturated)
+        rows.append([title, report.source, f"{report.rate_hz:.1f} Hz{held}", gaps, *spans, saturated])
+    columns = ["signal", "from", "rate", "gaps (longest)", "roll", "pitch", "saturated"]
+    print_table(f"{recording.path.name}: {recording.format}, {found.seconds:.1f} s", columns, rows)
+    if found.airborne is not None:
+        print(f"airborne: {sum(b - a for a, b in found.airborne):.1f} s by {recording.evidence}")
+    if found.parts:
+        print("used: " + ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.parts))
+    if experiment is not None:
+        count = len(experiment.segments)
+        print(f"experiment: {experiment.seconds:.1f} s at {1 / experiment.Ts:.1f} Hz, {count} stretches without a gap")
+    for name, excitation in found.excitation.items():
+        low, high = excitation.band_hz
+        print(f"excitation {name}: {excitation.rms:.4f} RMS, 90 % of its power from {low:.2f} to {high:.2f} Hz")
+    if found.flown is not None:
+        flown = found.flown
+        diagonals = [f"{name} {getattr(flown, name)[0, 0]:.4g} / {getattr(flown, name)[1, 1]:.4g}" for name in MATRICES]
+        print(f"flown (roll / pitch): {', '.join(diagonals)}")
+    for note in recording.notes:
+        print(f"note: {note}")
+    print("gains can be tuned from it" if found.reason is None else f"gains cannot be tuned from it: {found.reason}")

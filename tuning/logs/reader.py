@@ -1,0 +1,123 @@
+"""The one way from a log of any format to an experiment."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from tuning.errors import TuningError
+from tuning.experiment import Experiment
+from tuning.files import sha256
+from tuning.flown import flown_gains
+from tuning.logs.columns import Columns
+from tuning.logs.flight import flying_parts
+from tuning.logs.recording import Recording
+from tuning.logs.resample import on_common_grid
+
+ULOG = b"ULog\x01\x12\x35"
+DATAFLASH = b"\xa3\x95"
+MATLAB = b"MATLAB 5.0 MAT-file"
+MATLAB_HDF5 = (b"MATLAB 7.3 MAT-file", b"\x89HDF\r\n\x1a\n")
+
+
+def read_log(path: Path, columns: Columns | None = None) -> Experiment:
+    """Read an experiment from a flight log of any format that is known.
+
+    Parameters
+    ----------
+    path : Path
+        PX4 ULog, ArduPilot dataflash, CSV or MATLAB file; its content decides, not its name.
+    columns : Columns, optional
+        Names and units in a CSV or MATLAB file; by default those of `tuning.logs.columns`.
+
+    Returns
+    -------
+    Experiment
+        The part of the log with injected excitation, else the part in the air.
+
+    Raises
+    ------
+    TuningError
+        When the file is of no known format, damaged, lacks a signal, never flew, is too slow or too short.
+    """
+    return experiment_of(open_log(path, columns))
+
+
+def open_log(path: Path, columns: Columns | None = None) -> Recording:
+    """Read the signals of a log as they were logged; see `read_log`.
+
+    Raises
+    ------
+    TuningError
+        When the file is of no known format or damaged.
+    """
+    if not path.is_file():
+        raise TuningError(f"{path}: no such file; give the path of a flight log (.ulg, .bin, .csv or .mat)")
+    with path.open("rb") as stream:
+        head = stream.read(4096)
+    if columns is not None and head.startswith((ULOG, DATAFLASH)):
+        raise TuningError(f"{path}: a column file is for CSV and MATLAB files, this log names its signals itself")
+    if head.startswith(ULOG):
+        from tuning.logs.ulog import record_ulog
+
+        return record_ulog(path)
+    if head.startswith(DATAFLASH):
+        from tuning.logs.dataflash import record_dataflash
+
+        return record_dataflash(path)
+    if head.startswith(MATLAB_HDF5):
+        raise TuningError(f"{path}: a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')")
+    if head.startswith(MATLAB):
+        from tuning.logs.table import record_matlab
+
+        return record_matlab(path, columns or Columns())
+    if b"\0" not in head and any(mark in head.partition(b"\n")[0] for mark in (b",", b";", b"\t")):
+        from tuning.logs.table import record_csv
+
+        return record_csv(path, columns or Columns())
+    raise TuningError(
+        f"{path}: not a flight log: neither PX4 ULog, ArduPilot dataflash (.bin), MATLAB (version 5 to 7) nor CSV; "
+        f"it begins with {head[:8]!r}"
+    )
+
+
+def experiment_of(recording: Recording) -> Experiment:
+    """The experiment in a log; see `read_log`.
+
+    Raises
+    ------
+    TuningError
+        When the log lacks a signal, never flew, is too slow or too short.
+    """
+    recording.require_signals()
+    parts = flying_parts(recording)
+    grid = on_common_grid(recording.signals, parts, str(recording.path), recording.advice)
+    experiment = Experiment(
+        Ts=grid.Ts,
+        segments=grid.segments,
+        source=recording.path.name,
+        sha256=sha256(recording.path.read_bytes()),
+        flown=flown_gains(recording.parameters, grid.Ts),
+        **grid.signals,
+    )
+    _check_units(experiment, recording)
+    return experiment
+
+
+def _check_units(experiment: Experiment, recording: Recording) -> None:
+    """Refuse rates that are not the derivative of the angles: a wrong unit or sign."""
+    slopes = [np.gradient(experiment.y_o[a:b], experiment.Ts, axis=0) for a, b in experiment.segments if b - a > 2]
+    rates = [experiment.y_i[a:b] for a, b in experiment.segments if b - a > 2]
+    for axis, name in enumerate(("roll", "pitch")):
+        slope, rate = (np.concatenate(pieces)[:, axis] for pieces in (slopes, rates))
+        scale = np.std(slope) * np.std(rate)
+        if scale == 0:
+            continue
+        correlation = float(np.cov(slope, rate)[0, 1] / scale)
+        factor = float(np.std(rate) / np.std(slope) * np.sign(correlation))
+        if abs(correlation) > 0.8 and not 0.4 < factor < 2.5:
+            raise TuningError(
+                f"{recording.path}: {name}: {recording.signals['y_i'].topic} is {factor:.3g} times the derivative "
+                f"of {recording.signals['y_o'].topic}, expected 1; correct the unit (rad/s, rad) or sign of one"
+            )
