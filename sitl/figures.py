@@ -77,27 +77,30 @@ def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer
     return figure
 
 
-def experiment_figure(flight: Flight) -> Figure:
-    """The closed-loop data set: injected and total moment, rates and angles of both axes."""
+def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
+    """The closed-loop data set: injected and total moment, rates and angles of both axes; on the right a stretch."""
     time = np.arange(len(flight.record)) * flight.scenario.Ts
     record = flight.record
     figure = Figure(figsize=(9, 7), layout="constrained")
-    panels: Any = figure.subplots(4, 1, sharex=True)
-    for axis, (colour, _) in enumerate((STYLES[1], STYLES[0])):
-        line = {"color": colour, "linewidth": 0.6, "label": AXES[axis]}
-        panels[0].step(time, record["excitation"][:, axis], where="post", **line)
-        panels[1].plot(time, record["moment"][:, axis], **line)
-        panels[2].plot(time, np.degrees(record["rates"][:, axis]), **line)
-        panels[3].plot(time, np.degrees(record["attitude"][:, axis]), **line)
-    names = ("injected moment [-]", "total moment u [-]", "body rate [deg/s]", "angle [deg]")
-    for panel, text in zip(panels, names, strict=True):
-        panel.set_ylabel(text)
-        panel.grid(alpha=0.3)
-    legend = panels[0].legend(loc="upper right", fontsize=9, ncols=2)
-    for handle in legend.get_lines():
-        handle.set_linewidth(2.0)
-    panels[0].set_title("Closed-loop experiment", loc="left")
-    panels[3].set_xlabel("time [s]")
-    panels[3].set_xlim(time[0], time[-1])
+    panels: Any = figure.subplots(4, 2, sharex="col", sharey="row", width_ratios=[3, 2])
+    signals = (
+        ("injected moment [-]", record["excitation"]),
+        ("total moment u [-]", record["moment"]),
+        ("body rate [deg/s]", np.degrees(record["rates"])),
+        ("angle [deg]", np.degrees(record["attitude"])),
+    )
+    middle = time[-1] / 2
+    for row, (text, values) in zip(panels, signals, strict=True):
+        for panel, lines in zip(row, (0.4, 1.2), strict=True):
+            for axis, (colour, _) in enumerate((STYLES[1], STYLES[0])):
+                panel.step(time, values[:, axis], where="post", color=colour, linewidth=lines, label=AXES[axis])
+            panel.grid(alpha=0.3)
+        row[0].set_ylabel(text)
+    panels[0, 1].legend(loc="upper right", fontsize=9, ncols=2)
+    panels[0, 0].set_title("Closed-loop experiment", loc="left")
+    panels[0, 1].set_title("where roll ends and pitch begins", loc="left")
+    for column, limits in enumerate(((time[0], time[-1]), (middle - zoom_s / 2, middle + zoom_s / 2))):
+        panels[3, column].set_xlabel("time [s]")
+        panels[3, column].set_xlim(*limits)
     figure.align_ylabels(panels)
     return figure

@@ -2,13 +2,17 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
+import zipfile
+from pathlib import Path
 
 import pytest
 from pyulog import ULog
 
+from sitl.airframe import FOLDER
 from tests.conftest import assert_one_clear_line
 
 COMMANDS = ["demo", "experiment", "inspect", "tune", "certify", "advise", "generate", "fly", "sitl", "plant"]
@@ -116,6 +120,17 @@ def test_models_window_and_specification_are_taken(mimopilot, log, tmp_path):
     [
         (("fly", "adam1"), ("unknown airframe 'adam1'", "adam0_nominal", "antr")),
         (("fly", "adam0", "--gains", "none.toml"), ("none.toml", "cannot read")),
+        (("fly", "adam0", "--amplitude-deg", "1000"), ("amplitude: got 1000 degrees", "at most 60")),
+        (("fly", "adam0", "--period-s", "0.001"), ("period: got 0.001 s",)),
+        (("fly", "heavy.toml"), ("heavy.toml", "does not fly")),
+        (("fly", "still.toml"), ("still.toml", "no moment on some axis")),
+        (("experiment", "adam0", "--bandwidth", "1e-20", "--out", "x.ulg"), ("one pulse may last",)),
+        (("experiment", "adam0", "--seconds-per-axis", "1e12", "--out", "x.ulg"), ("seconds_per_axis: got",)),
+        (("plant", "adam0", "--rate", "nan"), ("--rate nan",)),
+        (("tune", "LOG", "--inner", "20,1e300,0", "--out", "x.toml"), ("reference model",)),
+        (("tune", "LOG", "--window", "5000", "--out", "x.toml"), ("window",)),
+        (("tune", "LOG", "--out", "folder"), ("folder",)),
+        (("generate", "odd.toml", "--out", "cpp"), ("odd.toml", "provenance")),
         (("fly", "adam0", "--axis", "yaw"), ("axis: got 'yaw'",)),
         (("fly", "adam0", "--scenario", "spin"), ("scenario: got 'spin'",)),
         (("fly", "adam0", "--amplitude-deg", "nan"), ("amplitude: got nan",)),
@@ -136,6 +151,11 @@ def test_a_mistake_is_one_clear_line_and_nothing_is_written(mimopilot, log, tmp_
     (tmp_path / "text.ulg").write_text("hello")
     (tmp_path / "cut.ulg").write_bytes(log.read_bytes()[:300])
     (tmp_path / "bad.toml").write_text("a = 1")
+    (tmp_path / "odd.toml").write_text("schema = 1\nprovenance = 3\n")
+    (tmp_path / "folder").mkdir()
+    adam0 = (FOLDER / "adam0.toml").read_text()
+    (tmp_path / "heavy.toml").write_text(adam0.replace("mass = 1.45", "mass = 100.0"))
+    (tmp_path / "still.toml").write_text(adam0.replace("0.1768", "0.0"))
     before = sorted(p.name for p in tmp_path.iterdir())
     assert_one_clear_line(mimopilot(*(log if a == "LOG" else a for a in arguments)), *words)
     assert sorted(p.name for p in tmp_path.iterdir()) == before
@@ -204,6 +224,34 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path, monkeypatch):
         write_atomically(path, "new")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["x"]
+
+
+def test_the_wheel_holds_every_file_that_is_not_python(tmp_path):
+    top = Path(__file__).resolve().parents[1]
+    copy = tmp_path / "source"
+    copy.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE", "mimopilot.py"):
+        shutil.copy(top / name, copy)
+    for room in ("tuning", "codegen", "sitl", "firmware_templates"):
+        shutil.copytree(top / room, copy / room, ignore=shutil.ignore_patterns("__pycache__"))
+    build = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "-q",
+        "--no-deps",
+        "--no-build-isolation",
+        "-w",
+        str(tmp_path),
+        str(copy),
+    ]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    held = set(zipfile.ZipFile(wheel).namelist())
+    rooms = [p for room in ("tuning", "codegen", "sitl", "firmware_templates") for p in (top / room).rglob("*")]
+    wanted = {p.relative_to(top).as_posix() for p in rooms if p.is_file() and "__pycache__" not in p.parts}
+    assert wanted <= held
 
 
 def test_the_demo_does_the_whole_way(mimopilot, tmp_path):

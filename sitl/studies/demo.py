@@ -196,7 +196,10 @@ def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
             continue  # zero in every set
         for label, values in sets:
             matrix = values[name] if isinstance(values, dict) else getattr(values, name)
-            rows.append([f"{name}  {label}", *(f"{float(v):.4f}" for v in np.ravel(matrix))])
+            found = {} if isinstance(values, dict) else values.provenance.get("standard_deviation", {})
+            spread = [f" ({v:.4f})" for v in np.ravel(found[name])] if name in found else [""] * 4
+            numbers = [f"{float(v):.4f}".replace("-0.0000", "0.0000") for v in np.ravel(matrix)]
+            rows.append([f"{name}  {label}", *(number + s for number, s in zip(numbers, spread, strict=True))])
     return rows
 
 
@@ -257,7 +260,10 @@ def _write_report(
         ),
         Section(
             "Gains",
-            "Beside those that the thesis prints for its own simulator, whose inertia it does not give.",
+            "Beside those that the thesis prints for its own simulator, whose inertia it does not give. In brackets: "
+            "standard deviation under repeated noise. Kp_o in 1/s, Kp_i in s, Ki_i dimensionless, Kd_i in s^2; a small "
+            "negative Kd_i means that these models ask for no damping beyond the vehicle's own. SISO tunes each axis by "
+            "itself with the same instruments.",
             tables=[Table("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
         ),
         Section(

@@ -173,6 +173,14 @@ def test_a_lost_vehicle_is_reported_when_the_crash_rule_is_met(vehicle):
     assert flight.crashed_at >= first + 0.28
 
 
+def test_touching_the_ground_is_a_loss(vehicle):
+    low = Autopilot(vehicle.airframe, vehicle.default_gains(), altitude=0.02)
+    flight = fly(vehicle.airframe, low, step("roll", np.radians(59.0), 6.0, TS), 1)
+    assert flight.crashed_at is not None
+    first = np.flatnonzero(flight.truth["position"][:, 2] > 0)[0]
+    assert flight.crashed_at == pytest.approx(first * TS)
+
+
 def test_a_steady_flight_is_not_reported_as_lost(vehicle):
     assert fly(vehicle.airframe, fresh(vehicle), hover("roll", 2.0, TS), 1).crashed_at is None
 
