@@ -262,8 +262,8 @@ def _write_report(
             "Gains",
             "Beside those that the thesis prints for its own simulator, whose inertia it does not give. In brackets: "
             "standard deviation under repeated noise. Kp_o in 1/s, Kp_i in s, Ki_i dimensionless, Kd_i in s^2; a small "
-            "negative Kd_i means that these models ask for no damping beyond the vehicle's own. SISO tunes each axis by "
-            "itself with the same instruments.",
+            "negative Kd_i means that these models ask for no damping beyond the vehicle's own. SISO tunes each axis "
+            "by itself with the same instruments.",
             tables=[Table("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
         ),
         Section(
