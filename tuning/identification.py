@@ -92,7 +92,8 @@ class IdentifiedModel:
         """
         if np.abs(self.plant.poles[0]) > 1:
             raise TuningError(
-                f"the identified plant has a pole at modulus {abs(self.plant.poles[0]):.5g}: simulate the closed loop instead"
+                f"the identified plant has a pole at modulus {abs(self.plant.poles[0]):.5g}: its output would grow "
+                "without bound; simulate the closed loop instead"
             )
         return self.plant.simulate(u)
 
@@ -151,7 +152,8 @@ def pbsid(
     count = sum(b - a - past for a, b in stretches)
     if count < 4 * needed:
         raise TuningError(
-            f"too short: {count} usable samples for {needed} unknowns an output; record longer, or ask for a smaller past"
+            f"too short: {count} usable samples for {needed} unknowns an output; record longer, or ask for a "
+            "smaller past"
         )
     u, y = u - u.mean(axis=0), y - y.mean(axis=0)
     Z = np.vstack([_past(u[a:b], y[a:b], past) for a, b in stretches])
