@@ -11,7 +11,7 @@ from pyulog import ULog
 
 from tests.conftest import assert_one_clear_line
 
-COMMANDS = ["demo", "experiment", "tune", "generate", "fly", "sitl", "plant"]
+COMMANDS = ["demo", "experiment", "tune", "generate", "fly", "sitl", "plant", "identify", "reproduce"]
 
 
 @pytest.fixture(scope="module")

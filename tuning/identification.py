@@ -17,6 +17,7 @@ import numpy as np
 from scipy.linalg import lstsq, qr, svd
 
 from tuning.errors import TuningError
+from tuning.experiment import Experiment
 from tuning.statespace import Signal, StateSpace
 
 #: Orders that are tried when none is asked for.
@@ -155,7 +156,8 @@ def pbsid(
             f"too short: {count} usable samples for {needed} unknowns an output; record longer, or ask for a "
             "smaller past"
         )
-    u, y = u - u.mean(axis=0), y - y.mean(axis=0)
+    inside = np.concatenate([np.arange(a, b) for a, b in stretches])
+    u, y = u - u[inside].mean(axis=0), y - y[inside].mean(axis=0)
     Z = np.vstack([_past(u[a:b], y[a:b], past) for a, b in stretches])
     now_u, now_y = (np.vstack([s[a + past : b] for a, b in stretches]) for s in (u, y))
     w = np.vstack([external[a + past : b] for a, b in stretches]) if external is not None else now_u[:, :0]
@@ -178,12 +180,53 @@ def pbsid(
     e = now_y - np.hstack([x, now_u]) @ CD.T
     # The next state of a stretch's last sample is in another stretch: leave it out.
     ends = np.cumsum([b - a - past for a, b in stretches]) - 1
-    inside = np.setdiff1d(np.arange(count), ends)
+    followed = np.setdiff1d(np.arange(count), ends)
     full_u = np.vstack([u[a + past : b] for a, b in stretches])
-    ABK = lstsq(np.hstack([x, full_u, e])[inside], x[inside + 1])[0].T
+    ABK = lstsq(np.hstack([x, full_u, e])[followed], x[followed + 1])[0].T
     D = CD[:, order:] if direct else np.zeros((n_y, n_u))
     plant = StateSpace(ABK[:, :order], ABK[:, order : order + n_u], CD[:, :order], D, Ts)
     return IdentifiedModel(plant, ABK[:, order + n_u :], s, e.T @ e / (count - needed), past, f, count)
+
+
+def identify_rates(
+    experiment: Experiment, *, order: int | None = None, past: int = PAST, future: int | None = None
+) -> tuple[IdentifiedModel, Signal]:
+    """The plant from control moment to body rates, and its one-step fit in percent; see `pbsid`.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    order, past, future
+        See `pbsid`.
+
+    Returns
+    -------
+    model : IdentifiedModel
+    fits : (2,) array
+        Of roll and pitch rate, percent.
+    """
+    u, y = experiment.u, experiment.y_i
+    model = pbsid(u, y, experiment.Ts, order=order, past=past, future=future, segments=experiment.segments)
+    u, y = u - u.mean(axis=0), y - y.mean(axis=0)
+    parts = [(y[a:b][past:], model.predict(u[a:b], y[a:b])[past:]) for a, b in experiment.segments]
+    measured, predicted = (np.vstack(side) for side in zip(*parts, strict=True))
+    return model, fit(measured, predicted)
+
+
+def model_toml(model: IdentifiedModel, log_sha256: str) -> str:
+    """The model as readable TOML text: Ts (s), A, B, C, D, K, windows, and the hash of the log."""
+    rows = {name: getattr(model.plant, name).tolist() for name in "ABCD"} | {"K": model.K.tolist()}
+    lines = [
+        "# x(k+1) = A x + B u + K e, y = C x + D u + e; u dimensionless moment, y body rates in rad/s",
+        "version = 1",
+        f"Ts = {model.plant.Ts!r}",
+        f"past = {model.past}",
+        f"future = {model.future}",
+        f'log_sha256 = "{log_sha256}"',
+    ]
+    for name, matrix in rows.items():
+        lines += [f"{name} = [", *(f"  {row}," for row in matrix), "]"]
+    return "\n".join(lines) + "\n"
 
 
 def fit(measured: Signal, modelled: Signal) -> Signal:

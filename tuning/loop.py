@@ -96,7 +96,8 @@ class LoopController:
 
         def stacked(of: dict[str, Response]) -> Response:
             columns = np.stack([of[term] for term in self.terms], axis=1)
-            return np.einsum("ft,ij->ftij", columns, eye).reshape(len(z), -1, len(eye))
+            blocks: Response = np.einsum("ft,ij->ftij", columns, eye).reshape(len(z), -1, len(eye))
+            return blocks
 
         return stacked(of_r), stacked(of_y)
 
@@ -117,8 +118,8 @@ def complementary_sensitivity(plant: Response, controller: LoopController, omega
     """
     of_r, of_y = controller.shapes(omega)
     open_loop = plant @ controller.matrix
-    closed: Response = np.linalg.solve(np.eye(plant.shape[1]) + open_loop @ of_y, open_loop @ of_r)
-    return closed
+    closed = np.linalg.solve(np.eye(plant.shape[1]) + open_loop @ of_y, open_loop @ of_r)
+    return np.asarray(closed, dtype=np.complex128)
 
 
 def closed_loop(plant: StateSpace, controller: LoopController) -> StateSpace:

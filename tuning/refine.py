@@ -41,8 +41,7 @@ class Refinement:
 
 def frequency_grid(Ts: float, count: int) -> Signal:
     """`count` frequencies in the middle of equal parts of (0, pi/Ts), rad/s."""
-    grid: Signal = (np.arange(count) + 0.5) * (np.pi / Ts / count)
-    return grid
+    return np.asarray((np.arange(count) + 0.5) * (np.pi / Ts / count), dtype=np.float64)
 
 
 def model_reference_cost(
@@ -101,7 +100,7 @@ def refine(controller: LoopController, plant: StateSpace, models: Sequence[Refer
 
     def closed(parameters: Signal) -> tuple[Response, Response]:
         open_loop = G @ (parameters.reshape(start.shape) * scale)
-        S = np.linalg.inv(eye + open_loop @ of_y)
+        S = np.linalg.inv(eye + open_loop @ of_y).astype(np.complex128)
         return S, S @ open_loop @ of_r
 
     def residual(parameters: Signal) -> Signal:

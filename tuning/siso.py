@@ -84,7 +84,7 @@ def siso_vrft(
     taps = whitening_filter(u)
 
     def shaped(signal: Signal) -> Signal:
-        """A (1 - m) of a signal; m itself is `vrft`'s own filter, or the next lines' here."""
+        """Whitening and (1 - m) of a signal; m itself is `vrft`'s own filter, or the next lines' here."""
         column = lfilter(taps, [1.0], signal[:, None], axis=0)
         rest: Signal = column - model.response(column)
         return rest
@@ -111,7 +111,8 @@ def siso_vrft(
         virtual = shaped(output)
         filtered = model.response(virtual)
         x = regressors(letters, virtual - filtered, filtered, virtual, model.Ts, derivative_cutoff_hz)[drop:]
-        return x - x.mean(axis=0)
+        rest: Signal = x - x.mean(axis=0)
+        return rest
 
     x = regressor(y)
     zeta = x if repeated is None else regressor(repeated)

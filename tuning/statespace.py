@@ -69,8 +69,8 @@ class StateSpace:
         """
         z = np.exp(1j * np.asarray(omega) * self.Ts)
         pencil = z[:, None, None] * np.eye(len(self.A)) - self.A
-        response: Response = self.C @ np.linalg.solve(pencil, np.broadcast_to(self.B, (len(z), *self.B.shape))) + self.D
-        return response
+        states = np.linalg.solve(pencil, np.broadcast_to(self.B, (len(z), *self.B.shape)))
+        return np.asarray(self.C @ states + self.D, dtype=np.complex128)
 
     def simulate(self, u: Signal) -> Signal:
         """Output from rest.
@@ -91,5 +91,4 @@ class StateSpace:
         for k in range(len(u)):
             states[k] = state
             state = state @ transition + drive[k]
-        output: Signal = states @ self.C.T + u @ self.D.T
-        return output
+        return np.asarray(states @ self.C.T + u @ self.D.T, dtype=np.float64)

@@ -124,7 +124,8 @@ def lv100() -> Benchmark:
     printed = json.loads(TABLES.read_text())["lv100"]
     Ts = printed["Ts"]
     continuous = tuple(np.array(printed[name], float) for name in "ABCD")
-    plant = StateSpace(*cont2discrete(continuous, Ts, method=printed["discretisation"])[:4], Ts)
+    A, B, C, D, _ = cont2discrete(continuous, Ts, method=printed["discretisation"])
+    plant = StateSpace(A, B, C, D, Ts)
     initial = LoopController.from_polynomial(**printed["C0_stabilising"], Ts=Ts)
     return Benchmark(plant, _model(printed, Ts), initial, float(np.sqrt(printed["noise_variance"])), printed)
 

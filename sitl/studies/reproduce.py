@@ -190,7 +190,9 @@ def reproduce_lv100(out: Path, runs: int = RUNS, seeds: int = SEEDS) -> Reproduc
     printed = _printed(task, "table_5_1")
     corrected = np.array(task.printed["table_5_1"]["VRFT"]["B1"])
     corrected[1, 0] = -19.2  # Table 5.1 contradicts Table 5.2 here
-    printed["VRFT, (2,1) corrected"] = LoopController.from_polynomial(printed["VRFT"].polynomial()[0], corrected, 0.1)
+    printed["VRFT with (2,1) corrected"] = LoopController.from_polynomial(
+        printed["VRFT"].polynomial()[0], corrected, 0.1
+    )
     experiments = {name: comparison.experiments for name, comparison in comparisons.items()}
     shown = _beside(ours, printed, "Table 5.1")
     rms = {d: [np.sqrt(np.mean(s**2, axis=0)).tolist() for s in one_experiment(task, d, 0)[1:]] for d in medians}
