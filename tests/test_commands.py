@@ -15,7 +15,20 @@ from pyulog import ULog
 from sitl.airframe import FOLDER
 from tests.conftest import assert_one_clear_line
 
-COMMANDS = ["demo", "experiment", "inspect", "tune", "certify", "advise", "generate", "fly", "sitl", "plant"]
+COMMANDS = [
+    "demo",
+    "reproduce",
+    "experiment",
+    "inspect",
+    "identify",
+    "tune",
+    "certify",
+    "advise",
+    "generate",
+    "fly",
+    "sitl",
+    "plant",
+]
 
 
 @pytest.fixture(scope="module")

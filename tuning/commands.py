@@ -12,6 +12,7 @@ import typer
 def register(app: typer.Typer) -> None:
     """Add this room's commands to the front door."""
     app.command(epilog="Example: mimopilot inspect flight.ulg")(inspect)
+    app.command(epilog="Example: mimopilot identify flight.ulg --order 4 --out plant.toml")(identify)
     app.command(epilog="Example: mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out my.gains.toml")(tune)
     app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
     app.command(epilog="Example: mimopilot advise flight.ulg --outer 10,0.7,0 --out my.gains.toml")(advise)
@@ -183,6 +184,59 @@ def inspect(
         print_json(as_mapping(found))
     else:
         print_inspection(found)
+
+
+def identify(
+    log: LOG,
+    order: Annotated[int | None, typer.Option(help="States; by default from the singular values.")] = None,
+    past: Annotated[int, typer.Option(help="Past window, samples.")] = 20,
+    future: Annotated[int | None, typer.Option(help="Future window, samples; the past window by default.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Where the state space is written: FILE.toml.")] = None,
+    columns: COLUMNS = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Identify the plant from control moment to body rates (PBSID, closed loop)."""
+    from tuning.files import write_atomically
+    from tuning.identification import identify_rates, model_toml
+    from tuning.logs.columns import load_columns
+    from tuning.logs.reader import read_log
+    from tuning.output import print_json, print_table
+
+    experiment = read_log(log, load_columns(columns) if columns else None)
+    model, fits = identify_rates(experiment, order=order, past=past, future=future)
+    if out is not None:
+        write_atomically(out, model_toml(model, experiment.sha256))
+    shown = model.singular_values[: max(10, model.order + 3)].tolist()
+    poles = [(value.real, value.imag) for value in model.plant.poles.tolist()]
+    if as_json:
+        matrices = {name: getattr(model.plant, name).tolist() for name in "ABCD"}
+        print_json(
+            {
+                "order": model.order,
+                "past": model.past,
+                "future": model.future,
+                "samples": model.samples,
+                "singular_values": shown,
+                "poles": [list(pole) for pole in poles],
+                "fit_percent": fits.tolist(),
+                "Ts": model.plant.Ts,
+                **matrices,
+                "K": model.K.tolist(),
+                "out": None if out is None else str(out),
+            }
+        )
+        return
+    print_table(
+        f"Order {model.order} from {log.name} (past {model.past}, future {model.future}, {model.samples} samples)",
+        ["state", "singular value", "pole (real)", "pole (imaginary)"],
+        [
+            [str(i + 1), f"{value:.4g}", *(f"{part:.5f}" for part in (poles[i] if i < len(poles) else ()))]
+            for i, value in enumerate(shown)
+        ],
+    )
+    print(f"one-step fit of the rates: roll {fits[0]:.1f} %, pitch {fits[1]:.1f} %")
+    if out is not None:
+        print(f"written to {out}")
 
 
 def print_gains(title: str, gains: Any, deviations: dict[str, Any]) -> None:

@@ -1,0 +1,67 @@
+"""Figures of `mimopilot reproduce`: how near each closed loop is to the reference model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from sitl.figures import MODEL, STYLES
+from sitl.studies.benchmarks import Benchmark
+from tuning.loop import LoopController, closed_loop, complementary_sensitivity
+
+#: Okabe-Ito, and a style of its own each.
+LINES = (*STYLES, ("#E69F00", (0, (5, 1, 1, 1, 1, 1))))
+
+
+def step_figure(task: Benchmark, controllers: Mapping[str, LoopController], samples: int, title: str) -> Figure:
+    """Noise-free answer of both outputs (rows) to a unit step of each set-point (columns)."""
+    figure, panels = _panels(title)
+    time = np.arange(samples) * task.plant.Ts
+    for j in range(2):
+        inputs = np.zeros((samples, 6))
+        inputs[:, j] = 1.0
+        for i in range(2):
+            wanted = task.model.response(inputs[:, j]) if i == j else np.zeros(samples)
+            panels[i, j].step(time, wanted, where="post", label="reference model", **MODEL)
+        for (label, controller), (colour, style) in zip(controllers.items(), LINES, strict=False):
+            y = closed_loop(task.plant, controller).simulate(inputs)[:, 2:]
+            for i in range(2):
+                line = {"color": colour, "linestyle": style, "linewidth": 1.6, "label": label}
+                panels[i, j].step(time, y[:, i], where="post", **line)
+        panels[0, j].set_title(f"step of set-point {j + 1}", fontsize=10)
+        panels[1, j].set_xlabel("time [s]")
+        panels[j, 0].set_ylabel(f"output {j + 1} [-]")
+    panels[0, 0].legend(fontsize=8)
+    return figure
+
+
+def sensitivity_figure(task: Benchmark, controllers: Mapping[str, LoopController], title: str) -> Figure:
+    """Magnitude of each element of T over frequency, beside the reference model."""
+    figure, panels = _panels(title)
+    Ts = task.plant.Ts
+    omega = np.geomspace(1e-3, 1, 400) * np.pi / Ts
+    plant, wanted = task.plant.frequency_response(omega), np.abs(task.model.frequency_response(omega))
+    for i in range(2):
+        panels[i, i].loglog(omega, wanted, label="reference model", **MODEL)
+        for (label, controller), (colour, style) in zip(controllers.items(), LINES, strict=False):
+            T = np.abs(complementary_sensitivity(plant, controller, omega))
+            for j in range(2):
+                panels[i, j].loglog(omega, T[:, i, j], color=colour, linestyle=style, linewidth=1.6, label=label)
+        for j in range(2):
+            panels[i, j].set_ylim(1e-3, 3)
+            panels[i, j].set_ylabel(f"|T({i + 1},{j + 1})| [-]")
+        panels[1, i].set_xlabel("frequency [rad/s]")
+    panels[0, 0].legend(fontsize=8)
+    return figure
+
+
+def _panels(title: str) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    panels: Any = figure.subplots(2, 2, sharex=True)
+    for panel in panels.flat:
+        panel.grid(alpha=0.3)
+    figure.suptitle(title, x=0.02, ha="left")
+    return figure, panels
