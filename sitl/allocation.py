@@ -87,27 +87,31 @@ def _largest_share(base, part, collective, allocation):  # type: ignore[no-untyp
     """Largest s in 0..1 for which base + s part leaves a collective that keeps every motor within 0..1.
 
     Motor i asks for c >= -(base_i + s part_i)/h_i, motor j for c <= (1 - base_j - s part_j)/h_j and, without
-    airmode, for c <= the commanded one: each pair is one linear inequality in s. -1 when none will do.
+    airmode, for c <= the commanded one: each pair is one linear inequality in s. -1 when no s will do.
     """
     n = base.shape[0]
-    share = 1.0
+    smallest, largest = 0.0, 1.0
     for i in range(n):
         h_i = allocation.mixer[i, 3]
         for j in range(n + 1):
             if j < n:
                 h_j = allocation.mixer[j, 3]
-                room = (1.0 - base[j]) / h_j + base[i] / h_i
+                room = (1.0 - base[j]) / h_j + base[i] / h_i + ROUNDING
                 slope = part[j] / h_j - part[i] / h_i
             elif allocation.airmode:
                 continue
             else:
-                room = collective + base[i] / h_i
+                room = collective + base[i] / h_i + ROUNDING
                 slope = -part[i] / h_i
-            if room < -ROUNDING:
-                return -1.0
-            if slope > 0.0 and slope * share > room + ROUNDING:
-                share = max(room, 0.0) / slope
-    return share
+            if slope > room:
+                if slope <= 0.0:
+                    return -1.0  # even the whole part leaves too little room
+                largest = min(largest, room / slope)
+            if room < 0.0:
+                if slope >= 0.0:
+                    return -1.0
+                smallest = max(smallest, room / slope)
+    return largest if largest >= smallest else -1.0
 
 
 @compiled
