@@ -7,7 +7,9 @@ zeta(k) = [w(k-l); ...; w(k+l)]; the thesis' Kronecker form splits into one smal
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,21 +65,32 @@ class Solution:
     ----------
     B : (n_u, n_x) array
         Coefficients.
-    covariance : (n_u, n_x, n_x) array
-        Of each row of B under repeated noise, the excitation being the same.
-    strength : (n_x,) array
-        Share of each regressor's power that the instrument explains.
     r_squared : (n_u,) array
         Share of each u's power that B x explains.
     least_squares : (n_u, n_x) array
         The same coefficients without instruments, biased by noise: a large difference is a warning.
+    uncertainty : callable
+        Computes `covariance` and `strength`, which cost more than B: only when they are asked for.
     """
 
     B: Signal
-    covariance: Signal
-    strength: Signal
     r_squared: Signal
     least_squares: Signal
+    uncertainty: Callable[[], tuple[Signal, Signal]]
+
+    @cached_property
+    def _certain(self) -> tuple[Signal, Signal]:
+        return self.uncertainty()
+
+    @property
+    def covariance(self) -> Signal:
+        """Of each row of B, (n_u, n_x, n_x), under repeated noise, the excitation being the same."""
+        return self._certain[0]
+
+    @property
+    def strength(self) -> Signal:
+        """Share of each regressor's power that the instrument explains, (n_x,)."""
+        return self._certain[1]
 
 
 def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: float = 0.0) -> Solution:
@@ -117,9 +130,9 @@ def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: f
     first, _, rank, _ = lstsq(S, Q)
     if rank < S.shape[1]:
         raise TuningError("not excited: the injected signal does not reach every axis, so some gains cannot be found")
-    noise = _noise(problem, x)
     n_u, n_x = Q.shape[1], S.shape[1]
-    B, covariance = np.empty((n_u, n_x)), np.empty((n_u, n_x, n_x))
+    B = np.empty((n_u, n_x))
+    rows: list[tuple[Signal, Signal, Signal]] = []
     for row in range(n_u):
         if weight == "optimal":
             residual = [u[:, [row]] - xs @ first[:, [row]] for u, xs in zip(problem.u, x, strict=True)]
@@ -135,14 +148,21 @@ def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: f
         B[row] = gain @ (projected.T @ Q[:, row] + target)
         misfit = Q[:, row] - S @ B[row]
         weighted = cho_solve(factor, misfit) if factor is not None else misfit
-        score = _score_covariance(problem, noise, projected, weighted, B[row], row)
-        covariance[row] = gain @ score @ gain.T
+        rows.append((gain, projected, weighted))
     power = sum((u**2).sum(axis=0) for u in problem.u)
     left = sum(((u - xs @ B.T) ** 2).sum(axis=0) for u, xs in zip(problem.u, x, strict=True))
     plain = lstsq(np.vstack(x), np.vstack(problem.u))[0].T
-    weights = np.real(np.diagonal(noise.noise, axis1=1, axis2=2))[:, n_u:] / (1 - noise.explained[:, n_u:] + 1e-12)
-    strength = (noise.explained[:, n_u:] * weights).sum(axis=0) / weights.sum(axis=0)
-    return Solution(B / scale, covariance / np.outer(scale, scale), strength, 1 - left / power, plain / scale)
+
+    def uncertainty() -> tuple[Signal, Signal]:
+        noise = _noise(problem, x)
+        covariance = np.empty((n_u, n_x, n_x))
+        for row, (gain, projected, weighted) in enumerate(rows):
+            covariance[row] = gain @ _score_covariance(problem, noise, projected, weighted, B[row], row) @ gain.T
+        explained = noise.explained[:, n_u:]
+        spectrum = np.real(np.diagonal(noise.noise, axis1=1, axis2=2))[:, n_u:] / (1 - explained + 1e-12)
+        return covariance / np.outer(scale, scale), (explained * spectrum).sum(axis=0) / spectrum.sum(axis=0)
+
+    return Solution(B / scale, 1 - left / power, plain / scale, uncertainty)
 
 
 def _residual_covariance(problem: Regression, residual: list[Signal]) -> Signal:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +33,6 @@ class LoopEstimate:
     ----------
     gains : dict
         Term (``P``, ``I``, ``D``, ``F``) -> (n_u, n_y) array.
-    deviations : dict
-        The same for their standard deviations.
     samples : int
         Samples used.
     window : int
@@ -43,10 +42,16 @@ class LoopEstimate:
     """
 
     gains: dict[str, Signal]
-    deviations: dict[str, Signal]
     samples: int
     window: int
     solution: Solution
+
+    @cached_property
+    def deviations(self) -> dict[str, Signal]:
+        """Term -> (n_u, n_y) standard deviations under repeated noise."""
+        variances = np.diagonal(self.solution.covariance, axis1=1, axis2=2)
+        found = np.split(np.sqrt(np.maximum(variances, 0.0)), len(self.gains), axis=1)
+        return dict(zip(self.gains, found, strict=True))
 
     def gain(self, term: str) -> Signal:
         """Matrix of a term; zeros when the structure does not have it."""
@@ -203,11 +208,8 @@ def vrft(
     solution = solve(problem, weight, None if prior is None else np.hstack([prior[t] for t in letters]), pull)
     n_y = y.shape[1]
     split = {term: slice(i * n_y, (i + 1) * n_y) for i, term in enumerate(letters)}
-    variances = np.diagonal(solution.covariance, axis1=1, axis2=2)
-    deviations = np.sqrt(np.maximum(variances, 0.0))
     return LoopEstimate(
         {term: solution.B[:, columns] for term, columns in split.items()},
-        {term: deviations[:, columns] for term, columns in split.items()},
         problem.samples,
         lags,
         solution,
