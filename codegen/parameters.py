@@ -6,7 +6,6 @@ all come from here. Its order is that of ``mimopilot::Gains`` seen as an array o
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,8 +100,6 @@ IDENTITY: tuple[Parameter, ...] = tuple(
     )
     for axis in "RPY"
 )
-
-BY_NAME: Mapping[str, Parameter] = {parameter.name: parameter for parameter in PARAMETERS}
 
 
 def identity_parameters(gains: Gains) -> dict[str, float]:

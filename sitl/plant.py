@@ -17,7 +17,7 @@ from sitl.errors import SitlError
 GRAVITY = 9.80665  # m/s^2, standard gravity
 STEP = 1e-3  # s, of the Runge-Kutta scheme
 
-POSITION, VELOCITY, QUATERNION, RATES, ROTORS = 0, 3, 6, 10, 13
+POSITION, QUATERNION, ROTORS = 0, 6, 13
 
 
 class PlantParameters(NamedTuple):

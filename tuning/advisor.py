@@ -13,9 +13,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.cascade import UPPER, external_signal, tune
+from tuning.cascade import measured_plant, tune
 from tuning.certificate import CERTIFIED
-from tuning.closed_loop import ACCURATE, COHERENT, PlantResponse, cascade_loop, plant_response
+from tuning.closed_loop import ACCURATE, COHERENT, PlantResponse, cascade_loop
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.gains import Gains
@@ -123,11 +123,11 @@ def advise(
         When the log cannot be tuned from at all, or no candidate is certified.
     """
     doublet = doublet or Doublet()
-    plant = plant_response(experiment, external_signal(experiment)[0], UPPER)
+    plant = measured_plant(experiment)
     candidates: list[Candidate] = []
     for inner in watch(list(product(BANDWIDTHS, DAMPINGS, DELAYS))):
         try:
-            gains = tune(experiment, spec.model_copy(update={"inner": (inner, inner)}))
+            gains = tune(experiment, spec.model_copy(update={"inner": (inner, inner)}), plant)
         except TuningError as error:
             candidates.append(Candidate(inner, None, "refused", str(error)))
             continue

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.certificate import certify
-from tuning.closed_loop import plant_response, refine_outer
+from tuning.closed_loop import PlantResponse, plant_response, refine_outer
 from tuning.controller import rebuild_rate_setpoint
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
@@ -26,7 +26,7 @@ PERIOD_TOLERANCE = 0.02
 TERMS = {"P": "Kp_i", "I": "Ki_i", "D": "Kd_i"}
 
 
-def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
+def tune(experiment: Experiment, spec: TuningSpec | None = None, plant: PlantResponse | None = None) -> Gains:
     """Gains of the whole cascade, by VRFT with extended instrumental variables, (3.26)-(3.34).
 
     Parameters
@@ -35,6 +35,8 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
         One flight with excitation.
     spec : TuningSpec, optional
         Method and reference models.
+    plant : PlantResponse, optional
+        The experiment's `measured_plant`, when it is at hand already.
 
     Returns
     -------
@@ -92,11 +94,12 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
     ]
     gains = replace(gains, Kp_o=_assemble(outer, stretches, "P"))
     deviations = {matrix: _assemble(inner, stretches, term, "deviations") for term, matrix in TERMS.items()}
-    deviations["Kp_o"] = _assemble(outer, stretches, "P", "deviations")
-    plant = plant_response(experiment, instrument, UPPER)
+    plant = plant or measured_plant(experiment)
     outer_models = spec.models("outer", experiment.Ts)
     if spec.refine:
         gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full=spec.method == "mimo")
+    else:
+        deviations["Kp_o"] = _assemble(outer, stretches, "P", "deviations")
     certificate = certify(gains, plant, spec.models("inner", experiment.Ts), outer_models, experiment.sha256)
     provenance = {
         "method": spec.method,
@@ -117,6 +120,11 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None) -> Gains:
     return replace(gains, certificate=certificate.as_table(), provenance=provenance)
 
 
+def measured_plant(experiment: Experiment) -> PlantResponse:
+    """The plant's frequency response from the experiment's external signal; see `plant_response`."""
+    return plant_response(experiment, external_signal(experiment)[0], UPPER)
+
+
 def certify_from_log(experiment: Experiment, gains: Gains) -> Gains:
     """The gains with a certificate made from a flight of the vehicle, whatever they come from.
 
@@ -130,8 +138,7 @@ def certify_from_log(experiment: Experiment, gains: Gains) -> Gains:
             f"{experiment.source}: sampled every {experiment.Ts:g} s, the gains are for {gains.Ts:g} s; certify them "
             "with a log of the same control rate"
         )
-    instrument, _ = external_signal(experiment)
-    plant = plant_response(experiment, instrument, UPPER)
+    plant = measured_plant(experiment)
     spec = TuningSpec()
     certificate = certify(
         gains, plant, spec.models("inner", gains.Ts), spec.models("outer", gains.Ts), experiment.sha256

@@ -14,13 +14,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.closed_loop import CascadeLoop, PlantResponse, cascade_loop, inner_controllers
+from tuning.closed_loop import (
+    COHERENT,
+    DRAWS,
+    MIN_FREQUENCIES,
+    CascadeLoop,
+    PlantResponse,
+    cascade_loop,
+    inner_controllers,
+)
 from tuning.gains import Gains
 from tuning.reference import ReferenceModel
 
-COHERENT = 0.7
-MIN_FREQUENCIES = 8
-DRAWS = 64
 #: Above the band sigma_max(G) sup sigma_max(K) may be at most this.
 HIGH_FREQUENCY_LOOP = 0.5
 
