@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tuning.cascade import measured_plant, tune
 from tuning.certificate import CERTIFIED
-from tuning.closed_loop import ACCURATE, COHERENT, PlantResponse, cascade_loop
+from tuning.closed_loop import ACCURATE, PlantResponse, cascade_loop
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.gains import Gains
@@ -75,7 +75,7 @@ def predict(
 
     The mean is over twice the doublet's length; frequencies that the log does not know are left out.
     """
-    known = plant.at((plant.coherence > COHERENT) & (plant.relative_error() < 3 * ACCURATE))
+    known = plant.at(plant.coherent() & (plant.relative_error() < 3 * ACCURATE))
     loop = cascade_loop(gains, known)
     s = 1j * known.omega
     signal = np.radians(doublet.amplitude_deg) * (1 - np.exp(-s * doublet.period_s / 2)) ** 2 / s

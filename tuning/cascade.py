@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,23 +11,185 @@ from numpy.typing import NDArray
 from tuning.certificate import certify
 from tuning.closed_loop import PlantResponse, plant_response, refine_outer
 from tuning.controller import rebuild_rate_setpoint
-from tuning.errors import TuningError
+from tuning.errors import NotMinimumPhaseError, TuningError
 from tuning.experiment import Experiment
 from tuning.gains import Gains, Limits, YawGains
-from tuning.gates import examine
+from tuning.gates import examine_band, examine_estimates, examine_saturation
+from tuning.instruments import Instruments, Stretches, align, excited_stretches, external_signal, instruments
+from tuning.reference import ReferenceModel
+from tuning.siso import siso_vrft
 from tuning.spec import TuningSpec
-from tuning.vrft import LoopEstimate, Segments, vrft
+from tuning.vrft import LoopEstimate, vrft
 
-AXES = ("roll", "pitch")
 #: Highest frequency of the measured response, rad/s.
 UPPER = 300.0
 #: Periods of a log and of a gain set may differ by this share.
 PERIOD_TOLERANCE = 0.02
-TERMS = {"P": "Kp_i", "I": "Ki_i", "D": "Kd_i"}
+TERMS = {"P": "Kp_i", "I": "Ki_i", "D": "Kd_i", "F": "Kff_i"}
 
 
-def tune(experiment: Experiment, spec: TuningSpec | None = None, plant: PlantResponse | None = None) -> Gains:
-    """Gains of the whole cascade, by VRFT with extended instrumental variables, (3.26)-(3.34).
+@dataclass(frozen=True, eq=False)
+class CascadeEstimate:
+    """What VRFT says of both loops.
+
+    Attributes
+    ----------
+    gains : Gains
+        The whole set, neither refined nor certified.
+    stretches : list of (axes, segments)
+        Which axes were tuned together, and on which samples; `inner` and `outer` have one entry each.
+    inner, outer : list of LoopEstimate
+        Rate loop and attitude loop.
+    instruments : Instruments
+        What the instruments were made of.
+    warnings : tuple of str
+        What had to be done otherwise than asked.
+    """
+
+    gains: Gains
+    stretches: Stretches
+    inner: list[LoopEstimate]
+    outer: list[LoopEstimate]
+    instruments: Instruments
+    warnings: tuple[str, ...]
+
+    def deviations(self) -> dict[str, NDArray[np.float64]]:
+        """Matrix -> (2, 2) standard deviations, in the unit of the matrix, of those that were estimated."""
+        found = {TERMS[term]: self._assembled(self.inner, term) for term in self.inner[0].gains}
+        return {**found, "Kp_o": self._assembled(self.outer, "P")}
+
+    def _assembled(self, loops: list[LoopEstimate], term: str) -> NDArray[np.float64]:
+        return _assemble([loop.deviations[term] for loop in loops], self.stretches)
+
+
+def estimate(experiment: Experiment, spec: TuningSpec, repeat: Experiment | None = None) -> CascadeEstimate:
+    """VRFT with extended instrumental variables of both loops, (3.26)-(3.34), and nothing else.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        One flight with excitation.
+    spec : TuningSpec
+        Method and reference models.
+    repeat : Experiment, optional
+        A second flight of the same experiment, for the instrument ``repeated``.
+
+    Raises
+    ------
+    TuningError
+        When the log has no external signal, is too short or not excited, or lacks what the controller needs
+        beside roll and pitch.
+    """
+    if repeat is not None:
+        experiment, repeat = align(experiment, repeat)
+    base = _base(experiment, spec)
+    chosen = instruments(experiment, spec.instrument, repeat)
+    stretches = excited_stretches(experiment, chosen.external, spec.method)
+    models = spec.models("inner", experiment.Ts)
+    inner = [
+        _loop(
+            spec,
+            spec.structure,
+            axes,
+            segments,
+            (experiment.u, experiment.y_i, chosen.y_i),
+            chosen,
+            models,
+            derivative_cutoff_hz=base.derivative_cutoff_hz,
+            weight=spec.weight,
+            prior=_prior(experiment, spec, axes),
+            pull=spec.pull,
+        )
+        for axes, segments in stretches
+    ]
+    found: dict[str, Any] = {
+        TERMS[term]: _assemble([loop.gains[term] for loop in inner], stretches) for term in spec.structure
+    }
+    gains = replace(base, **found)
+
+    outer_models = spec.models("outer", experiment.Ts)
+    r_i, inverse, settling, warnings = _rate_setpoint(experiment, gains, models, outer_models)
+    outer = [
+        _loop(
+            spec,
+            "P",
+            axes,
+            segments,
+            (r_i, experiment.y_o, chosen.y_o),
+            chosen,
+            outer_models,
+            inverse=inverse[axes],
+            settling=settling,
+            weight="identity",  # the residual is what a P controller cannot do, not noise
+        )
+        for axes, segments in stretches
+    ]
+    gains = replace(gains, Kp_o=_assemble([loop.gains["P"] for loop in outer], stretches))
+    return CascadeEstimate(gains, stretches, inner, outer, chosen, warnings)
+
+
+def _loop(
+    spec: TuningSpec,
+    terms: str,
+    axes: slice,
+    segments: list[tuple[int, int]],
+    signals: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64] | None],
+    chosen: Instruments,
+    models: list[ReferenceModel],
+    **options: Any,
+) -> LoopEstimate:
+    """One loop on some axes: `signals` are u, y and, where there is one, y with other noise."""
+    u, y, repeated = (None if signal is None else signal[:, axes] for signal in signals)
+    assert u is not None and y is not None
+    common: dict[str, Any] = {
+        "segments": segments,
+        "window": spec.window,
+        "trim": spec.trim,
+        "repeated": repeated,
+        "external": None if chosen.lagged is chosen.external else chosen.external[:, axes],
+        **options,
+    }
+    if spec.method == "siso":
+        return siso_vrft(u, y, chosen.lagged[:, axes], models[axes][0], terms, **common)
+    return vrft(u, y, chosen.lagged[:, axes], models[axes], terms, **common)
+
+
+def _rate_setpoint(
+    experiment: Experiment, gains: Gains, inner: list[ReferenceModel], outer: list[ReferenceModel]
+) -> tuple[NDArray[np.float64], list[ReferenceModel], int, tuple[str, ...]]:
+    """What the attitude loop's virtual controller makes: C_i^-1 u, (3.32)-(3.34), else M_i^-1 y_i.
+
+    Returns
+    -------
+    signal : (N, 2) array, rad/s
+    inverse : list of ReferenceModel
+        M_i where the signal is y_i and M_i^-1 is still to be applied, together with the outer filter; else none.
+    settling : int, samples
+    warnings : tuple of str
+    """
+    r_i, settling = np.zeros_like(experiment.y_i), 0
+    try:
+        for start, stop in experiment.segments:
+            u, y_i = experiment.u[start:stop], experiment.y_i[start:stop]
+            r_i[start:stop], settling = rebuild_rate_setpoint(gains, u, y_i)
+    except NotMinimumPhaseError as error:
+        quotients = [m_o.over(m_i) for m_o in outer for m_i in inner]
+        warning = (
+            f"{error}; the attitude gains are found as if the rate loop were its reference model (r_i = M_i^-1 y_i): "
+            "record a longer or stronger excitation, leave the integral out (--structure PD), or ask for another "
+            "rate-loop model"
+        )
+        return experiment.y_i, inner, max(quotient.settling_samples() for quotient in quotients), (warning,)
+    return r_i, [], settling, ()
+
+
+def tune(
+    experiment: Experiment,
+    spec: TuningSpec | None = None,
+    plant: PlantResponse | None = None,
+    repeat: Experiment | None = None,
+) -> Gains:
+    """Gains of the whole cascade: VRFT of both loops, quality gates, refinement, certificate.
 
     Parameters
     ----------
@@ -37,6 +199,8 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None, plant: PlantRes
         Method and reference models.
     plant : PlantResponse, optional
         The experiment's `measured_plant`, when it is at hand already.
+    repeat : Experiment, optional
+        See `estimate`.
 
     Returns
     -------
@@ -46,75 +210,41 @@ def tune(experiment: Experiment, spec: TuningSpec | None = None, plant: PlantRes
     Raises
     ------
     TuningError
-        When the log has no external signal, is too short or not excited, lacks what the controller needs
-        beside roll and pitch, or when the inner controller cannot be run backwards.
+        As `estimate`, or when the gains would be nonsense.
     """
     spec = spec or TuningSpec()
-    base = _base(experiment, spec)
-    instrument, name = external_signal(experiment)
-    stretches = excited_stretches(experiment, instrument, spec.method)
-
-    inner = [
-        vrft(
-            experiment.u[:, axes],
-            experiment.y_i[:, axes],
-            instrument[:, axes],
-            spec.models("inner", experiment.Ts)[axes],
-            "PID",
-            segments=segments,
-            window=spec.window,
-            derivative_cutoff_hz=base.derivative_cutoff_hz,
-            weight=spec.weight,
-            prior=_prior(experiment, spec, axes),
-            pull=spec.pull,
-        )
-        for axes, segments in stretches
-    ]
-    warnings = examine(experiment, [(axes, loop) for (axes, _), loop in zip(stretches, inner, strict=True)])
-    Kp, Ki, Kd = (_assemble(inner, stretches, term) for term in TERMS)
-    gains = replace(base, Kp_i=Kp, Ki_i=Ki, Kd_i=Kd)
-
-    settling = 0
-    r_i = np.zeros_like(experiment.y_i)
-    for start, stop in experiment.segments:
-        r_i[start:stop], settling = rebuild_rate_setpoint(gains, experiment.u[start:stop], experiment.y_i[start:stop])
-    outer = [
-        vrft(
-            r_i[:, axes],
-            experiment.y_o[:, axes],
-            instrument[:, axes],
-            spec.models("outer", experiment.Ts)[axes],
-            "P",
-            segments=segments,
-            window=spec.window,
-            settling=settling,
-            weight="identity",  # the residual is what a P controller cannot do, not noise
-        )
-        for axes, segments in stretches
-    ]
-    gains = replace(gains, Kp_o=_assemble(outer, stretches, "P"))
-    deviations = {matrix: _assemble(inner, stretches, term, "deviations") for term, matrix in TERMS.items()}
+    found = estimate(experiment, spec, repeat)
     plant = plant or measured_plant(experiment)
+    warnings = [
+        *found.warnings,
+        *examine_saturation(experiment),
+        *examine_estimates(experiment.source, found.stretches, found.inner),
+        *examine_band(experiment.source, plant, [omega for omega, _, _ in spec.inner]),
+    ]
+    gains, deviations = found.gains, found.deviations()
     outer_models = spec.models("outer", experiment.Ts)
     if spec.refine:
-        gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full=spec.method == "mimo")
-    else:
-        deviations["Kp_o"] = _assemble(outer, stretches, "P", "deviations")
+        try:
+            gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full=spec.method == "mimo")
+        except TuningError as error:
+            warnings.append(f"the attitude gains are left as VRFT gives them: {error}")
     certificate = certify(gains, plant, spec.models("inner", experiment.Ts), outer_models, experiment.sha256)
     provenance = {
         "method": spec.method,
+        "structure": spec.structure,
         "log": experiment.source,
         "log_sha256": experiment.sha256,
-        "instrument": name,
+        "instrument": found.instruments.name,
         "weight": spec.weight,
+        "trim": spec.trim,
         "pull": spec.pull,
         "refined": spec.refine,
-        "fit": [float(value) for loop in inner for value in loop.solution.r_squared],
+        "fit": [float(value) for loop in found.inner for value in loop.solution.r_squared],
         "warnings": warnings,
         "inner_model": [list(model) for model in spec.inner],
         "outer_model": [list(model) for model in spec.outer],
-        "window": [inner[0].window, outer[0].window],
-        "samples": [inner[0].samples, outer[0].samples],
+        "window": [found.inner[0].window, found.outer[0].window],
+        "samples": [found.inner[0].samples, found.outer[0].samples],
         "standard_deviation": {matrix: value.tolist() for matrix, value in deviations.items()},
     }
     return replace(gains, certificate=certificate.as_table(), provenance=provenance)
@@ -183,59 +313,11 @@ def _prior(experiment: Experiment, spec: TuningSpec, axes: slice) -> dict[str, N
     flown = experiment.flown
     if flown is None:
         raise TuningError(f"{experiment.source}: pull: the log does not say which gains flew; leave it at 0")
-    return {term: getattr(flown, matrix)[axes, axes] for term, matrix in TERMS.items()}
+    return {term: getattr(flown, TERMS[term])[axes, axes] for term in spec.structure}
 
 
-def external_signal(experiment: Experiment) -> tuple[NDArray[np.float64], str]:
-    """The instrument, (N, 2), and its name: the injected moment, else the attitude set-point (rad).
-
-    Raises
-    ------
-    TuningError
-        When neither is logged and moves.
-    """
-    for name in ("u_bar", "r_o"):
-        signal = getattr(experiment, name)
-        if signal is not None and any(np.ptp(signal[start:stop]) > 0 for start, stop in experiment.segments):
-            return signal, name
-    raise TuningError(
-        f"{experiment.source}: no excitation: neither an injected moment nor a moving attitude set-point is logged; "
-        "fly an experiment with a moment injected on roll, then on pitch"
-    )
-
-
-def excited_stretches(
-    experiment: Experiment, instrument: NDArray[np.float64], method: str
-) -> list[tuple[slice, list[tuple[int, int]]]]:
-    """Which axes are tuned together, and on which samples: SISO uses an axis' own part of the flight.
-
-    Raises
-    ------
-    TuningError
-        When an axis is not excited.
-    """
-    if method == "mimo":
-        for axis in range(2):
-            if all(np.ptp(instrument[start:stop, axis]) == 0 for start, stop in experiment.segments):
-                raise TuningError(f"{experiment.source}: not excited on {AXES[axis]}; inject a moment on that axis too")
-        return [(slice(0, 2), list(experiment.segments))]
-    stretches = []
-    for axis in range(2):
-        active: list[tuple[int, int]] = []
-        for start, stop in experiment.segments:
-            moving = start + np.flatnonzero(instrument[start:stop, axis] != 0)
-            if len(moving):
-                active.append((int(moving[0]), int(moving[-1]) + 1))
-        if not active:
-            raise TuningError(f"{experiment.source}: not excited on {AXES[axis]}; inject a moment on that axis too")
-        stretches.append((slice(axis, axis + 1), active))
-    return stretches
-
-
-def _assemble(
-    estimates: list[LoopEstimate], stretches: Sequence[tuple[slice, Segments]], term: str, what: str = "gains"
-) -> NDArray[np.float64]:
+def _assemble(parts: list[NDArray[np.float64]], stretches: Stretches) -> NDArray[np.float64]:
     matrix = np.zeros((2, 2))
-    for estimate, (axes, _) in zip(estimates, stretches, strict=True):
-        matrix[axes, axes] = getattr(estimate, what)[term]
+    for part, (axes, _) in zip(parts, stretches, strict=True):
+        matrix[axes, axes] = part
     return matrix

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.closed_loop import (
-    COHERENT,
     DRAWS,
     MIN_FREQUENCIES,
     CascadeLoop,
     PlantResponse,
     cascade_loop,
     inner_controllers,
+    longest_run,
 )
 from tuning.gains import Gains
 from tuning.reference import ReferenceModel
@@ -112,8 +112,7 @@ def certify(
         What is thin.
     """
     thresholds = thresholds or Thresholds()
-    known = np.flatnonzero(plant.coherence > COHERENT)
-    known = _longest_run(known)
+    known = longest_run(np.flatnonzero(plant.coherent()))
 
     def verdict(text: str, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
         return Certificate(text, reason, figures, band, log_sha256, gains.matrices_sha256())
@@ -157,15 +156,6 @@ def certify(
     if phase < thresholds.phase_deg:
         thin.append(f"phase margin {phase:.0f} degrees is below {thresholds.phase_deg:g}")
     return verdict(THIN if thin else CERTIFIED, "; ".join([*thin, assumed]), figures, band)
-
-
-def _longest_run(indices: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Longest stretch of neighbours, single holes forgiven."""
-    if not len(indices):
-        return indices
-    runs = np.split(indices, np.flatnonzero(np.diff(indices) > 2) + 1)
-    longest = max(runs, key=len)
-    return np.arange(longest[0], longest[-1] + 1)
 
 
 class _Normaliser:

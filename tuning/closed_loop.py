@@ -44,8 +44,8 @@ class PlantResponse:
     reach : (K, 2, 2) array
         With X (6, 2) of unit complex normals and E = root X reach, G_i + E_i - G_i E_u and G_o + E_o - G_o E_u are
         as likely as G_i and G_o.
-    coherence : (K,) array
-        Smaller multiple coherence of the two rates with the excitation.
+    coherence : (K, 2) array
+        Multiple coherence of each rate with the excitation.
     Ts : float, s
         Sampling period.
     """
@@ -57,6 +57,16 @@ class PlantResponse:
     reach: Complex
     coherence: Signal
     Ts: float
+
+    def coherent(self) -> NDArray[np.bool_]:
+        """Where the excitation explains both rates, (K,)."""
+        which: NDArray[np.bool_] = (self.coherence > COHERENT).all(axis=1)
+        return which
+
+    def band(self, axis: int) -> tuple[float, float] | None:
+        """Where the excitation explains an axis' rate, rad/s: the longest stretch; None: nowhere."""
+        run = longest_run(np.flatnonzero(self.coherence[:, axis] > COHERENT))
+        return (float(self.omega[run[0]]), float(self.omega[run[-1]])) if len(run) else None
 
     def relative_error(self) -> Signal:
         """Standard deviation of G_o over its size, (K,), Frobenius norms."""
@@ -109,9 +119,18 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float) -> 
         G_o=T_o @ inverse,
         root=_root(found.noise),
         reach=_root(found.error).transpose(0, 2, 1) @ inverse,
-        coherence=found.explained[:, 2:4].min(axis=1),
+        coherence=found.explained[:, 2:4],
         Ts=experiment.Ts,
     )
+
+
+def longest_run(indices: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Longest stretch of neighbours, single holes forgiven."""
+    if not len(indices):
+        return indices
+    runs = np.split(indices, np.flatnonzero(np.diff(indices) > 2) + 1)
+    longest = max(runs, key=len)
+    return np.arange(longest[0], longest[-1] + 1)
 
 
 def _root(matrices: Complex) -> Complex:
@@ -190,9 +209,9 @@ def refine_outer(
     TuningError
         When the response is known well at too few frequencies.
     """
-    use = (plant.coherence > COHERENT) & (plant.relative_error() < ACCURATE)
+    use = plant.coherent() & (plant.relative_error() < ACCURATE)
     if use.sum() < MIN_FREQUENCIES:
-        raise TuningError(f"not excited: only {use.sum()} frequencies of the response are known to 10 %")
+        raise TuningError(f"only {use.sum()} frequencies of the measured response are known to 10 %")
     plant = plant.at(use)
     target = np.stack([model.frequency_response(plant.omega) for model in models], axis=1)[:, :, None] * np.eye(2)
     where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)

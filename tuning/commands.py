@@ -34,6 +34,19 @@ def tune(
         str | None, typer.Option(help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 20,0.4,0.")
     ] = None,
     outer: Annotated[str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY; 10,0.7,0.")] = None,
+    structure: Annotated[
+        str | None,
+        typer.Option(help="Terms of the rate controller: P, PI, PD or PID (the default), F behind for feed-forward."),
+    ] = None,
+    instrument: Annotated[
+        str | None,
+        typer.Option(
+            help="external (lags of the injected moment, the default), u (of the whole moment), model, repeated."
+        ),
+    ] = None,
+    repeat: Annotated[
+        Path | None, typer.Option(help="Log of a second flight of the same experiment: instrument repeated.")
+    ] = None,
     window: Annotated[
         int | None, typer.Option(help="Lags of the instrument, samples; by default from the models.")
     ] = None,
@@ -56,9 +69,12 @@ def tune(
         method=method,
         inner=parse_model(inner) if inner else None,
         outer=parse_model(outer) if outer else None,
+        structure=structure,
+        instrument=instrument or ("repeated" if repeat else None),
         window=window,
     )
-    gains = tune_cascade(read_log(log, load_columns(columns) if columns else None), task)
+    named = load_columns(columns) if columns else None
+    gains = tune_cascade(read_log(log, named), task, repeat=read_log(repeat, named) if repeat else None)
     gains.save(out)
     deviations = gains.provenance["standard_deviation"]
     for warning in gains.provenance["warnings"]:

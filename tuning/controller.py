@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.linalg import schur
 from scipy.signal import lfilter
 
-from tuning.errors import TuningError
+from tuning.errors import NotMinimumPhaseError
 from tuning.gains import MATRICES, Gains, derivative_pole
 
 HOLD_SAMPLES = 25
@@ -218,12 +218,12 @@ def inverse_eigenvalues(Kp: NDArray[np.float64], Ki: NDArray[np.float64], Kff: N
 
     Raises
     ------
-    TuningError
+    NotMinimumPhaseError
         When G_c is singular: the controller has no inverse.
     """
     Gc = Kp + Ts * Ki + Kff
     if np.linalg.cond(Gc) > 1e12:
-        raise TuningError(f"the inner controller has no inverse: Kp + Ts Ki + Kff = {Gc.tolist()} is singular")
+        raise NotMinimumPhaseError(f"the inner controller has no inverse: Kp + Ts Ki + Kff = {Gc.tolist()} is singular")
     return np.linalg.eigvals(np.eye(len(Gc)) - Ts * Ki @ np.linalg.inv(Gc))
 
 
@@ -253,7 +253,7 @@ def rebuild_rate_setpoint(
 
     Raises
     ------
-    TuningError
+    NotMinimumPhaseError
         When the inner controller is not minimum phase, with the eigenvalues; or has no inverse.
     """
     Ts, Ki, Kff = gains.Ts, gains.Ki_i, gains.Kff_i
@@ -261,10 +261,10 @@ def rebuild_rate_setpoint(
     # An integrator that is not used (a zero row of Ki) leaves its state at rest: an eigenvalue of exactly 1.
     at_rest = np.isclose(eigenvalues, 1.0, rtol=0, atol=1e-12)
     if np.any(np.abs(eigenvalues[~at_rest]) >= 1) or (at_rest.any() and np.linalg.matrix_rank(Ki) + at_rest.sum() > 2):
-        raise TuningError(
+        raise NotMinimumPhaseError(
             "the inner controller cannot be run backwards, it is not minimum phase: eigenvalues of I - Ts Ki Gc^-1 are "
-            f"{', '.join(f'{v:.6g}' for v in eigenvalues)}, expected inside the unit circle; Ki_i = {Ki.tolist()} "
-            "should be positive definite: record a longer or stronger excitation, or ask for another inner model"
+            f"{', '.join(f'{v:.6g}' for v in eigenvalues)}, expected inside the unit circle; "
+            f"Ki_i = {Ki.round(6).tolist()} should be positive definite"
         )
     inverse = np.linalg.inv(gains.Kp_i + Ts * Ki + Kff)
     known = u + filtered_derivative(y_i, Ts, gains.derivative_cutoff_hz) @ gains.Kd_i.T - y_i @ Kff.T

@@ -1,233 +1,159 @@
-"""Linear regression with extended instrumental variables: the estimator behind VRFT, (3.28)-(3.31).
-
-u(k) = B x(k) + eps(k) is solved from the correlations of both sides with the instrument
-zeta(k) = [w(k-l); ...; w(k+l)]; the thesis' Kronecker form splits into one small problem for each row of B.
-"""
+"""What of an experiment is free of the loop's noise, and so can serve as instrument."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, lstsq
+from scipy.signal import correlate
 
-from tuning.correlations import autocorrelation, cross_correlation
 from tuning.errors import TuningError
-from tuning.frequency import LocalResponse, local_response
+from tuning.experiment import Experiment
+from tuning.identification import pbsid
 
-#: Diagonal loading of the residual covariance: the instruments at neighbouring lags are almost the same.
-LOADING = 1e-3
-#: Share of the instrument's power below the highest frequency at which the noise is looked at.
-POWER = 0.9999
+AXES = ("roll", "pitch")
+#: Two flights count as one experiment flown twice when their excitations agree to this correlation.
+SAME_EXCITATION = 0.99
 
 Signal = NDArray[np.float64]
+Stretches = list[tuple[slice, list[tuple[int, int]]]]
 
 
 @dataclass(frozen=True, eq=False)
-class Regression:
-    """One regression problem; each list holds one array a segment.
+class Instruments:
+    """What VRFT's instruments are made of.
 
     Attributes
     ----------
-    x : list of (N_s, n_x) arrays
-        Regressors.
-    u : list of (N_s, n_u) arrays
-        What they explain.
-    w : list of (N_s, n_w) arrays
-        External instrument.
-    lags : int, samples
-        l.
-    memory : int, samples
-        How long the residual may remember, for (3.30).
+    external : (N, 2) array
+        External signal; noise is what it does not explain.
+    lagged : (N, 2) array
+        Signal whose lags are the instruments: `external`, or u.
+    name : str
+        Of what is used, for provenance.
+    y_i, y_o : (N, 2) arrays or None, rad/s, rad
+        Outputs with other noise, whose regressors replace the lags; None: lags are used.
     """
 
-    x: list[Signal]
-    u: list[Signal]
-    w: list[Signal]
-    lags: int
-    memory: int
-
-    @property
-    def samples(self) -> int:
-        """Samples in all segments."""
-        return sum(len(x) for x in self.x)
+    external: Signal
+    lagged: Signal
+    name: str
+    y_i: Signal | None = None
+    y_o: Signal | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Solution:
-    """What a regression gives.
-
-    Attributes
-    ----------
-    B : (n_u, n_x) array
-        Coefficients.
-    r_squared : (n_u,) array
-        Share of each u's power that B x explains.
-    least_squares : (n_u, n_x) array
-        The same coefficients without instruments, biased by noise: a large difference is a warning.
-    uncertainty : callable
-        Computes `covariance` and `strength`, which cost more than B: only when they are asked for.
-    """
-
-    B: Signal
-    r_squared: Signal
-    least_squares: Signal
-    uncertainty: Callable[[], tuple[Signal, Signal]]
-
-    @cached_property
-    def _certain(self) -> tuple[Signal, Signal]:
-        return self.uncertainty()
-
-    @property
-    def covariance(self) -> Signal:
-        """Of each row of B, (n_u, n_x, n_x), under repeated noise, the excitation being the same."""
-        return self._certain[0]
-
-    @property
-    def strength(self) -> Signal:
-        """Share of each regressor's power that the instrument explains, (n_x,)."""
-        return self._certain[1]
-
-
-def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: float = 0.0) -> Solution:
-    """Estimate B row by row.
+def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = None) -> Instruments:
+    """Instruments of an experiment.
 
     Parameters
     ----------
-    problem : Regression
-        The data.
-    weight : str
-        ``identity``: least squares on the correlations, (3.28). ``optimal``: (3.30), in two steps.
-    prior : (n_u, n_x) array, optional
-        Coefficients towards which the estimate is pulled.
-    pull : float
-        lambda of the pull, relative to the curvature of each coefficient; 0: none.
-
-    Returns
-    -------
-    Solution
+    experiment : Experiment
+    kind : str
+        ``external``: lags of the external signal. ``u``: lags of u, the thesis' choice; in closed loop it carries
+        fed-back noise. ``model``: the outputs that a model identified by PBSID from the external signal to the outputs
+        gives. ``repeated``: the outputs of a second flight of the same experiment.
+    repeat : Experiment, optional
+        The second flight, row for row the same excitation; see `align`.
 
     Raises
     ------
     TuningError
-        When a regressor is constant, or the instrument does not reach all of them.
+        When there is no external signal, the model is not stable, or the second flight is missing or not wanted.
     """
-    samples = problem.samples
-    scale = np.sqrt(sum((x**2).sum(axis=0) for x in problem.x) / samples)
-    if not (scale > 0).all():
-        raise TuningError("not excited: a measured signal is constant, so its gains cannot be found")
-    x = [signal / scale for signal in problem.x]
-
-    def correlate(signals: list[Signal]) -> Signal:
-        terms = [cross_correlation(w, s, problem.lags) for w, s in zip(problem.w, signals, strict=True)]
-        return np.reshape(np.sum(terms, axis=0), (-1, signals[0].shape[1])) / samples
-
-    S, Q = correlate(x), correlate(problem.u)
-    first, _, rank, _ = lstsq(S, Q)
-    if rank < S.shape[1]:
-        raise TuningError("not excited: the injected signal does not reach every axis, so some gains cannot be found")
-    n_u, n_x = Q.shape[1], S.shape[1]
-    B = np.empty((n_u, n_x))
-    rows: list[tuple[Signal, Signal, Signal]] = []
-    for row in range(n_u):
-        if weight == "optimal":
-            residual = [u[:, [row]] - xs @ first[:, [row]] for u, xs in zip(problem.u, x, strict=True)]
-            factor = cho_factor(_residual_covariance(problem, residual))
-            projected = cho_solve(factor, S)
-        else:
-            factor = None
-            projected = S
-        curvature = S.T @ projected
-        load = pull * np.diag(np.diag(curvature))
-        target = load @ (prior[row] * scale) if prior is not None else 0.0
-        gain = np.linalg.inv(curvature + load)
-        B[row] = gain @ (projected.T @ Q[:, row] + target)
-        misfit = Q[:, row] - S @ B[row]
-        weighted = cho_solve(factor, misfit) if factor is not None else misfit
-        rows.append((gain, projected, weighted))
-    power = sum((u**2).sum(axis=0) for u in problem.u)
-    left = sum(((u - xs @ B.T) ** 2).sum(axis=0) for u, xs in zip(problem.u, x, strict=True))
-    plain = lstsq(np.vstack(x), np.vstack(problem.u))[0].T
-
-    def uncertainty() -> tuple[Signal, Signal]:
-        noise = _noise(problem, x)
-        covariance = np.empty((n_u, n_x, n_x))
-        for row, (gain, projected, weighted) in enumerate(rows):
-            covariance[row] = gain @ _score_covariance(problem, noise, projected, weighted, B[row], row) @ gain.T
-        explained = noise.explained[:, n_u:]
-        spectrum = np.real(np.diagonal(noise.noise, axis1=1, axis2=2))[:, n_u:] / (1 - explained + 1e-12)
-        return covariance / np.outer(scale, scale), (explained * spectrum).sum(axis=0) / spectrum.sum(axis=0)
-
-    return Solution(B / scale, 1 - left / power, plain / scale, uncertainty)
+    external, name = external_signal(experiment)
+    if (kind == "repeated") != (repeat is not None):
+        raise TuningError(
+            f"instrument {kind!r} {'with' if repeat else 'without'} a second log: a second flight of the same "
+            "experiment goes with instrument 'repeated', and only with it"
+        )
+    if repeat is not None:
+        return Instruments(external, external, f"second experiment {repeat.source}", repeat.y_i, repeat.y_o)
+    if kind == "model":
+        y = np.hstack([experiment.y_i, experiment.y_o])
+        model = pbsid(external, y, experiment.Ts, segments=experiment.segments)
+        simulated = np.zeros_like(y)
+        for start, stop in experiment.segments:
+            simulated[start:stop] = model.simulate(external[start:stop])
+        name = f"PBSID model of order {model.order}"
+        return Instruments(external, external, name, simulated[:, :2], simulated[:, 2:])
+    if kind == "u":
+        return Instruments(external, experiment.u, "u")
+    return Instruments(external, external, name)
 
 
-def _residual_covariance(problem: Regression, residual: list[Signal]) -> Signal:
-    """Newey-West covariance of zeta(k) eps(k), Gamma of (3.30), for one row of the controller.
+def external_signal(experiment: Experiment) -> tuple[Signal, str]:
+    """The external signal, (N, 2), and its name: the injected moment, else the attitude set-point (rad).
 
-    The residual is independent of the external instrument, so the covariance at lag h is the product of
-    their autocorrelations and Gamma is block Toeplitz: sum over h of R_eps(h) R_w(h + tau_1 - tau_2).
+    Raises
+    ------
+    TuningError
+        When neither is logged and moves.
     """
-    lags, memory, samples = problem.lags, problem.memory, problem.samples
-    taper = 1 - np.abs(np.arange(-memory, memory + 1)) / (memory + 1)
-    R_eps = np.sum([autocorrelation(e, memory) for e in residual], axis=0)[:, 0, 0] / samples * taper
-    R_w: Signal = np.sum([autocorrelation(w, 2 * lags + memory) for w in problem.w], axis=0) / samples
-    n_w = R_w.shape[1]
-    blocks = np.empty((4 * lags + 1, n_w, n_w))
-    for i in range(n_w):
-        for j in range(n_w):
-            blocks[:, i, j] = np.convolve(R_w[:, i, j], R_eps[::-1], "valid")
-    difference = np.arange(2 * lags + 1)[:, None] - np.arange(2 * lags + 1)[None, :]
-    gamma = blocks[difference + 2 * lags].transpose(0, 2, 1, 3).reshape((2 * lags + 1) * n_w, -1)
-    gamma = (gamma + gamma.T) / 2
-    loaded: Signal = gamma + LOADING * np.trace(gamma) / len(gamma) * np.eye(len(gamma))
-    return loaded
+    for name in ("u_bar", "r_o"):
+        signal = getattr(experiment, name)
+        if signal is not None and any(np.ptp(signal[start:stop]) > 0 for start, stop in experiment.segments):
+            return signal, name
+    raise TuningError(
+        f"{experiment.source}: no excitation: neither an injected moment nor a moving attitude set-point is logged; "
+        "fly an experiment with a moment injected on roll, then on pitch"
+    )
 
 
-def _noise(problem: Regression, x: list[Signal]) -> LocalResponse:
-    """Spectrum of what the instrument does not explain of [u, x]; frequencies are in rad/sample."""
-    lengths = np.cumsum([0, *(len(signal) for signal in x)])
-    segments = [(int(a), int(b)) for a, b in itertools.pairwise(lengths)]
-    w = np.vstack(problem.w)
-    power = np.cumsum((np.abs(np.fft.rfft(w, axis=0)) ** 2).sum(axis=1))
-    upper = np.pi * (np.searchsorted(power, POWER * power[-1]) + 1) / len(power)
-    # Never so narrow that only a handful of frequencies are left.
-    upper = min(np.pi, max(upper, 60 * np.pi / lengths[-1]))
-    return local_response(w, np.hstack([np.vstack(problem.u), np.vstack(x)]), 1.0, segments, upper, centres=60)
+def excited_stretches(experiment: Experiment, external: Signal, method: str) -> Stretches:
+    """Which axes are tuned together, and on which samples: SISO uses an axis' own part of the flight.
 
-
-def _score_covariance(
-    problem: Regression, noise: LocalResponse, projected: Signal, weighted: Signal, b: Signal, row: int
-) -> Signal:
-    """Covariance of what noise adds to S' W^-1 (q - S b), (n_x, n_x).
-
-    Noise enters as (1/N) sum of z(k) eps(k) + g(k) x_n(k): eps and x_n are the noise in the residual and in the
-    regressors, z = S' W^-1 zeta and g = zeta' W^-1 (q - S b) filters of the external signal. By Parseval its
-    covariance is a sum over frequency of their spectra.
+    Raises
+    ------
+    TuningError
+        When an axis is not excited.
     """
-    n_x, n_u = len(b), problem.u[0].shape[1]
-    taps = np.column_stack([projected, weighted]).reshape(2 * problem.lags + 1, -1, n_x + 1)
-    # Noise of [eps, x] from that of [u, x].
-    mix = np.zeros((1 + n_x, n_u + n_x))
-    mix[0, row], mix[0, n_u:], mix[1:, n_u:] = 1.0, -b, np.eye(n_x)
-    spectra = mix @ noise.noise @ mix.T
-    total = np.zeros((n_x, n_x))
-    for w in problem.w:
-        size = len(w)
-        frequencies = 2 * np.pi * np.arange(size // 2 + 1) / size
-        W = np.fft.rfft(w, axis=0)
-        edges = np.searchsorted(frequencies, (noise.omega[1:] + noise.omega[:-1]) / 2)
-        groups = np.split(np.arange(len(frequencies)), edges)
-        shift = np.exp(1j * np.outer(np.arange(-problem.lags, problem.lags + 1), noise.omega))
-        response = np.einsum("taj,tk->kaj", taps, shift)  # of the filters, at the centres
-        for k, group in enumerate(groups):
-            C = W[group] @ response[k]  # (bins, n_x + 1): z, then g
-            z, g = C[:, :n_x], C[:, n_x:]
-            phi = spectra[k]
-            cross = (z.T @ g.conj()) @ phi[0:1, 1:]
-            block = (z.T @ z.conj()) * phi[0, 0] + cross + cross.conj().T + np.sum(np.abs(g) ** 2) * phi[1:, 1:]
-            total += 2 * np.real(block) / size
-    return total / problem.samples**2
+    stretches: Stretches = []
+    for axis in range(2):
+        active: list[tuple[int, int]] = []
+        for start, stop in experiment.segments:
+            signal = external[start:stop, axis]
+            moving = start + np.flatnonzero(signal if np.ptp(signal) > 0 else 0 * signal)
+            if len(moving):
+                active.append((int(moving[0]), int(moving[-1]) + 1))
+        if not active:
+            raise TuningError(f"{experiment.source}: not excited on {AXES[axis]}; inject a moment on that axis too")
+        stretches.append((slice(axis, axis + 1), active))
+    return stretches if method == "siso" else [(slice(0, 2), list(experiment.segments))]
+
+
+def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment]:
+    """Two flights of the same experiment, cut to the rows that both have, so that row k of both has one excitation.
+
+    Raises
+    ------
+    TuningError
+        When their periods or their excitations differ.
+    """
+    one, other = external_signal(first)[0], external_signal(second)[0]
+    if abs(first.Ts / second.Ts - 1) > 1e-6:
+        raise TuningError(f"{second.source}: sampled every {second.Ts:g} s, {first.source} every {first.Ts:g} s")
+    likeness = sum(correlate(one[:, i], other[:, i], method="fft") for i in range(2))
+    shift = int(np.argmax(likeness)) - (len(other) - 1)
+    size = np.sqrt(np.sum(one**2) * np.sum(other**2))
+    if np.max(likeness) < SAME_EXCITATION * size:
+        raise TuningError(
+            f"{second.source}: its excitation is not that of {first.source} (correlation "
+            f"{np.max(likeness) / size:.2f}); give a second flight with the same amplitude, hold times and seed"
+        )
+    start, stop = max(shift, 0), min(len(one), len(other) + shift)
+    shared = [
+        (max(a, c + shift) - start, min(b, d + shift) - start)
+        for a, b in first.segments
+        for c, d in second.segments
+        if max(a, c + shift) < min(b, d + shift)
+    ]
+    return _rows(first, start, stop, shared), _rows(second, start - shift, stop - shift, shared)
+
+
+def _rows(experiment: Experiment, start: int, stop: int, segments: Sequence[tuple[int, int]]) -> Experiment:
+    values = {f.name: getattr(experiment, f.name) for f in fields(experiment)}
+    cut: dict[str, Any] = {name: value[start:stop] for name, value in values.items() if isinstance(value, np.ndarray)}
+    return replace(experiment, **cut, segments=tuple(segments))

@@ -53,6 +53,25 @@ class ReferenceModel:
         filtered: NDArray[np.float64] = lfilter(self.taps, self.den, signal, axis=0)
         return filtered
 
+    def over(self, other: ReferenceModel) -> ReferenceModel:
+        """Times the inverse of another, as one proper and stable filter.
+
+        Raises
+        ------
+        TuningError
+            When the other answers later than this one, or its inverse is not stable.
+        """
+        lag = len(self.den) - len(self.num) + self.delay - (len(other.den) - len(other.num) + other.delay)
+        if lag < 0 or np.any(np.abs(np.roots(other.num)) >= 1):
+            raise TuningError(
+                f"reference model {self.label} over {other.label}: the quotient is not a proper, stable filter; ask "
+                "the first for as much delay as the second has"
+            )
+        num, den = np.polymul(self.num, other.den), np.polymul(self.den, other.num)
+        delay = lag - (len(den) - len(num))
+        label = f"({self.label}) over ({other.label})"
+        return ReferenceModel(tuple(num / den[0]), tuple(den / den[0]), delay, self.Ts, label)
+
     def frequency_response(self, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Value at z = exp(j omega Ts); omega in rad/s."""
         z = np.exp(1j * np.asarray(omega) * self.Ts)

@@ -45,9 +45,16 @@ class TuningSpec(_Table):
     Attributes
     ----------
     method : str
-        ``mimo``: full matrices. ``siso``: each axis by itself.
+        ``mimo``: full matrices. ``siso``: each axis by itself, with the optimal prefilter (3.12).
     inner, outer : tuple of (omega rad/s, damping, delay samples)
         Reference models of the rate and the attitude loop: one for both axes, or one each.
+    structure : str
+        Terms of the rate controller: letters of ``PIDF`` in that order, P among them. The attitude controller is P.
+    instrument : str
+        ``external``: lags of the injected moment, or of the set-point. ``u``: lags of the moment that acted, the
+        thesis' choice. ``model``, ``repeated``: see `tuning.instruments.instruments`.
+    trim : bool
+        Estimate a constant (trim, initial integrator) on each stretch; the thesis does not.
     window : int or None, samples
         Lags of the instrument; None: from the reference model.
     weight : str
@@ -71,6 +78,9 @@ class TuningSpec(_Table):
     method: Literal["mimo", "siso"] = "mimo"
     inner: tuple[Model, Model] = ((20.0, 0.4, 0), (20.0, 0.4, 0))
     outer: tuple[Model, Model] = ((10.0, 0.7, 0), (10.0, 0.7, 0))
+    structure: Annotated[str, Field(pattern="^PI?D?F?$")] = "PID"
+    instrument: Literal["external", "u", "model", "repeated"] = "external"
+    trim: bool = True
     window: Annotated[int, Field(ge=1, le=500)] | None = None
     weight: Literal["identity", "optimal"] = "optimal"
     pull: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from tuning.controller import filtered_derivative
 from tuning.errors import TuningError
-from tuning.instruments import Regression, Solution, solve
 from tuning.reference import ReferenceModel
+from tuning.regression import Regression, Solution, solve
 
 TERMS = "PIDF"
 Signal = NDArray[np.float64]
@@ -96,6 +96,27 @@ def filter_by(signal: Signal, factors: Sequence[ReferenceModel]) -> Signal:
     return signal
 
 
+def filter_by_inverse(signal: Signal, factors: Sequence[ReferenceModel], models: Sequence[ReferenceModel]) -> Signal:
+    """Filter by l and M^-1, as the proper filters l m_j^-1, one a column.
+
+    Parameters
+    ----------
+    signal : (N, n) array
+    factors : sequence of ReferenceModel
+        Whose product is l.
+    models : sequence of n ReferenceModel
+        M.
+
+    Raises
+    ------
+    TuningError
+        When l answers faster than M, or M cannot be inverted.
+    """
+    filtered = filter_by(signal, factors[1:])
+    columns = [factors[0].over(model).response(filtered[:, j]) for j, model in enumerate(models)]
+    return np.column_stack(columns)
+
+
 def regressors(terms: str, e_l: Signal, y_l: Signal, r_l: Signal, Ts: float, derivative_cutoff_hz: float) -> Signal:
     """The regressor x(k) of the flown difference equation, one column a gain: P, I, D, F as `terms` has them.
 
@@ -135,6 +156,11 @@ def vrft(
     derivative_cutoff_hz: float = 0.0,
     settling: int = 0,
     weight: str = "optimal",
+    trim: bool = True,
+    external: Signal | None = None,
+    repeated: Signal | None = None,
+    prefilter: Callable[[Signal], Signal] | None = None,
+    inverse: Sequence[ReferenceModel] | None = None,
     prior: Mapping[str, Signal] | None = None,
     pull: float = 0.0,
 ) -> LoopEstimate:
@@ -147,7 +173,8 @@ def vrft(
     y : (N, n_y) array
         Output of the plant.
     instrument : (N, n_w) array
-        External signal: the injected excitation, or the set-point.
+        Signal whose lags are the instruments: an external one (the injected excitation, or the set-point), or `u`
+        itself, the thesis' choice, which in closed loop carries fed-back noise.
     models : sequence of n_y ReferenceModel
         Wanted complementary sensitivity of each output.
     terms : str
@@ -163,7 +190,17 @@ def vrft(
         Further samples to drop at the start of each segment.
     weight : str
         ``identity``: least squares on the correlations, (3.28). ``optimal``: (3.30), in two steps.
-
+    trim : bool
+        False: no constant, as the thesis has it; right only for data without offsets.
+    external : (N, n_e) array, optional
+        External signal that noise is told from, where `instrument` is not external.
+    repeated : (N, n_y) array, optional
+        y with other noise, of a second experiment (3.13) or simulated by an identified model: its regressors are
+        the instruments, in place of lags; `instrument` then is what noise is told from.
+    prefilter : callable, optional
+        Filter of every signal before l, such as `tuning.siso.prefilter`.
+    inverse : sequence of n_u ReferenceModel, optional
+        M_i of an inner loop: `u` holds that loop's outputs and M_i^-1 u is meant.
     prior : mapping, optional
         Term -> (n_u, n_y) gains towards which the estimate is pulled.
     pull : float
@@ -178,7 +215,7 @@ def vrft(
     TuningError
         When a segment is too short, a model's period differs, or the regressors are not excited.
     """
-    letters = [term for term in TERMS if term in terms]
+    letters = "".join(term for term in TERMS if term in terms)
     if not letters or len(letters) != len(terms) or weight not in ("optimal", "identity"):
         raise TuningError(f"terms {terms!r}, weight {weight!r}: expected letters of {TERMS}, and optimal or identity")
     if len(models) != y.shape[1]:
@@ -186,25 +223,46 @@ def vrft(
     lags = default_window(models) if window is None else window
     Ts = models[0].Ts
     drop = settling + sum(model.settling_samples() for model in dict.fromkeys(models))
-    xs, us, ws = [], [], []
+    needed = drop + 4 * lags
+    shaped = prefilter or (lambda signal: signal)
+
+    def regressor(output: Signal) -> tuple[Signal, list[ReferenceModel]]:
+        e_l, r_l, y_l, factors = virtual_signals(shaped(output), models)
+        return regressors(letters, e_l, y_l, r_l, Ts, derivative_cutoff_hz)[drop:], factors
+
+    xs: list[Signal] = []
+    us: list[Signal] = []
+    ws: list[Signal] = []
+    vs: list[Signal] = []
     for start, stop in segments or [(0, len(u))]:
-        if stop - start < drop + 4 * lags:
+        if stop - start < needed:
             continue
-        e_l, r_l, y_l, factors = virtual_signals(y[start:stop], models)
-        x = regressors("".join(letters), e_l, y_l, r_l, Ts, derivative_cutoff_hz)[drop:]
-        u_l = filter_by(u[start:stop], factors)[drop:]
-        # The constant (trim, initial integrator), filtered like the rest, is regressor and instrument at once:
-        # to take its part off all others is the same as to estimate it.
-        constant = filter_by(np.ones((stop - start, 1)), factors)[drop:]
-        xs.append(_without(constant, x))
-        us.append(_without(constant, u_l))
-        ws.append(filter_by(instrument[start:stop], factors)[drop:])
+        part = slice(start, stop)
+        x, factors = regressor(y[part])
+        u_l = shaped(u[part])
+        u_l = (filter_by_inverse(u_l, factors, inverse) if inverse else filter_by(u_l, factors))[drop:]
+        w = filter_by(shaped(instrument[part]), factors)[drop:]
+        v = w if external is None else filter_by(shaped(external[part]), factors)[drop:]
+        if repeated is not None:
+            w = regressor(repeated[part])[0]
+            w /= np.sqrt(np.einsum("ij,ij->j", w, w))  # their units differ; nothing else depends on it
+        if trim:
+            # The constant (trim, initial integrator), filtered like the rest, is regressor and instrument at once:
+            # to take its part off all others is the same as to estimate it.
+            constant = filter_by(np.ones((stop - start, 1)), factors)[drop:]
+            _take_off(constant, x)
+            _take_off(constant, u_l)
+            if repeated is not None:
+                _take_off(constant, w)
+        for signals, signal in ((xs, x), (us, u_l), (ws, w), (vs, v)):
+            signals.append(signal)
     if not xs:
         raise TuningError(
-            f"too short: no stretch without a gap is longer than {(drop + 4 * lags) * Ts:.2f} s, which these reference "
+            f"too short: no stretch without a gap is longer than {needed * Ts:.2f} s, which these reference "
             "models need; record a longer flight, or ask for faster models"
         )
-    problem = Regression(xs, us, ws, lags, memory=max(lags, 2 * drop))
+    lags = lags if repeated is None else 0
+    problem = Regression(xs, us, ws, lags, memory=max(lags, 2 * drop), external=vs)
     solution = solve(problem, weight, None if prior is None else np.hstack([prior[t] for t in letters]), pull)
     n_y = y.shape[1]
     split = {term: slice(i * n_y, (i + 1) * n_y) for i, term in enumerate(letters)}
@@ -216,7 +274,6 @@ def vrft(
     )
 
 
-def _without(constant: Signal, signal: Signal) -> Signal:
-    """`signal` (N, n) less its projection on `constant` (N, 1)."""
-    rest: Signal = signal - constant @ (constant.T @ signal) / (constant.T @ constant)
-    return rest
+def _take_off(constant: Signal, signal: Signal) -> None:
+    """Take its projection on `constant` (N, 1) off `signal` (N, n), in place."""
+    signal -= constant @ (constant.T @ signal / (constant.T @ constant))

@@ -141,7 +141,10 @@ def reproduce_numerical_example(out: Path) -> Reproduction:
     u = excitation(2 * half, "in turn", np.random.default_rng(0))
     u, y = task.run(None, np.zeros_like(u), u, np.random.default_rng(0))
     mimo = LoopController(vrft(u, y, u, task.models, "PI", weight="identity").gains, task.plant.Ts)
-    axes = [siso_vrft(u[s, i], y[s, i], task.model, "PI") for i, s in enumerate((slice(half), slice(half, None)))]
+    axes = []
+    for i, part in enumerate((slice(half), slice(half, None))):
+        u_i, y_i = u[part, i : i + 1], y[part, i : i + 1]
+        axes.append(siso_vrft(u_i, y_i, u_i, task.model, "PI", repeated=y_i, weight="identity"))
     diagonal = {term: np.diag([axis.gain(term).item() for axis in axes]) for term in "PI"}
     found = {"MIMO": mimo, "SISO": LoopController(diagonal, task.plant.Ts)}
     shown = _beside(found, _printed(task, "table_5_3"), "Table 5.3")

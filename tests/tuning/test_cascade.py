@@ -14,7 +14,7 @@ from tests.tuning.test_certificate import experiment
 from tuning.cascade import tune
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
-from tuning.gates import examine
+from tuning.gates import examine_saturation
 from tuning.reference import second_order
 from tuning.spec import load_spec
 
@@ -125,6 +125,6 @@ def test_a_saturated_flight_is_refused_and_an_occasional_limit_warned_about(log)
     often[::3] = limit + 0.01
     sometimes[::20] = limit + 0.01
     with pytest.raises(TuningError, match="saturated: the roll moment is at its limit for 33%"):
-        examine(dataclasses.replace(log, u=often), [])
-    assert len(examine(dataclasses.replace(log, u=sometimes), [])) == 2
-    assert examine(log, []) == []
+        examine_saturation(dataclasses.replace(log, u=often))
+    assert len(examine_saturation(dataclasses.replace(log, u=sometimes))) == 2
+    assert examine_saturation(log) == []

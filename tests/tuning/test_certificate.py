@@ -60,7 +60,7 @@ class Linear:
         z = np.exp(1j * omega * TS)[:, None, None]
         G = np.linalg.solve(z * np.eye(6) - self.A, np.broadcast_to(self.B, (len(omega), 6, 2))) / z
         empty = np.zeros((len(omega), 6, 6)), np.zeros((len(omega), 2, 2))
-        return PlantResponse(omega, G[:, :2], G[:, 2:4], *empty, np.ones(len(omega)), TS)
+        return PlantResponse(omega, G[:, :2], G[:, 2:4], *empty, np.ones((len(omega), 2)), TS)
 
     def peak(self, gains):
         loop = cascade_loop(gains, self.response(np.linspace(0.5, 780, 2000)))
