@@ -18,25 +18,12 @@ from sitl.autopilot import Autopilot
 from sitl.loop import fly
 from sitl.mavlink.host import Host, plant_process
 from sitl.scenario import doublet, excitation_flight
-from sitl.studies.benchmarks import lv100
-from sitl.studies.reproduce import gain_spread
-from tuning.cascade import tune
+from tests.bench_tuning import best, tuning_rows
 from tuning.controller import Controller
 from tuning.logs.reader import read_log
 from tuning.output import print_table
-from tuning.spec import load_spec
 
 TS = 0.004
-
-
-def best(call: Callable[[], object], repeats: int = 5) -> float:
-    """Shortest of several runs, s."""
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        call()
-        times.append(time.perf_counter() - begin)
-    return min(times)
 
 
 def command(*arguments: str) -> Callable[[], object]:
@@ -88,16 +75,7 @@ def main() -> None:
             ["one step of the controller, Python reference", f"{reference * 1e6:.0f} us", f"{reference / native:.0f} x"]
         )
 
-        experiment = read_log(folder / "demo" / "flight.ulg")
-        identity = best(lambda: tune(experiment, load_spec(weight="identity")))
-        rows.append(["tune the cascade, N = 10^4, least squares", f"{identity * 1e3:.0f} ms", ""])
-        optimal = best(lambda: tune(experiment))
-        rows.append(
-            ["tune the cascade, N = 10^4, two-step weight", f"{optimal * 1e3:.0f} ms", f"{optimal / identity:.1f} x"]
-        )
-        task_lv100 = lv100()
-        spread = best(lambda: [gain_spread(task_lv100, N, 500, 0) for N in (1000, 10_000)], 1)
-        rows.append(["1,000 LV100 tunings of Table 5.2, simulation included", f"{spread:.1f} s", "at most 10 s"])
+        rows += tuning_rows(read_log(folder / "demo" / "flight.ulg"))
     print_table("mimopilot bench", ["what", "figure", "beside"], rows)
 
 

@@ -60,8 +60,7 @@ class PlantResponse:
 
     def coherent(self) -> NDArray[np.bool_]:
         """Where the excitation explains both rates, (K,)."""
-        which: NDArray[np.bool_] = (self.coherence > COHERENT).all(axis=1)
-        return which
+        return np.asarray(np.all(self.coherence > COHERENT, axis=1))
 
     def band(self, axis: int) -> tuple[float, float] | None:
         """Where the excitation explains an axis' rate, rad/s: the longest stretch; None: nowhere."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,7 @@ class ReferenceModel:
         return int(np.flatnonzero(transient > fraction * transient.max())[-1]) + 1 + self.delay
 
 
+@lru_cache(maxsize=256)
 def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceModel:
     """Zero-order-hold discretisation of omega^2/(s^2 + 2 zeta omega s + omega^2), times z^-delay.
 
