@@ -1,7 +1,8 @@
 """The thesis' pseudo-code of the cascade, word for word: Kronecker products, one sample after the other.
 
-It is the oracle of the fast estimator, and what the benchmark compares its time with. Two departures, as in
-(A.24)-(A.38) corrected: phi transposed in steps 3 and 9, and + Kd on y in the inverse controller, since D is subtracted.
+It is the oracle of the fast estimator, and what the benchmark compares its time with. Two departures from
+its print: phi transposed in steps 3 and 9, and + Kd on y in the inverse controller, since D is
+subtracted.
 """
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""VRFT of the cascade by itself: its oracle, the thesis' choices, other instruments, and what happens when Ki is no good."""
+"""VRFT of the cascade by itself: its oracle, the thesis' choices, other instruments, its fall-back."""
 
 import dataclasses
 
@@ -66,7 +66,7 @@ def test_noise_moves_what_every_instrument_gives_by_no_more_than_its_error(noisy
 
 
 def test_the_constant_takes_a_trim_moment_off_and_without_it_the_gains_are_wrong(log):
-    trimmed = dataclasses.replace(log, u=log.u + [0.05, -0.03])
+    trimmed = dataclasses.replace(log, u=log.u + np.array([0.05, -0.03]))
     clean = estimate(log, load_spec()).gains
     assert estimate(trimmed, load_spec()).gains.Ki_i == pytest.approx(clean.Ki_i, abs=1e-9)
     without = estimate(trimmed, load_spec(trim=False)).gains
