@@ -76,6 +76,8 @@ class Airframe(_Table):
         See `sitl.allocation`.
     computing_delay : int, samples
         Whole control periods between a measurement and the motor command made from it.
+    gyro_cutoff_hz : float, Hz
+        Of the second-order low-pass that the measured rates pass; 0: none.
     gains : str
         The gains file that it flies under until tuned, beside the TOML file.
     motors, rotors, noise, point_masses
@@ -90,6 +92,7 @@ class Airframe(_Table):
     drag: NotNegative
     airmode: bool
     computing_delay: Annotated[int, Field(ge=0, le=50)]
+    gyro_cutoff_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     gains: str
     motors: Motors
     rotors: Annotated[tuple[Rotor, ...], Field(min_length=4, max_length=16)]

@@ -149,5 +149,6 @@ def check_moment_scale(airframe: Airframe, gains: Gains) -> None:
     if not np.allclose(gains.moment_scale, scale, rtol=0.01, atol=0):
         raise SitlError(
             f"moment_scale: the gains are for {', '.join(f'{v:.4g}' for v in gains.moment_scale)} N m per unit, "
-            f"{airframe.name} has {', '.join(f'{v:.4g}' for v in scale)}; tune on a log of this vehicle"
+            f"{airframe.name} has {', '.join(f'{v:.4g}' for v in scale)}; tune on a log of this vehicle, or "
+            "convert them (mimopilot convert) if they are for this vehicle under another allocator"
         )

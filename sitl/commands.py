@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 AirframeArgument = Annotated[
-    str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, or a TOML file.")
+    str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file.")
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
@@ -36,6 +36,22 @@ def register(app: typer.Typer) -> None:
         epilog="Example: mimopilot sitl adam0 --gains my.gains.toml, then mavproxy.py --master=udp:127.0.0.1:14550"
     )(sitl)
     app.command(epilog="Example: mimopilot plant adam0 --port 4560")(plant)
+    app.command(epilog="Example: mimopilot convert px4.gains.toml px4_sih --out bench.gains.toml")(convert)
+
+
+def convert(
+    gains: Annotated[Path, typer.Argument(help="Gains file of this vehicle, made with another allocator.")],
+    airframe: Annotated[str, typer.Argument(help="Airframe whose allocator they are wanted for.")],
+    out: Annotated[Path, typer.Option(help="Where the converted gains are written: FILE.gains.toml.")],
+) -> None:
+    """Bring gains into the unit of moment of an airframe's allocator: the moment in N m stays the same."""
+    from sitl.airframe import load_airframe
+    from tuning.gains import load_gains
+
+    loaded, scale = load_gains(gains), load_airframe(airframe).airframe.moment_scale()
+    loaded.with_moment_scale(scale).save(out)
+    before, after = (", ".join(f"{value:.4g}" for value in triple) for triple in (loaded.moment_scale or (), scale))
+    print(f"{out}: one unit of moment stood for {before} N m, now for {after} N m (roll, pitch, yaw)")
 
 
 def _load(airframe: str, gains: Path | None) -> tuple[Any, Any]:

@@ -13,7 +13,7 @@ from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.compiled import compiled
 from sitl.plant import STEP, advance, hover_state
 from sitl.scenario import Scenario
-from sitl.sensors import NOISES, SIZE, euler_angles, measure
+from sitl.sensors import NOISES, SIZE, euler_angles, low_pass, measure
 
 CRASH_ANGLE = np.radians(60.0)
 CRASH_SECONDS = 0.3
@@ -57,12 +57,12 @@ class Flight:
 
 
 @compiled
-def _fly(plant, state, steps, step, queue, deviations, noise, autopilot, record, truth, work):  # type: ignore[no-untyped-def]
+def _fly(plant, state, steps, step, queue, sensors, noise, autopilot, record, truth, work):  # type: ignore[no-untyped-def]
     step_address, controller, controls, outputs, allocation, hover, altitude = autopilot
     measurement = np.zeros(SIZE)
     delay = queue.shape[0]
     for k in range(record.shape[0]):
-        measure(state, noise[k], deviations[0], deviations[1], measurement)
+        measure(state, noise[k], sensors[0], sensors[1], sensors[2], sensors[3], measurement)
         row, true = record[k], truth[k]
         tick(step_address, controller, controls, outputs, allocation, hover, altitude, measurement, row)
         roll, pitch, yaw = euler_angles(state[6], state[7], state[8], state[9])
@@ -102,7 +102,8 @@ class Simulator:
         self.queue = np.full((airframe.computing_delay, RECORD["commands"].shape[0]), hover, np.float32)
         self.generator = np.random.default_rng(seed)
         scale = 1.0 if noise else 0.0
-        self.deviations = (scale * airframe.noise.angle, scale * airframe.noise.rate)
+        gyro = low_pass(airframe.gyro_cutoff_hz, Ts)
+        self.sensors = (scale * airframe.noise.angle, scale * airframe.noise.rate, gyro, np.zeros((2, 3)))
         self.work = np.zeros((6, len(self.state)))
 
     def noise(self, samples: int) -> NDArray[np.float64]:
@@ -136,7 +137,7 @@ def fly(airframe: Airframe, autopilot: Autopilot, scenario: Scenario, seed: int 
         simulator.steps,
         simulator.step,
         simulator.queue,
-        simulator.deviations,
+        simulator.sensors,
         simulator.noise(len(record)),
         autopilot.arguments(),
         record,

@@ -8,6 +8,8 @@ HIL_STATE_QUATERNION message carries. The in-process loop rounds the same way, s
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter
 
 from sitl.compiled import compiled
 
@@ -15,9 +17,33 @@ SIZE = 9
 NOISES = 6
 
 
+def low_pass(cutoff_hz: float, Ts: float) -> NDArray[np.float64]:
+    """The gyro's filter, a second-order Butterworth low-pass as flight stacks have it.
+
+    Parameters
+    ----------
+    cutoff_hz : float, Hz
+        0: none.
+    Ts : float, s
+        Its period.
+
+    Returns
+    -------
+    (5,) array
+        b0, b1, b2, a1, a2.
+    """
+    if cutoff_hz == 0:
+        return np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+    b, a = butter(2, cutoff_hz, fs=1 / Ts)
+    return np.concatenate([b, a[1:]]).astype(np.float64)
+
+
 @compiled
-def measure(state, noise, angle_deviation, rate_deviation, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (9,) from the true state and six standard normal numbers (angles, then rates)."""
+def measure(state, noise, angle_deviation, rate_deviation, gyro, memory, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (9,) from the true state and six standard normal numbers (angles, then rates).
+
+    The rates pass the filter `gyro` (5,), whose `memory` (2, 3) is carried on.
+    """
     w, x, y, z = state[6], state[7], state[8], state[9]
     a, b, c = 0.5 * angle_deviation * noise[0], 0.5 * angle_deviation * noise[1], 0.5 * angle_deviation * noise[2]
     # A small rotation about the body axes, 1 + (a, b, c), then back to length one.
@@ -31,7 +57,11 @@ def measure(state, noise, angle_deviation, rate_deviation, out):  # type: ignore
         np.float32(qz * scale),
     )
     for i in range(3):
-        out[4 + i] = np.float32(state[10 + i] + rate_deviation * noise[3 + i])
+        rate = state[10 + i] + rate_deviation * noise[3 + i]
+        filtered = gyro[0] * rate + memory[0, i]
+        memory[0, i] = gyro[1] * rate - gyro[3] * filtered + memory[1, i]
+        memory[1, i] = gyro[2] * rate - gyro[4] * filtered
+        out[4 + i] = np.float32(filtered)
     out[7] = np.round(-1000.0 * state[2])
     out[8] = np.round(-100.0 * state[5])
 

@@ -225,7 +225,8 @@ def tune(
     outer_models = spec.models("outer", experiment.Ts)
     if spec.refine:
         try:
-            gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full=spec.method == "mimo")
+            full = spec.method == "mimo"
+            gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full, spec.doublet_s)
         except TuningError as error:
             warnings.append(f"the attitude gains are left as VRFT gives them: {error}")
     certificate = certify(gains, plant, spec.models("inner", experiment.Ts), outer_models, experiment.sha256)

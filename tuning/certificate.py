@@ -26,7 +26,7 @@ from tuning.closed_loop import (
 from tuning.gains import Gains
 from tuning.reference import ReferenceModel
 
-#: Above the band sigma_max(G) sup sigma_max(K) may be at most this.
+#: Above the band the rate loop's gain may be at most this, if the plant falls like an integrator from its end on.
 HIGH_FREQUENCY_LOOP = 0.5
 
 CERTIFIED = "certified"
@@ -119,8 +119,7 @@ def certify(
 
     if len(known) < MIN_FREQUENCIES:
         return verdict(NOT_CERTIFIED, "the excitation reaches fewer than 8 frequencies", {}, (0.0, 0.0))
-    gains_above = _controller_gain_above(gains, plant.omega[known])
-    small = np.linalg.norm(plant.G_i[known], ord=2, axis=(1, 2)) * gains_above <= HIGH_FREQUENCY_LOOP
+    small = _loop_above(gains, plant.at(known)) <= HIGH_FREQUENCY_LOOP
     # Where the loop is small for good nothing more has to be known: the noisy end of the band is left out.
     settled = len(known) - int(np.argmin(small[::-1])) if not small.all() else 1
     known = known[: max(settled + 1, MIN_FREQUENCIES)]
@@ -146,8 +145,8 @@ def certify(
         reason = f"too close to the limit to tell: {doubtful} of {DRAWS} plants that the log allows are unstable"
         return verdict(NOT_CERTIFIED, reason, figures, band)
     assumed = (
-        f"assumed: above {band[1]:.0f} rad/s the plant's gain does not grow; below {band[0]:.1f} rad/s the integral "
-        "term acts as there"
+        f"assumed: above {band[1]:.0f} rad/s the plant falls at least like an integrator; "
+        f"below {band[0]:.1f} rad/s the integral term acts as there"
     )
     thin = []
     if figures["Ms"] + figures["Ms_error"] > thresholds.Ms:
@@ -200,8 +199,7 @@ def _turn(f: Complex) -> float:
 
 def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
     """Why nothing can be said outside of the band; empty when the assumptions hold."""
-    K = _controller_gain_above(gains, plant.omega[-1:])[0]
-    loop = float(np.linalg.norm(plant.G_i[-1], ord=2) * K)
+    loop = float(_loop_above(gains, plant)[-1])
     if loop > HIGH_FREQUENCY_LOOP:
         return (
             f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
@@ -220,13 +218,19 @@ def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
     return ""
 
 
-def _controller_gain_above(gains: Gains, omega: Signal) -> Signal:
-    """Supremum of sigma_max(C_e + C_d) above each frequency."""
-    grid = np.concatenate([omega, np.linspace(omega[-1], np.pi / gains.Ts, 200)[1:]])
+def _loop_above(gains: Gains, plant: PlantResponse) -> Signal:
+    """What the rate loop's gain may still reach above each frequency of the plant, (K,).
+
+    The supremum over w > w_k of sigma_max(G(w_k)) (w_k / w) sigma_max(C_e + C_d)(w). A rate is the integral of the
+    moment over the inertia, behind motors and filters, so |G| falls at least like 1/w; that it does not grow would be
+    weaker, but then a filtered D counts with its gain at the Nyquist frequency, where no vehicle answers.
+    """
+    grid = np.concatenate([plant.omega, np.linspace(plant.omega[-1], np.pi / gains.Ts, 200)[1:]])
     C_e, C_d = inner_controllers(gains, grid)
-    size = np.linalg.norm(C_e + C_d, ord=2, axis=(1, 2))
-    highest: Signal = np.maximum.accumulate(size[::-1])[::-1]
-    return highest[: len(omega)]
+    falling = np.linalg.norm(C_e + C_d, ord=2, axis=(1, 2)) / grid
+    highest = np.maximum.accumulate(falling[::-1])[::-1][: len(plant.omega)]
+    reached: Signal = np.linalg.norm(plant.G_i, ord=2, axis=(1, 2)) * plant.omega * highest
+    return reached
 
 
 def _figures(
@@ -255,7 +259,7 @@ def _figures(
         for i, axis in enumerate(("roll", "pitch"))
     }
     # Above the band the loop is at most this large: no gain margin is claimed beyond what that leaves.
-    rest = np.linalg.norm(plant.G_i[-1], ord=2) * _controller_gain_above(gains, plant.omega[-1:])[0]
+    rest = _loop_above(gains, plant)[-1]
     ceiling = -20 * float(np.log10(rest))
     distance = np.abs(np.linalg.det(identity + nominal.L_u)).min()
     return {

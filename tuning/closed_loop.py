@@ -74,10 +74,33 @@ class PlantResponse:
         relative: Signal = noise * reach / size
         return relative
 
-    def at(self, which: NDArray[np.bool_]) -> PlantResponse:
+    def at(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> PlantResponse:
         """The response at some of the frequencies."""
         arrays = {name: value[which] for name, value in vars(self).items() if name != "Ts"}
         return PlantResponse(Ts=self.Ts, **arrays)
+
+    def extended(self) -> PlantResponse:
+        """The response with frequencies below its own added, where rates integrate the moment and angles the rates.
+
+        Set-points have most of their power there, and there the closed loop hardly depends on the plant: so the shape
+        of a rigid body, 1/w and 1/w^2 from the mean of the lowest frequencies on, is enough.
+        """
+        step = float(np.diff(self.omega).min())
+        low = np.arange(self.omega[0] - step, step / 2, -step)[::-1]
+        if not len(low):
+            return self
+        first, w = slice(0, 3), self.omega[:, None, None]
+        below = low[:, None, None]
+        down = (self.omega[0] / below) ** np.repeat([0, 1, 2], 2)[:, None]
+        return PlantResponse(
+            omega=np.concatenate([low, self.omega]),
+            G_i=np.concatenate([(w * self.G_i)[first].mean(axis=0) / below, self.G_i]),
+            G_o=np.concatenate([(w**2 * self.G_o)[first].mean(axis=0) / below**2, self.G_o]),
+            root=np.concatenate([down * self.root[0], self.root]),
+            reach=np.concatenate([np.repeat(self.reach[:1], len(low), axis=0), self.reach]),
+            coherence=np.concatenate([np.repeat(self.coherence[:1], len(low), axis=0), self.coherence]),
+            Ts=self.Ts,
+        )
 
     def draw(self, generator: np.random.Generator) -> PlantResponse:
         """Another plant that the experiment allows, from its error distribution."""
@@ -176,14 +199,28 @@ def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
     return CascadeLoop(L_i, L_u, plant.G_o @ U_o, U_o)
 
 
+def doublet_spectrum(omega: Signal, seconds: float) -> Complex:
+    """Fourier transform of a doublet of height 1, +1 then -1 for half of its length each.
+
+    Parameters
+    ----------
+    omega : (K,) array, rad/s
+    seconds : float, s
+        Its whole length.
+    """
+    s = 1j * omega
+    spectrum: Complex = (1 - np.exp(-s * seconds / 2)) ** 2 / s
+    return spectrum
+
+
 def refine_outer(
-    gains: Gains, plant: PlantResponse, models: Sequence[ReferenceModel], full: bool
+    gains: Gains, plant: PlantResponse, models: Sequence[ReferenceModel], full: bool, doublet_s: float | None = None
 ) -> tuple[Gains, Signal]:
     """Kp_o that brings the measured closed loop closest to the outer reference model.
 
     VRFT weighs what a P controller cannot do by the experiment's spectrum; here the same measured data weigh it by
-    that of set-points: |T_o - M_o|^2 / omega, between an impulse's (J_MR, (3.1)) and a step's. Gauss-Newton from
-    the VRFT gains, four numbers at most; no model is fitted.
+    that of set-points: |T_o - M_o|^2 / omega, between an impulse's (J_MR, (3.1)) and a step's, or the spectrum of a
+    doublet. Gauss-Newton from the VRFT gains, four numbers at most; no model is fitted.
 
     Parameters
     ----------
@@ -195,6 +232,8 @@ def refine_outer(
         Of the attitude loop.
     full : bool
         False: the diagonal only (SISO).
+    doublet_s : float, s, optional
+        Length of the doublet whose spectrum weighs the error.
 
     Returns
     -------
@@ -211,10 +250,11 @@ def refine_outer(
     use = plant.coherent() & (plant.relative_error() < ACCURATE)
     if use.sum() < MIN_FREQUENCIES:
         raise TuningError(f"only {use.sum()} frequencies of the measured response are known to 10 %")
-    plant = plant.at(use)
+    plant = plant.at(use).extended()
     target = np.stack([model.frequency_response(plant.omega) for model in models], axis=1)[:, :, None] * np.eye(2)
     where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
-    weight = where * (plant.omega**-0.5)[:, None, None]
+    spectrum = plant.omega**-0.5 if doublet_s is None else np.abs(doublet_spectrum(plant.omega, doublet_s))
+    weight = where * spectrum[:, None, None]
 
     def placed(values: Signal) -> Gains:
         Kp_o = np.zeros((2, 2))

@@ -24,6 +24,10 @@ COLUMNS = Annotated[
 ]
 
 
+#: Candidates that `advise` prints; ``--json`` has all.
+SHOWN = 24
+
+
 def tune(
     log: LOG,
     out: Annotated[Path, typer.Option(help="Where the gains are written: FILE.gains.toml.")],
@@ -123,8 +127,8 @@ def advise(
     columns: COLUMNS = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Scan bandwidth, damping and delay of the rate loop's model; recommend one and say why."""
-    from dataclasses import asdict
+    """Scan bandwidth, damping and delay of the rate loop's model, and derivative filters; recommend one and say why."""
+    import math
 
     from rich.progress import track
 
@@ -135,30 +139,44 @@ def advise(
     from tuning.spec import load_spec, parse_model
 
     task = load_spec(spec, outer=parse_model(outer) if outer else None)
-    candidates, best = scan(
+    found = scan(
         read_log(log, load_columns(columns) if columns else None),
         task,
         watch=lambda grid: track(list(grid), "tuning", console=progress_console(), transient=True),
     )
+    best = found.recommended
     assert best.gains is not None
     if out is not None:
         best.gains.save(out)
-    shown = [{k: v for k, v in asdict(c).items() if k != "gains"} for c in candidates]
-    recommended = next(row for row, c in zip(shown, candidates, strict=True) if c is best)
+
+    def shown(candidate: Any) -> dict[str, Any]:
+        return {name: value for name, value in vars(candidate).items() if name != "gains"}
+
     if as_json:
-        print_json({"recommended": recommended, "candidates": shown})
+        print_json(
+            {
+                "recommended": shown(best),
+                "nonminimum_phase_zero_rad_s": found.zero,
+                "candidates": [shown(candidate) for candidate in found.candidates],
+            }
+        )
         return
     rows = []
-    for c in candidates:
+    ordered = sorted(found.candidates, key=lambda c: (c.verdict != best.verdict, math.hypot(*c.follow_deg)))
+    for c in ordered[:SHOWN]:
         pairs = [f"{a:.2f} / {b:.2f}" for a, b in (c.follow_deg, c.offaxis_deg, c.effort)]
         name = "{:g}, {:g}, {}".format(*c.inner)
-        rows.append(["* " + name if c is best else name, f"{c.fit:.2f}", *pairs, c.verdict])
-    title = "Rate loop: rad/s, damping, delay in samples; predicted RMS of an 18 degree doublet, roll / pitch"
-    print_table(title, ["model", "fit", "to the model [deg]", "off-axis [deg]", "moment", "certificate"], rows)
+        delta = "{:.2f} +- {:.2f}".format(*c.delta)
+        row = ["* " + name if c is best else name, f"{c.cutoff_hz:g}", f"{c.fit:.2f}", *pairs, delta, c.verdict]
+        rows.append(row)
+    print("Rate loop: rad/s, damping, delay in samples; predicted RMS of an 18 degree doublet, roll / pitch")
+    columns_shown = ["model", "D [Hz]", "fit", "to the model [deg]", "off-axis [deg]", "moment", "delta", "certificate"]
+    print_table(f"{len(rows)} of {len(ordered)}, certified ones first, by how they follow", columns_shown, rows)
+    zero = "no non-minimum-phase zero" if found.zero is None else f"non-minimum-phase zero at {found.zero:.1f} rad/s"
+    print(f"{zero} between moment and rates")
     print(
-        "recommended: {:g},{:g},{}: certified, follows within 10 % of the best of those, with the least moment".format(
-            *best.inner
-        )
+        "recommended: --inner {:g},{:g},{} with a derivative filter of {:g} Hz: certified, follows within 10 % of the "
+        "best of those, with the least moment".format(*best.inner, best.cutoff_hz)
     )
 
 

@@ -210,6 +210,46 @@ class Gains:
             **{name: matrix(code) for name, code in MATRICES.items()},  # type: ignore[arg-type]
         )
 
+    def with_moment_scale(self, scale: Triple) -> Gains:
+        """The same controller for an allocator whose unit of moment is another.
+
+        Rate gains and the limits of the moment and of its integral are in that unit: all are multiplied by old over
+        new, an axis at a time, so that the moment in N m stays; a limit stays within 1, the most there is. What the
+        certificate says of the loop holds on, and is bound to the new matrices.
+
+        Parameters
+        ----------
+        scale : tuple of 3 float, N m
+            What one unit stands for on the target: roll, pitch, yaw.
+
+        Raises
+        ------
+        TuningError
+            When the set does not say its own unit.
+        """
+        if self.moment_scale is None:
+            raise TuningError(
+                "moment_scale: the gains do not say how many N m one unit of moment stands for; write it into "
+                "their file"
+            )
+        ratio = np.array(self.moment_scale) / np.array(scale)
+        rows = {name: getattr(self, name) * ratio[:2, None] for name in MATRICES if name.endswith("_i")}
+        yaw = {name: getattr(self.yaw, name) * float(ratio[2]) for name in MATRICES if name.endswith("_i")}
+        limits = {
+            name: tuple(min(float(v * r), 1.0) for v, r in zip(getattr(self.limits, name), ratio, strict=True))
+            for name in ("moment_max", "integral_max")
+        }
+        changed = replace(
+            self,
+            moment_scale=scale,
+            yaw=replace(self.yaw, **yaw),
+            limits=replace(self.limits, **limits),  # type: ignore[arg-type]
+            **rows,  # type: ignore[arg-type]
+        )
+        if self.certificate is None or self.verdict()[0] == "void":
+            return changed
+        return replace(changed, certificate={**self.certificate, "matrices_sha256": changed.matrices_sha256()})
+
     def save(self, path: Path) -> None:
         """Write the set as a readable TOML file, atomically."""
         write_atomically(path, gains_to_toml(self))

@@ -67,6 +67,8 @@ class TuningSpec(_Table):
     refine : bool
         Refine the attitude gains on the measured frequency response, `tuning.closed_loop.refine_outer`; False
         leaves them as VRFT gives them.
+    doublet_s : float or None, s
+        Length of the doublet that the refinement weighs errors by; None: 1/omega, for set-points of all kinds.
     derivative_cutoff_hz : float or None, Hz
         Of the derivative filter that will fly; None: as flown.
     moment_scale : tuple of 3 float or None, N m
@@ -85,6 +87,7 @@ class TuningSpec(_Table):
     weight: Literal["identity", "optimal"] = "optimal"
     pull: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     refine: bool = True
+    doublet_s: Annotated[float, Field(gt=0, le=60)] | None = None
     derivative_cutoff_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     moment_scale: Triple | None = None
     yaw: YawSpec | None = None

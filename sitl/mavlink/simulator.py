@@ -57,7 +57,7 @@ class PlantServer:
     def _warm_up(self, airframe: Airframe, seed: int) -> None:
         """Compile what each period calls now, so that the first frames come in time."""
         spare = Simulator(airframe, self.Ts, seed)
-        measure(spare.state, spare.noise(1)[0], *spare.deviations, np.zeros(SIZE))
+        measure(spare.state, spare.noise(1)[0], *spare.sensors, np.zeros(SIZE))
         commands = np.zeros(MAX_ROTORS, np.float32)
         advance(spare.state, commands, spare.plant, spare.steps, spare.step, spare.work)
 
@@ -72,7 +72,7 @@ class PlantServer:
         while True:
             if count % NOISE_BLOCK == 0:
                 noise = self.simulator.noise(NOISE_BLOCK)
-            measure(self.simulator.state, noise[count % NOISE_BLOCK], *self.simulator.deviations, measurement)
+            measure(self.simulator.state, noise[count % NOISE_BLOCK], *self.simulator.sensors, measurement)
             frame = self._frame(count, measurement)
             try:
                 connection.sendall(frame)

@@ -127,7 +127,7 @@ def test_quaternions_and_angles_are_inverse_to_each_other(angles):
 def test_an_exact_measurement_is_the_state_in_single_precision(vehicle):
     simulator = Simulator(vehicle.airframe, TS, 0, noise=False, altitude=12.3456)
     out = np.zeros(9)
-    measure(simulator.state, np.ones(6), 0.0, 0.0, out)
+    measure(simulator.state, np.ones(6), *simulator.sensors, out)
     assert out == pytest.approx([1, 0, 0, 0, 0, 0, 0, 12346, 0])
 
 

@@ -50,7 +50,9 @@ def test_the_recommended_model_follows_better_than_the_thesis_one_and_is_certifi
     monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 30.0))
     monkeypatch.setattr(advisor, "DAMPINGS", (0.4, 1.0))
     monkeypatch.setattr(advisor, "DELAYS", (0, 2))
-    candidates, best = advise(log, TuningSpec())
+    found = advise(log, TuningSpec(derivative_cutoff_hz=30.0))
+    candidates, best = found.candidates, found.recommended
+    assert found.zero is None
     assert len(candidates) == 8
     thesis = next(c for c in candidates if c.inner == (20.0, 0.4, 0))
     assert best.verdict == CERTIFIED
@@ -65,4 +67,4 @@ def test_without_a_certified_candidate_nothing_is_recommended(log, monkeypatch):
     monkeypatch.setattr(advisor, "DAMPINGS", (0.2,))
     monkeypatch.setattr(advisor, "DELAYS", (0,))
     with pytest.raises(TuningError, match="none of 1 rate loops is certified"):
-        advise(log, TuningSpec())
+        advise(log, TuningSpec(derivative_cutoff_hz=30.0))
