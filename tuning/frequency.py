@@ -56,7 +56,7 @@ def local_response(
     Ts: float,
     segments: Sequence[tuple[int, int]],
     upper: float | None = None,
-    centres: int = CENTRES,
+    growth: float = 0.0,
 ) -> LocalResponse:
     """Responses of `v` to `w`, their errors and the noise.
 
@@ -72,8 +72,9 @@ def local_response(
         Stretches without a gap.
     upper : float, optional, rad/s
         Largest frequency; the Nyquist frequency by default.
-    centres : int
-        Number of frequencies, at most.
+    growth : float
+        Windows are at least this share of their frequency wide on each side: fewer and surer values at high
+        frequencies, where responses change slowly. 0: all as narrow as the data allow.
 
     Returns
     -------
@@ -90,17 +91,28 @@ def local_response(
     # Enough rows in the longest segment for all parameters of the response and of its transient.
     rows = (ORDER + 1) * (n_w + 1) + FREEDOM
     upper = np.pi / Ts if upper is None else upper
-    half = max(rows / 2 * finest, upper / centres)
-    omega = np.arange(half, upper, half)
+    narrowest = max(rows / 2 * finest, upper / CENTRES)
+    omega, halves = _windows(narrowest, upper, growth)
     if not len(omega):
         raise TuningError(f"too short: {sum(b - a for a, b in segments) * Ts:.2f} s hold no frequency response")
     response = np.empty((len(omega), n_v, n_w), complex)
     noise = np.empty((len(omega), n_v, n_v), complex)
     error = np.empty((len(omega), n_w, n_w), complex)
     explained = np.empty((len(omega), n_v))
-    for k, centre in enumerate(omega):
+    for k, (centre, half) in enumerate(zip(omega, halves, strict=True)):
         response[k], noise[k], error[k], explained[k] = _fit(spectra, centre, half, n_w)
     return LocalResponse(omega, response, noise, explained, error)
+
+
+def _windows(narrowest: float, upper: float, growth: float) -> tuple[Signal, Signal]:
+    """Centres up to `upper` and half widths of windows that touch the next centre, rad/s."""
+    omega, halves, centre = [], [], narrowest
+    while centre < upper:
+        half = max(narrowest, growth * centre)
+        omega.append(centre)
+        halves.append(half)
+        centre += half
+    return np.array(omega), np.array(halves)
 
 
 class _Spectrum:

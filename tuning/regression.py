@@ -20,6 +20,8 @@ from tuning.frequency import LocalResponse, local_response
 
 #: Diagonal loading of the residual covariance: the instruments at neighbouring lags are almost the same.
 LOADING = 1e-3
+#: Windows of the noise spectrum: share of their frequency.
+GROWTH = 0.1
 #: Share of the instrument's power below the highest frequency at which the noise is looked at.
 POWER = 0.9999
 
@@ -119,7 +121,7 @@ class Solution:
         # Never so narrow that only a handful of frequencies are left.
         upper = min(np.pi, max(upper, 60 * np.pi / lengths[-1]))
         signals = np.hstack([np.vstack(problem.u), np.vstack(problem.x) / self.scale])
-        return local_response(w, signals, 1.0, segments, upper, centres=60)
+        return local_response(w, signals, 1.0, segments, upper, growth=GROWTH)
 
     @cached_property
     def covariance(self) -> Signal:

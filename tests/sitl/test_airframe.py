@@ -1,12 +1,22 @@
+import dataclasses
+
+import numpy as np
 import pytest
 
 from sitl.airframe import FOLDER, known_airframes, load_airframe
-from sitl.autopilot import check_moment_scale
+from sitl.autopilot import Autopilot, check_moment_scale
 from sitl.errors import SitlError
+from sitl.loop import fly
+from sitl.scenario import doublet
+from tests.conftest import assert_one_clear_line
+from tuning.errors import TuningError
+from tuning.gains import load_gains
+
+TS = 0.004
 
 
-def test_the_airframes_of_the_thesis_come_with_their_gains():
-    assert known_airframes() == ["adam0", "adam0_nominal", "adam0_perturbed", "antr"]
+def test_the_airframes_come_with_their_gains():
+    assert known_airframes() == ["adam0", "adam0_nominal", "adam0_perturbed", "antr", "px4_sih"]
     for name in known_airframes():
         vehicle = load_airframe(name)
         assert vehicle.airframe.name == name
@@ -14,7 +24,7 @@ def test_the_airframes_of_the_thesis_come_with_their_gains():
 
 
 def test_an_unknown_airframe_lists_the_known_ones():
-    with pytest.raises(SitlError, match=r"unknown airframe 'adam1'.*adam0, adam0_nominal, adam0_perturbed, antr"):
+    with pytest.raises(SitlError, match=r"unknown airframe 'adam1'.*adam0, adam0_nominal, adam0_perturbed, antr, px4_sih"):
         load_airframe("adam1")
 
 
@@ -47,3 +57,54 @@ def test_gains_for_another_unit_of_moment_are_refused(gains):
         check_moment_scale(airframe, dataclasses.replace(gains, moment_scale=(3.6, 3.6, 0.2736)))
     with pytest.raises(SitlError, match="do not say"):
         check_moment_scale(airframe, dataclasses.replace(gains, moment_scale=None))
+
+
+def test_the_gyro_filter_is_a_butterworth_low_pass_on_the_measured_rates():
+    from scipy.signal import butter, lfilter
+
+    vehicle = load_airframe("px4_sih")
+    plain = vehicle.airframe.model_copy(update={"gyro_cutoff_hz": 0.0})
+    gains = vehicle.default_gains()
+    task = doublet("roll", 0.2, 0.8, TS)
+    flights = {body.gyro_cutoff_hz: fly(body, Autopilot(body, gains), task, 3) for body in (vehicle.airframe, plain)}
+    filtered, raw = flights[40.0], flights[0.0]
+    b, a = butter(2, 40.0, fs=250)
+    assert raw.record["rates"] == pytest.approx(raw.truth["rates"], abs=0.1)
+    # The measured rates are those of the true ones and the same noise, filtered.
+    noise = raw.record["rates"].astype(float) - raw.truth["rates"]
+    expected = lfilter(b, a, filtered.truth["rates"] + noise, axis=0)
+    assert filtered.record["rates"] == pytest.approx(expected, abs=2e-6)
+
+
+def test_converted_gains_make_the_same_moment_in_newton_metres_and_keep_their_certificate():
+    scale = load_airframe("px4_sih").airframe.moment_scale()
+    assert scale == pytest.approx((2.88, 2.88, 0.2))
+    original = load_airframe("adam0").default_gains()
+    certified = dataclasses.replace(
+        original, certificate={"verdict": "certified", "reason": "", "matrices_sha256": original.matrices_sha256()}
+    )
+    converted = certified.with_moment_scale(scale)
+    for name in ("Kp_i", "Ki_i", "Kd_i"):
+        moments = [np.array(g.moment_scale[:2])[:, None] * getattr(g, name) for g in (original, converted)]
+        assert moments[0] == pytest.approx(moments[1], rel=1e-12)
+    assert np.array_equal(converted.Kp_o, original.Kp_o)
+    assert converted.yaw.Kp_o == original.yaw.Kp_o
+    assert converted.limits.rate_max == original.limits.rate_max
+    assert max(converted.limits.moment_max) <= 1.0
+    assert converted.verdict() == ("certified", "")
+    edited = dataclasses.replace(certified, Kp_o=1.1 * certified.Kp_o)
+    assert edited.with_moment_scale(scale).verdict()[0] == "void"
+    back = converted.with_moment_scale(original.moment_scale)
+    assert back.Kp_i == pytest.approx(original.Kp_i, rel=1e-12)
+    with pytest.raises(TuningError, match="do not say"):
+        dataclasses.replace(original, moment_scale=None).with_moment_scale(scale)
+
+
+def test_convert_writes_gains_that_the_airframe_takes(mimopilot, tmp_path):
+    mine = tmp_path / "mine.gains.toml"
+    load_airframe("adam0").default_gains().save(mine)
+    assert_one_clear_line(mimopilot("fly", "px4_sih", "--gains", mine), "mimopilot convert", "moment_scale")
+    result = mimopilot("convert", mine, "px4_sih", "--out", "theirs.gains.toml")
+    assert result.returncode == 0, result.stderr
+    assert "2.546, 2.546, 0.2736 N m, now for 2.88, 2.88, 0.2" in result.stdout
+    check_moment_scale(load_airframe("px4_sih").airframe, load_gains(tmp_path / "theirs.gains.toml"))
