@@ -24,7 +24,9 @@ def test_the_airframes_come_with_their_gains():
 
 
 def test_an_unknown_airframe_lists_the_known_ones():
-    with pytest.raises(SitlError, match=r"unknown airframe 'adam1'.*adam0, adam0_nominal, adam0_perturbed, antr, px4_sih"):
+    with pytest.raises(
+        SitlError, match=r"unknown airframe 'adam1'.*adam0, adam0_nominal, adam0_perturbed, antr, px4_sih"
+    ):
         load_airframe("adam1")
 
 
