@@ -52,7 +52,7 @@ _TERMS = {
     "Kp_o": ("1/s", 50.0, "rate set-point from angle error"),
     "Kp_i": ("s", 5.0, "moment from rate error"),
     "Ki_i": ("", 10.0, "moment from the integral of the rate error"),
-    "Kd_i": ("s^2", 0.5, "moment from measured angular acceleration, subtracted"),
+    "Kd_i": ("s^2", 0.5, "moment from angular acceleration, subtracted"),
     "Kff_i": ("s", 5.0, "moment from rate set-point"),
 }
 _LIMITS = {
@@ -100,6 +100,45 @@ IDENTITY: tuple[Parameter, ...] = tuple(
     )
     for axis in "RPY"
 )
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One parameter of a vehicle that is no gain, with a default of its own.
+
+    Attributes
+    ----------
+    name, unit, minimum, maximum, description
+        As in `Parameter`.
+    default : float
+        What it is until somebody sets it.
+    integer : bool
+        True for a whole number.
+    """
+
+    name: str
+    unit: str
+    default: float
+    minimum: float
+    maximum: float
+    integer: bool
+    description: str
+
+
+#: The experiment that a vehicle's own firmware flies: a PRBS added to the controller's output.
+EXCITATION: tuple[Setting, ...] = (
+    Setting("MIMO_EX_AX", "", 0, 0, 3, True, "excite once: 0 none, 1 roll, 2 pitch, 3 roll then pitch"),
+    Setting("MIMO_EX_AMP", "norm", 0.1, 0.0, 0.5, False, "excitation: amplitude"),
+    Setting("MIMO_EX_HMIN", "", 10, 1, 10000, True, "excitation: shortest pulse, control periods"),
+    Setting("MIMO_EX_HMAX", "", 60, 1, 10000, True, "excitation: longest pulse, control periods"),
+    Setting("MIMO_EX_DUR", "s", 16.0, 0.1, 300.0, False, "excitation: time on each axis"),
+    Setting("MIMO_EX_SEED", "", 1, 0, 1000000, True, "excitation: seed of the pulses"),
+    Setting("MIMO_EX_MODE", "", 4, 0, 30, True, "excitation: only in this nav_state (2 Position, 4 Hold)"),
+    Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stops beyond this roll or pitch"),
+)
+
+#: Whether a vehicle's start-up script takes this controller or that of the flight stack.
+ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
 
 
 def identity_parameters(gains: Gains) -> dict[str, float]:

@@ -13,7 +13,8 @@ import jinja2
 from codegen.errors import CodegenError
 from codegen.layout import GAINS, INPUT, OUTPUT, STATE
 from codegen.literals import float_literal
-from codegen.parameters import PARAMETERS, check_ranges
+from codegen.parameters import EXCITATION, PARAMETERS, check_ranges, identity_parameters
+from codegen.px4 import APIS, entries
 from codegen.toolchain import CXX_FLAGS, WARNINGS
 from codegen.vectors import emitted_vectors
 from tuning.files import sha256, write_atomically
@@ -25,7 +26,10 @@ MANIFEST = "manifest.json"
 MANIFEST_SCHEMA = 1
 
 #: Target -> the folders of firmware_templates that it is made of. ``package`` is the root of the output.
-TARGETS = {"native": ("core", "native", "package")}
+TARGETS = {
+    "native": ("core", "native", "package"),
+    "px4": ("core", "native", "px4", "package"),
+}
 
 
 def generator_version() -> str:
@@ -42,7 +46,7 @@ def interface_hash() -> int:
     return int.from_bytes(digest.digest()[:4], "big")
 
 
-def render(gains: Gains, target: str = "native") -> dict[str, str]:
+def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict[str, str]:
     """Every file of an output tree, by its path in that tree; the same gains give the same bytes.
 
     Parameters
@@ -51,6 +55,8 @@ def render(gains: Gains, target: str = "native") -> dict[str, str]:
         What to emit.
     target : str
         A key of `TARGETS`.
+    px4_api : str
+        Which of PX4's module interfaces, for the target px4: ``crtp`` (up to v1.17) or ``descriptor`` (later).
 
     Returns
     -------
@@ -60,10 +66,12 @@ def render(gains: Gains, target: str = "native") -> dict[str, str]:
     Raises
     ------
     CodegenError
-        When the target is unknown, or a gain is out of its parameter's range.
+        When the target or the interface is unknown, or a gain is out of its parameter's range.
     """
     if target not in TARGETS:
         raise CodegenError(f"target: got {target!r}, expected one of {', '.join(sorted(TARGETS))}")
+    if px4_api not in APIS:
+        raise CodegenError(f"px4-api: got {px4_api!r}, expected one of {', '.join(APIS)}")
     check_ranges(gains)
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined,
@@ -71,7 +79,7 @@ def render(gains: Gains, target: str = "native") -> dict[str, str]:
         autoescape=False,
         loader=jinja2.FileSystemLoader(TEMPLATES),
     )
-    context = _context(gains, target)
+    context = _context(gains, target) | {"px4_api": px4_api}
     files: dict[str, str] = {}
     for folder in TARGETS[target]:
         for path in sorted((TEMPLATES / folder).rglob("*")):
@@ -103,6 +111,9 @@ def _context(gains: Gains, target: str) -> dict[str, Any]:
         "target": target,
         "gains": gains,
         "parameters": PARAMETERS,
+        "identity": list(identity_parameters(gains)),
+        "excitation_settings": EXCITATION,
+        "px4_parameters": entries(gains),
         "literal": literal,
         "matrix": matrix,
         "triple": triple,
