@@ -6,6 +6,7 @@ all come from here. Its order is that of ``mimopilot::Gains`` seen as an array o
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -139,6 +140,30 @@ EXCITATION: tuple[Setting, ...] = (
 
 #: Whether a vehicle's start-up script takes this controller or that of the flight stack.
 ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
+
+
+#: Longest name that MAVLink and PX4 carry.
+NAME_LENGTH = 16
+
+
+def check_names() -> None:
+    """Refuse a table that a vehicle would garble: PX4 and MAVLink say nothing of a name that is too long.
+
+    Raises
+    ------
+    CodegenError
+        Naming a parameter whose name is too long, not of A-Z, 0-9 and _, or taken twice.
+    """
+    seen: set[str] = set()
+    for parameter in (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE):
+        name = parameter.name
+        if len(name) > NAME_LENGTH:
+            raise CodegenError(f"{name}: a name of {len(name)} characters, a vehicle stores at most {NAME_LENGTH}")
+        if not re.fullmatch("[A-Z][A-Z0-9_]*", name):
+            raise CodegenError(f"{name}: expected a letter, then A-Z, 0-9 and _: a vehicle drops other names")
+        if name in seen:
+            raise CodegenError(f"{name}: two parameters have this name")
+        seen.add(name)
 
 
 def identity_parameters(gains: Gains) -> dict[str, float]:

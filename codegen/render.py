@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import jinja2
 from codegen.errors import CodegenError
 from codegen.layout import GAINS, INPUT, OUTPUT, STATE
 from codegen.literals import float_literal
-from codegen.parameters import EXCITATION, PARAMETERS, check_ranges, identity_parameters
+from codegen.parameters import EXCITATION, PARAMETERS, check_names, check_ranges, identity_parameters
 from codegen.px4 import APIS, entries
 from codegen.toolchain import CXX_FLAGS, WARNINGS
 from codegen.vectors import emitted_vectors
@@ -72,6 +73,7 @@ def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict
         raise CodegenError(f"target: got {target!r}, expected one of {', '.join(sorted(TARGETS))}")
     if px4_api not in APIS:
         raise CodegenError(f"px4-api: got {px4_api!r}, expected one of {', '.join(APIS)}")
+    check_names()
     check_ranges(gains)
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined,
@@ -142,8 +144,17 @@ def _manifest(files: dict[str, str], gains: Gains, target: str) -> str:
     return json.dumps(content, indent=2) + "\n"
 
 
-def write_tree(files: dict[str, str], folder: Path) -> list[str]:
+def write_tree(files: dict[str, str], folder: Path, force: bool = False) -> list[str]:
     """Write a rendered tree: changed files only, each atomically; nothing is ever deleted.
+
+    Parameters
+    ----------
+    files : dict
+        What `render` returned.
+    folder : Path
+        The root of the tree; created when it is missing.
+    force : bool
+        Write even into a folder, or over a file, that mimopilot did not make.
 
     Returns
     -------
@@ -153,10 +164,35 @@ def write_tree(files: dict[str, str], folder: Path) -> list[str]:
     Raises
     ------
     CodegenError
-        When `folder` is a file, or holds files that mimopilot did not generate.
+        When `folder` is a file, a file's place is taken or cannot be written, or, without `force`, something
+        that mimopilot did not generate is there. Nothing has been written then.
     """
     if folder.exists() and not folder.is_dir():
         raise CodegenError(f"{folder}: is a file; give --out a folder")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / MANIFEST).is_file():
-        raise CodegenError(f"{folder}: holds files that mimopilot did not generate; give --out another folder")
+    if not force:
+        _check_ours(files, folder)
+    for name in files:
+        path = folder / name
+        if path.is_dir():
+            raise CodegenError(f"{path}: is a folder, expected a file or nothing; give --out another folder")
+        parent = next(parent for parent in path.parents if parent.exists())
+        if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+            raise CodegenError(f"{parent}: cannot be written to; give --out a folder that can")
     return [name for name, content in files.items() if write_atomically(folder / name, content)]
+
+
+def _check_ours(files: dict[str, str], folder: Path) -> None:
+    """Refuse a folder without a manifest of ours, and a file that its manifest does not list."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    hint = "give --out another folder, or --force to write all the same"
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text())
+        ours = {MANIFEST, *manifest["files"]} if manifest["generator"].startswith("mimopilot ") else set()
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        ours = set()
+    if not ours:
+        raise CodegenError(f"{folder}: holds files that mimopilot did not generate; {hint}")
+    for name in sorted(files.keys() - ours):
+        if (folder / name).exists():
+            raise CodegenError(f"{folder / name}: mimopilot did not generate it; {hint}")
