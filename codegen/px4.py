@@ -73,7 +73,7 @@ def _entry(source: Parameter | Setting, default: float, low: float, high: float,
     def text(value: float) -> str:
         return str(int(value)) if integer else yaml_number(value)
 
-    digits = max(0, 3 - math.floor(math.log10(high))) if high > 0 else 3
+    digits = min(max(3 - math.floor(math.log10(high)), 2), 4)  # steps of about a ten-thousandth of the range
     unit = f" In {source.unit}." if source.unit else ""
     return Entry(
         name=source.name,
