@@ -154,8 +154,9 @@ def check_names() -> None:
     CodegenError
         Naming a parameter whose name is too long, not of A-Z, 0-9 and _, or taken twice.
     """
+    table: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
     seen: set[str] = set()
-    for parameter in (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE):
+    for parameter in table:
         name = parameter.name
         if len(name) > NAME_LENGTH:
             raise CodegenError(f"{name}: a name of {len(name)} characters, a vehicle stores at most {NAME_LENGTH}")

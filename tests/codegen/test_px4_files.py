@@ -1,5 +1,6 @@
 """The files of the PX4 target: module.yaml by PX4's rules, start-up scripts, and the golden directories."""
 
+import dataclasses
 import difflib
 import json
 import re
@@ -72,8 +73,6 @@ def test_off_diagonal_gains_may_be_negative_and_what_is_fixed_has_one_value(gain
 
 
 def test_gains_that_do_not_say_their_unit_of_moment_publish_none(gains):
-    import dataclasses
-
     files = render(dataclasses.replace(gains, moment_scale=None), "px4")
     assert not [name for name in definitions(files) if "SCALE" in name]
     assert "MIMO_SCALE" not in files[f"{MODULE}/parameters.hpp"]
@@ -127,8 +126,8 @@ def test_what_needs_no_px4_includes_none(name):
     for path in (folder / f"{name}.hpp", folder / f"{name}.cpp"):
         included = set(re.findall(r"#include [<\"](.*)[>\"]", path.read_text()))
         assert included <= {f"{name}.hpp", "stdint.h", *(["math.h"] if name != "excitation" else [])}
-    command = [find_compiler(), "-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", str(folder / f"{name}.cpp")]
-    subprocess.run(command, check=True)
+    flags = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
+    subprocess.run([find_compiler(), *flags, str(folder / f"{name}.cpp")], check=True)
 
 
 def test_an_unknown_interface_is_refused(gains):

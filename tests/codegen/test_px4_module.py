@@ -161,7 +161,9 @@ def test_time_that_repeats_or_goes_back_makes_no_step(program):
     assert "4 bad sample times" in result.log[0]
 
 
-@pytest.mark.parametrize(("interval", "started"), [(4000, True), (4100, True), (3850, True), (4300, False), (1250, False)])
+@pytest.mark.parametrize(
+    ("interval", "started"), [(4000, True), (4100, True), (3850, True), (4300, False), (3700, False), (1250, False)]
+)
 def test_it_starts_only_when_the_gyro_keeps_the_period_of_the_gains(program, interval, started):
     result = drive(program, [f"gyro_interval {interval}", *AIRBORNE])
     assert result.exits == [0 if started else -1]

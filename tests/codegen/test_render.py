@@ -67,7 +67,7 @@ FOREIGN = {
 def test_a_folder_of_others_is_not_touched_unless_forced(gains, tmp_path, case):
     for name, text in FOREIGN[case].items():
         (tmp_path / name).write_text(text)
-    with pytest.raises(CodegenError, match="did not generate.*--force"):
+    with pytest.raises(CodegenError, match=r"did not generate.*--force"):
         write_tree(render(gains), tmp_path)
     assert read_tree(tmp_path) == FOREIGN[case]
     write_tree(render(gains), tmp_path, force=True)
@@ -239,5 +239,5 @@ def test_a_name_that_a_vehicle_would_garble_is_refused(gains, monkeypatch, name,
 
 
 def test_an_unknown_target_is_refused(gains):
-    with pytest.raises(CodegenError, match="expected one of .*native, px4"):
+    with pytest.raises(CodegenError, match=r"expected one of .*native, px4"):
         render(gains, "toaster")
