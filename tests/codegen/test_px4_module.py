@@ -177,9 +177,15 @@ def test_it_does_not_start_without_a_gyro(program):
 
 
 def test_it_takes_over_when_both_stock_controllers_have_stopped(program):
-    commands = [*AIRBORNE, "stock 1 1", STEP, STEP, "stock 0 1", STEP, STEP, "stock 0 0", STEP, STEP, STEP]
+    commands = [*AIRBORNE, "stock 1 1 1", STEP, STEP, "stock 0 1 1", STEP, STEP, "stock 0 0 1", STEP, STEP, STEP]
     result = drive(program, commands)
     assert result.ticks[1:] == [False] * 5 + [True] * 2
+
+
+def test_setpoints_still_arrive_when_the_stock_controllers_withdrew_their_topic(program):
+    tilted = f"setpoint {text(*quaternion(0.2, 0, 0), 0, 0, 0, -0.5)}"
+    out = drive(program, [*AIRBORNE, "stock 1 1 1", STEP, "stock 0 0 0", STEP, STEP, tilted, STEP, STEP]).out
+    assert out["rates"][-1, 0] == pytest.approx(6.0 * 0.2, rel=1e-4)
 
 
 def test_it_can_be_stopped_and_started_again(program):
@@ -384,6 +390,24 @@ def test_the_yaw_stick_turns_and_the_heading_is_held_after_it(program):
     out = by_sticks(program, "sticks 1 0 0 0.5 0", turned, STEP, "sticks 1 0 0 0 0", held, STEP, STEP).out
     assert out["wanted"][-1, 2] == pytest.approx(0.4, abs=1e-5)
     assert out["rates"][-1, 2] > 0.1
+
+
+def test_the_heading_follows_while_the_throttle_is_at_the_bottom(program):
+    turned = f"attitude {text(*quaternion(0, 0, 0.4))} 0 1 0 0 0"
+    for throttle, heading in ((-1, 0.4), (0, 0.0)):
+        out = by_sticks(program, f"sticks 1 0 0 0 {throttle}", turned, STEP, STEP).out
+        assert out["wanted"][-1, 2] == pytest.approx(heading, abs=1e-5)
+
+
+def test_a_reset_heading_moves_the_heading_that_the_sticks_hold(program):
+    step = quaternion(0, 0, 0.4)
+    out = by_sticks(program, f"attitude {text(*step)} 1 {text(*step)}", STEP, STEP).out
+    assert out["wanted"][-1, 2] == pytest.approx(0.4, abs=1e-5)
+
+
+def test_the_lowest_throttle_on_the_ground_is_zero(program):
+    out = by_sticks(program, "sticks 1 0 0 0 -1", "land 1 0", STEP, STEP).out
+    assert out["thrust"][-1, 2] == pytest.approx(0, abs=1e-6)
 
 
 def test_acro_flies_as_stabilized_and_says_so(program):

@@ -197,6 +197,7 @@ void execute(Line &line)
 	} else if (command == "stock") {
 		uORB::node(ORB_ID(vehicle_torque_setpoint)).advertised = line.flag();
 		uORB::node(ORB_ID(vehicle_rates_setpoint)).advertised = line.flag();
+		uORB::node(ORB_ID(vehicle_attitude_setpoint)).advertised = line.flag();
 
 	} else if (command == "mode") {
 		vehicle_control_mode_s mode{};
