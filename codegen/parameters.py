@@ -6,6 +6,7 @@ all come from here. Its order is that of ``mimopilot::Gains`` seen as an array o
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +53,7 @@ _TERMS = {
     "Kp_o": ("1/s", 50.0, "rate set-point from angle error"),
     "Kp_i": ("s", 5.0, "moment from rate error"),
     "Ki_i": ("", 10.0, "moment from the integral of the rate error"),
-    "Kd_i": ("s^2", 0.5, "moment from measured angular acceleration, subtracted"),
+    "Kd_i": ("s^2", 0.5, "moment from angular acceleration, subtracted"),
     "Kff_i": ("s", 5.0, "moment from rate set-point"),
 }
 _LIMITS = {
@@ -100,6 +101,70 @@ IDENTITY: tuple[Parameter, ...] = tuple(
     )
     for axis in "RPY"
 )
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One parameter of a vehicle that is no gain, with a default of its own.
+
+    Attributes
+    ----------
+    name, unit, minimum, maximum, description
+        As in `Parameter`.
+    default : float
+        What it is until somebody sets it.
+    integer : bool
+        True for a whole number.
+    """
+
+    name: str
+    unit: str
+    default: float
+    minimum: float
+    maximum: float
+    integer: bool
+    description: str
+
+
+#: The experiment that a vehicle's own firmware flies: a PRBS added to the controller's output.
+EXCITATION: tuple[Setting, ...] = (
+    Setting("MIMO_EX_AX", "", 0, 0, 3, True, "excite once: 0 none, 1 roll, 2 pitch, 3 roll then pitch"),
+    Setting("MIMO_EX_AMP", "norm", 0.1, 0.0, 0.5, False, "excitation: amplitude"),
+    Setting("MIMO_EX_HMIN", "", 10, 1, 10000, True, "excitation: shortest pulse, control periods"),
+    Setting("MIMO_EX_HMAX", "", 60, 1, 10000, True, "excitation: longest pulse, control periods"),
+    Setting("MIMO_EX_DUR", "s", 16.0, 0.1, 300.0, False, "excitation: time on each axis"),
+    Setting("MIMO_EX_SEED", "", 1, 0, 1000000, True, "excitation: seed of the pulses"),
+    Setting("MIMO_EX_MODE", "", 4, 0, 30, True, "excitation: only in this nav_state (2 Position, 4 Hold)"),
+    Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stops beyond this roll or pitch"),
+)
+
+#: Whether a vehicle's start-up script takes this controller or that of the flight stack.
+ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
+
+
+#: Longest name that MAVLink and PX4 carry.
+NAME_LENGTH = 16
+
+
+def check_names() -> None:
+    """Refuse a table that a vehicle would garble: PX4 and MAVLink say nothing of a name that is too long.
+
+    Raises
+    ------
+    CodegenError
+        Naming a parameter whose name is too long, not of A-Z, 0-9 and _, or taken twice.
+    """
+    table: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
+    seen: set[str] = set()
+    for parameter in table:
+        name = parameter.name
+        if len(name) > NAME_LENGTH:
+            raise CodegenError(f"{name}: a name of {len(name)} characters, a vehicle stores at most {NAME_LENGTH}")
+        if not re.fullmatch("[A-Z][A-Z0-9_]*", name):
+            raise CodegenError(f"{name}: expected a letter, then A-Z, 0-9 and _: a vehicle drops other names")
+        if name in seen:
+            raise CodegenError(f"{name}: two parameters have this name")
+        seen.add(name)
 
 
 def identity_parameters(gains: Gains) -> dict[str, float]:

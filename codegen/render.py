@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,8 @@ import jinja2
 from codegen.errors import CodegenError
 from codegen.layout import GAINS, INPUT, OUTPUT, STATE
 from codegen.literals import float_literal
-from codegen.parameters import PARAMETERS, check_ranges
+from codegen.parameters import EXCITATION, PARAMETERS, check_names, check_ranges, identity_parameters
+from codegen.px4 import APIS, entries
 from codegen.toolchain import CXX_FLAGS, WARNINGS
 from codegen.vectors import emitted_vectors
 from tuning.files import sha256, write_atomically
@@ -25,7 +27,10 @@ MANIFEST = "manifest.json"
 MANIFEST_SCHEMA = 1
 
 #: Target -> the folders of firmware_templates that it is made of. ``package`` is the root of the output.
-TARGETS = {"native": ("core", "native", "package")}
+TARGETS = {
+    "native": ("core", "native", "package"),
+    "px4": ("core", "native", "px4", "package"),
+}
 
 
 def generator_version() -> str:
@@ -42,7 +47,7 @@ def interface_hash() -> int:
     return int.from_bytes(digest.digest()[:4], "big")
 
 
-def render(gains: Gains, target: str = "native") -> dict[str, str]:
+def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict[str, str]:
     """Every file of an output tree, by its path in that tree; the same gains give the same bytes.
 
     Parameters
@@ -51,6 +56,8 @@ def render(gains: Gains, target: str = "native") -> dict[str, str]:
         What to emit.
     target : str
         A key of `TARGETS`.
+    px4_api : str
+        Which of PX4's module interfaces, for the target px4: ``crtp`` (up to v1.17) or ``descriptor`` (later).
 
     Returns
     -------
@@ -60,10 +67,13 @@ def render(gains: Gains, target: str = "native") -> dict[str, str]:
     Raises
     ------
     CodegenError
-        When the target is unknown, or a gain is out of its parameter's range.
+        When the target or the interface is unknown, or a gain is out of its parameter's range.
     """
     if target not in TARGETS:
         raise CodegenError(f"target: got {target!r}, expected one of {', '.join(sorted(TARGETS))}")
+    if px4_api not in APIS:
+        raise CodegenError(f"px4-api: got {px4_api!r}, expected one of {', '.join(APIS)}")
+    check_names()
     check_ranges(gains)
     environment = jinja2.Environment(
         undefined=jinja2.StrictUndefined,
@@ -71,7 +81,7 @@ def render(gains: Gains, target: str = "native") -> dict[str, str]:
         autoescape=False,
         loader=jinja2.FileSystemLoader(TEMPLATES),
     )
-    context = _context(gains, target)
+    context = _context(gains, target) | {"px4_api": px4_api}
     files: dict[str, str] = {}
     for folder in TARGETS[target]:
         for path in sorted((TEMPLATES / folder).rglob("*")):
@@ -103,6 +113,9 @@ def _context(gains: Gains, target: str) -> dict[str, Any]:
         "target": target,
         "gains": gains,
         "parameters": PARAMETERS,
+        "identity": list(identity_parameters(gains)),
+        "excitation_settings": EXCITATION,
+        "px4_parameters": entries(gains),
         "literal": literal,
         "matrix": matrix,
         "triple": triple,
@@ -131,8 +144,17 @@ def _manifest(files: dict[str, str], gains: Gains, target: str) -> str:
     return json.dumps(content, indent=2) + "\n"
 
 
-def write_tree(files: dict[str, str], folder: Path) -> list[str]:
+def write_tree(files: dict[str, str], folder: Path, force: bool = False) -> list[str]:
     """Write a rendered tree: changed files only, each atomically; nothing is ever deleted.
+
+    Parameters
+    ----------
+    files : dict
+        What `render` returned.
+    folder : Path
+        The root of the tree; created when it is missing.
+    force : bool
+        Write even into a folder, or over a file, that mimopilot did not make.
 
     Returns
     -------
@@ -142,10 +164,35 @@ def write_tree(files: dict[str, str], folder: Path) -> list[str]:
     Raises
     ------
     CodegenError
-        When `folder` is a file, or holds files that mimopilot did not generate.
+        When `folder` is a file, a file's place is taken or cannot be written, or, without `force`, something
+        that mimopilot did not generate is there. Nothing has been written then.
     """
     if folder.exists() and not folder.is_dir():
         raise CodegenError(f"{folder}: is a file; give --out a folder")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / MANIFEST).is_file():
-        raise CodegenError(f"{folder}: holds files that mimopilot did not generate; give --out another folder")
+    if not force:
+        _check_ours(files, folder)
+    for name in files:
+        path = folder / name
+        if path.is_dir():
+            raise CodegenError(f"{path}: is a folder, expected a file or nothing; give --out another folder")
+        parent = next(parent for parent in path.parents if parent.exists())
+        if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
+            raise CodegenError(f"{parent}: cannot be written to; give --out a folder that can")
     return [name for name, content in files.items() if write_atomically(folder / name, content)]
+
+
+def _check_ours(files: dict[str, str], folder: Path) -> None:
+    """Refuse a folder without a manifest of ours, and a file that its manifest does not list."""
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    hint = "give --out another folder, or --force to write all the same"
+    try:
+        manifest = json.loads((folder / MANIFEST).read_text())
+        ours = {MANIFEST, *manifest["files"]} if manifest["generator"].startswith("mimopilot ") else set()
+    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+        ours = set()
+    if not ours:
+        raise CodegenError(f"{folder}: holds files that mimopilot did not generate; {hint}")
+    for name in sorted(files.keys() - ours):
+        if (folder / name).exists():
+            raise CodegenError(f"{folder / name}: mimopilot did not generate it; {hint}")

@@ -15,6 +15,11 @@ from tuning.gains import Gains, Limits, YawGains
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Golden directories are rewritten on purpose only."""
+    parser.addoption("--update-golden", action="store_true", help="rewrite the golden directories of tests/codegen")
+
+
 @pytest.fixture
 def gains() -> Gains:
     """A full, coupled set with every term in use."""

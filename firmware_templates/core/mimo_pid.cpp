@@ -23,6 +23,8 @@ constexpr float kPi = 3.1415927F;
 // A range test, not isfinite: it catches NaN and infinity too, and survives every optimisation flag.
 bool within(float value, float limit) { return value >= -limit && value <= limit; }
 
+bool nonzero(float value) { return value > 0.0F || value < 0.0F; }  // some flight stacks forbid != between floats
+
 float clamp(float value, float limit)
 {
 	if (value > limit) { return limit; }
@@ -204,7 +206,7 @@ bool set_gains(State &state, const Gains &gains)
 	for (int j = 0; j < kAxes; j++) {
 		const float output = sum(before, j, state.integral[j]);
 		const float rest = sum(after, j, 0.0F);
-		const bool integrates = j == 2 ? gains.yaw_ki_i != 0.0F : gains.ki_i[j][0] != 0.0F || gains.ki_i[j][1] != 0.0F;
+		const bool integrates = j == 2 ? nonzero(gains.yaw_ki_i) : nonzero(gains.ki_i[j][0]) || nonzero(gains.ki_i[j][1]);
 		state.integral[j] = integrates ? clamp(output - rest, gains.integral_max[j]) : 0.0F;
 	}
 

@@ -1,5 +1,6 @@
 """The emitted tree: what is in it, that it is deterministic, and that it compiles and passes its own test."""
 
+import dataclasses
 import json
 import os
 import subprocess
@@ -12,8 +13,8 @@ from hypothesis import strategies as st
 
 from codegen.errors import CodegenError
 from codegen.literals import float_literal
-from codegen.parameters import IDENTITY, PARAMETERS
-from codegen.render import TEMPLATES, render, write_tree
+from codegen.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS
+from codegen.render import TARGETS, TEMPLATES, render, write_tree
 from codegen.toolchain import find_compiler
 from tuning.files import sha256
 
@@ -30,14 +31,16 @@ def test_the_same_gains_give_the_same_bytes_and_nothing_is_rewritten(gains, tmp_
     assert read_tree(tmp_path / "x") == render(gains)
 
 
-def test_the_output_tree_looks_like_the_template_tree(gains):
-    expected = {
-        path.relative_to(TEMPLATES).as_posix().removeprefix("package/").removesuffix(".jinja")
-        for folder in ("core", "native", "package")
-        for path in (TEMPLATES / folder).rglob("*")
-        if path.is_file()
-    }
-    assert set(render(gains)) == expected | {"manifest.json"}
+@pytest.mark.parametrize("target", TARGETS)
+def test_the_output_tree_looks_like_the_template_tree(gains, target):
+    files = render(gains, target)
+    expected = {"manifest.json"}
+    for path in (p for folder in TARGETS[target] for p in (TEMPLATES / folder).rglob("*") if p.is_file()):
+        name = path.relative_to(TEMPLATES).as_posix().removeprefix("package/")
+        expected.add(name.removesuffix(".jinja"))
+        if not name.endswith(".jinja"):
+            assert files[name] == path.read_text()
+    assert set(files) == expected
 
 
 def test_the_manifest_holds_the_hash_of_every_file(gains):
@@ -47,16 +50,70 @@ def test_the_manifest_holds_the_hash_of_every_file(gains):
 
 
 def test_nothing_generated_speaks_of_this_machine(gains, tmp_path):
-    text = "\n".join(render(gains).values())
+    text = "\n".join(content for target in TARGETS for content in render(gains, target).values())
     for word in (str(tmp_path), str(Path.cwd()), str(TEMPLATES), os.uname().nodename):
         assert word not in text
 
 
-def test_files_of_others_are_not_touched(gains, tmp_path):
-    (tmp_path / "mine.txt").write_text("keep")
-    with pytest.raises(CodegenError, match="did not generate"):
+FOREIGN = {
+    "another file": {"mine.txt": "keep"},
+    "a manifest of another program": {"manifest.json": '{"generator": "theirs", "files": {}}'},
+    "a manifest that is no JSON": {"manifest.json": "keep"},
+    "a manifest of another shape": {"manifest.json": "[1]"},
+}
+
+
+@pytest.mark.parametrize("case", FOREIGN)
+def test_a_folder_of_others_is_not_touched_unless_forced(gains, tmp_path, case):
+    for name, text in FOREIGN[case].items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(CodegenError, match=r"did not generate.*--force"):
         write_tree(render(gains), tmp_path)
-    assert read_tree(tmp_path) == {"mine.txt": "keep"}
+    assert read_tree(tmp_path) == FOREIGN[case]
+    write_tree(render(gains), tmp_path, force=True)
+    assert read_tree(tmp_path) == FOREIGN[case] | render(gains)
+
+
+def test_a_file_of_others_in_a_folder_of_ours_is_not_overwritten_unless_forced(gains, tmp_path):
+    write_tree(render(gains), tmp_path)
+    mine = tmp_path / "px4/src/CMakeLists.txt"
+    mine.parent.mkdir(parents=True)
+    mine.write_text("keep")
+    before = read_tree(tmp_path)
+    with pytest.raises(CodegenError, match=r"CMakeLists.txt: mimopilot did not generate it.*--force"):
+        write_tree(render(gains, "px4"), tmp_path)
+    assert read_tree(tmp_path) == before
+    assert "px4/src/CMakeLists.txt" in write_tree(render(gains, "px4"), tmp_path, force=True)
+
+
+def test_a_tree_of_ours_takes_another_target_and_keeps_what_was_added(gains, tmp_path):
+    write_tree(render(gains), tmp_path)
+    (tmp_path / "notes.txt").write_text("keep")
+    write_tree(render(gains, "px4"), tmp_path)
+    assert read_tree(tmp_path) == render(gains, "px4") | {"notes.txt": "keep"}
+
+
+@pytest.mark.parametrize("taken", ["core", "manifest.json", "native/Makefile"])
+def test_nothing_is_written_when_a_place_is_taken(gains, tmp_path, taken):
+    blocked = tmp_path / "x" / taken
+    if "." in taken or taken.endswith("Makefile"):
+        blocked.mkdir(parents=True)
+    else:
+        blocked.parent.mkdir(parents=True)
+        blocked.write_text("a file where a folder must be")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(CodegenError, match="give --out"):
+        write_tree(render(gains), tmp_path / "x", force=True)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_is_written(gains, tmp_path, monkeypatch):
+    # Root may write everywhere, so the answer of the operating system is made up.
+    monkeypatch.setattr("codegen.render.os.access", lambda path, mode: Path(path).name != "core")
+    (tmp_path / "x" / "core").mkdir(parents=True)
+    with pytest.raises(CodegenError, match="core: cannot be written to; give --out"):
+        write_tree(render(gains), tmp_path / "x", force=True)
+    assert read_tree(tmp_path) == {}
 
 
 def make(folder, *targets, **variables):
@@ -152,9 +209,9 @@ def test_no_literal_is_emitted_for_a_number_that_is_not_finite(value):
 
 
 def test_parameter_names_fit_a_vehicle():
-    names = [p.name for p in PARAMETERS + IDENTITY]
-    assert len(set(names)) == len(names)
-    for parameter in PARAMETERS + IDENTITY:
+    table = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
+    assert len({p.name for p in table}) == len(table)
+    for parameter in table:
         assert len(parameter.name) <= 16
         assert parameter.name.isupper() or "_" in parameter.name
         assert parameter.minimum < parameter.maximum
@@ -165,6 +222,22 @@ def test_a_gain_out_of_its_range_is_refused_by_name(gains):
         render(gains.with_elements({"RP_RR": 99.0}))
 
 
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("MIMO_RATE_P_ROLL_", "a name of 17 characters"),
+        ("MIMO_RP_RR", "two parameters"),
+        ("2_MIMO", "expected a letter"),
+        ("mimo_rp", "expected a letter"),
+    ],
+)
+def test_a_name_that_a_vehicle_would_garble_is_refused(gains, monkeypatch, name, reason):
+    odd = dataclasses.replace(EXCITATION[0], name=name)
+    monkeypatch.setattr("codegen.parameters.EXCITATION", (odd,))
+    with pytest.raises(CodegenError, match=f"{name}: {reason}"):
+        render(gains)
+
+
 def test_an_unknown_target_is_refused(gains):
-    with pytest.raises(CodegenError, match="expected one of native"):
+    with pytest.raises(CodegenError, match=r"expected one of .*native, px4"):
         render(gains, "toaster")

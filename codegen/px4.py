@@ -1,0 +1,89 @@
+"""What PX4 wants to know of every parameter: the entries of a module.yaml."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from codegen.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Parameter, Setting, identity_parameters
+from tuning.gains import Gains
+
+APIS = ("crtp", "descriptor")
+
+#: Our unit -> PX4's; one that is not here is in none of PX4's lists.
+_UNITS = {"1/s": "1/s", "s": "s", "rad": "rad", "rad/s": "rad/s", "norm": "norm", "N m": "Nm"}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One parameter of a module.yaml; numbers are the text that stands there."""
+
+    name: str
+    type: str
+    unit: str
+    default: str
+    minimum: str
+    maximum: str
+    decimal: int
+    increment: str
+    short: str
+    long: str
+
+
+def yaml_number(value: float) -> str:
+    """Shortest text that YAML reads as a float, and that reads back to float32(value).
+
+    Examples
+    --------
+    >>> yaml_number(0.1), yaml_number(-3), yaml_number(1e-5), yaml_number(1.5e-7)
+    ('0.1', '-3.0', '1.0e-05', '1.5e-07')
+    """
+    mantissa, exponent, power = str(np.float32(value)).partition("e")
+    return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}{exponent}{power}"
+
+
+def entries(gains: Gains) -> list[Entry]:
+    """Every parameter of the module, its default from `gains`.
+
+    The unit of moment is published where the gains say it. A parameter that is fixed in the firmware has a
+    range of one value.
+    """
+    values = gains.elements()
+    scales = identity_parameters(gains)
+    return [
+        *(_of_parameter(parameter, values[parameter.code]) for parameter in PARAMETERS),
+        *(_of_parameter(parameter, scales[parameter.name]) for parameter in IDENTITY if parameter.name in scales),
+        *(_of_setting(setting) for setting in (*EXCITATION, ENABLE)),
+    ]
+
+
+def _of_parameter(parameter: Parameter, value: float) -> Entry:
+    fixed = "" if parameter.writable else " Fixed in the firmware: published to be checked."
+    low, high = (parameter.minimum, parameter.maximum) if parameter.writable else (value, value)
+    return _entry(parameter, value, low, high, False, fixed)
+
+
+def _of_setting(setting: Setting) -> Entry:
+    return _entry(setting, setting.default, setting.minimum, setting.maximum, setting.integer, "")
+
+
+def _entry(source: Parameter | Setting, default: float, low: float, high: float, integer: bool, more: str) -> Entry:
+    def text(value: float) -> str:
+        return str(int(value)) if integer else yaml_number(value)
+
+    digits = min(max(3 - math.floor(math.log10(high)), 2), 4)  # steps of about a ten-thousandth of the range
+    unit = f" In {source.unit}." if source.unit else ""
+    return Entry(
+        name=source.name,
+        type="int32" if integer else "float",
+        unit=_UNITS.get(source.unit, ""),
+        default=text(default),
+        minimum=text(low),
+        maximum=text(high),
+        decimal=digits + 1,
+        increment=yaml_number(10.0**-digits),
+        short=source.description,
+        long=f"{source.description}.{unit}{more}",
+    )

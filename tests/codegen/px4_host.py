@@ -1,0 +1,170 @@
+"""The emitted PX4 module, compiled against the stand-ins beside this file and driven line by line.
+
+The stand-ins carry the names and types that the module uses of PX4. They are not PX4, and this is no PX4 build.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from codegen.render import render, write_tree
+from codegen.toolchain import WARNINGS, find_compiler
+
+STAND_INS = Path(__file__).parent / "px4_stand_ins"
+STANDARD = {"crtp": "-std=gnu++14", "descriptor": "-std=gnu++17"}
+#: What PX4 compiles its modules with, where it could matter here.
+PX4_FLAGS = (
+    "-O2",
+    "-fno-signed-zeros",
+    "-fno-trapping-math",
+    "-freciprocal-math",
+    "-fno-math-errno",
+    "-fno-exceptions",
+    "-fno-rtti",
+    "-Wfloat-equal",
+    "-Wcast-align",
+    "-Wlogical-op",
+    "-Wpointer-arith",
+    "-Wframe-larger-than=2048",
+    "-Wno-unused-parameter",
+)
+#: PX4's own parameters that the module reads, with their defaults.
+PX4_PARAMETERS = {
+    "MPC_MAN_TILT_MAX": 35.0,
+    "MPC_MAN_Y_MAX": 150.0,
+    "MPC_MANTHR_MIN": 0.08,
+    "MPC_THR_HOVER": 0.5,
+    "MPC_THR_MAX": 1.0,
+    "COM_SPOOLUP_TIME": 1.0,
+}
+WORDS = {
+    "torque": 3,
+    "rates": 3,
+    "integral": 3,
+    "excitation": 3,
+    "thrust": 3,
+    "angles": 3,
+    "wanted": 3,
+    "q_d": 4,
+}
+OUT = np.dtype([(name, "<f4", count) for name, count in WORDS.items()])
+
+
+def definitions(files: dict[str, str]) -> dict[str, dict]:
+    """Parameter name -> its entry of the emitted module.yaml."""
+    (group,) = yaml.safe_load(files["px4/src/modules/mc_mimo_pid/module.yaml"])["parameters"]
+    return group["definitions"]
+
+
+def parameters_header(entries: dict[str, dict]) -> str:
+    """What PX4's build makes of every module.yaml: an enum, the types and the default values."""
+    kinds = {name: entry["type"] == "float" for name, entry in entries.items()} | dict.fromkeys(PX4_PARAMETERS, True)
+    values = {name: entry["default"] for name, entry in entries.items()} | PX4_PARAMETERS
+    names = list(kinds)
+    apply = [f"#define APPLY_{n}(m, x, ...) m(x) APPLY_{n - 1}(m, __VA_ARGS__)" for n in range(2, len(names) + 1)]
+    places = ", ".join(f"_{n}" for n in range(len(names)))
+    counts = ", ".join(f"APPLY_{n}" for n in range(len(names), 0, -1))
+    return "\n".join(
+        [
+            "#pragma once",
+            "#include <stdlib.h>",
+            "#include <string.h>",
+            "namespace px4 {",
+            f"enum class params {{ {', '.join(names)} }};",
+            "constexpr bool kFloat[] = {" + ", ".join("true" if kinds[n] else "false" for n in names) + "};",
+            "constexpr bool is_float(params p) { return kFloat[static_cast<int>(p)]; }",
+            "inline double *values() {",
+            "static double v[] = {" + ", ".join(repr(float(values[n])) for n in names) + "}; return v; }",
+            "inline void set_value(const char *name, double value) {",
+            "static const char *const names[] = {" + ", ".join(f'"{n}"' for n in names) + "};",
+            f"for (int i = 0; i < {len(names)}; i++) {{",
+            "if (strcmp(names[i], name) == 0) { values()[i] = value; return; } } abort(); }",
+            "}",
+            "#define APPLY_1(m, x) m(x)",
+            *apply,
+            f"#define APPLY_PICK({places}, macro, ...) macro",
+            f"#define APPLY_ALL(m, ...) APPLY_PICK(__VA_ARGS__, {counts}, 0)(m, __VA_ARGS__)",
+            "",
+        ]
+    )
+
+
+def build(gains, api: str, folder: Path) -> Path:
+    """Emit, compile with our warnings as errors and PX4's flags, and link with the host program."""
+    files = render(gains, "px4", api)
+    write_tree(files, folder / "tree")
+    (folder / "generated").mkdir(exist_ok=True)
+    (folder / "generated" / "generated_parameters.hpp").write_text(parameters_header(definitions(files)))
+    module = folder / "tree/px4/src/modules/mc_mimo_pid"
+    core = folder / "tree/core"
+    includes = [f"-I{module}", f"-I{core}"]
+    for path in (folder / "generated", STAND_INS / api, STAND_INS / "common"):
+        includes += ["-isystem", str(path)]
+    common = [find_compiler(), STANDARD[api], *PX4_FLAGS, *includes]
+    jobs = {core / "mimo_pid.cpp": ["-fno-fast-math", "-fno-reciprocal-math", "-fno-associative-math", *WARNINGS]}
+    jobs |= {path: [*WARNINGS, "-Wno-unused-parameter"] for path in sorted(module.glob("*.cpp"))}
+    jobs[STAND_INS / "host.cpp"] = ["-Wall", "-fexceptions", "-frtti"]
+    objects = []
+    for source, flags in jobs.items():
+        objects.append(folder / f"{source.stem}.o")
+        command = [*common, *flags, '-DMODULE_NAME="mc_mimo_pid"', "-c", str(source), "-o", str(objects[-1])]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert result.returncode == 0, result.stderr
+    program = folder / "host"
+    subprocess.run([find_compiler(), *map(str, objects), "-o", str(program)], check=True)
+    return program
+
+
+@dataclass
+class Transcript:
+    """What the host program printed.
+
+    Attributes
+    ----------
+    out : (N,) array of `OUT`
+        What was published after each gyro sample that made the module publish.
+    ticks : list of bool
+        For each gyro sample given: whether the module published.
+    log : list of str
+        What the module said.
+    exits : list of int
+        What each of start, stop and status returned.
+    other : list of str
+        The rest.
+    """
+
+    out: np.ndarray
+    ticks: list[bool]
+    log: list[str]
+    exits: list[int]
+    other: list[str]
+
+
+def drive(program: Path, commands: Iterable[str]) -> Transcript:
+    """Run the host program on these commands."""
+    text = "\n".join(commands) + "\n"
+    result = subprocess.run([str(program)], input=text, capture_output=True, text=True, check=False, timeout=60)
+    assert result.returncode == 0, result.stdout[-500:] + result.stderr
+    rows, ticks, log, exits, other = [], [], [], [], []
+    for line in result.stdout.splitlines():
+        kind, _, rest = line.partition(" ")
+        if kind == "out":
+            words = rest.split()
+            assert words[-1] == "MIMO_EXC"
+            rows.append([int(word, 16) for word in words[1:-1]])
+        if kind in ("out", "quiet"):
+            ticks.append(kind == "out")
+        elif kind == "log":
+            log.append(rest)
+        elif kind == "exit":
+            exits.append(int(rest))
+        else:
+            other.append(line)
+    out = np.array(rows, np.uint32).reshape(len(rows), sum(WORDS.values())).view(OUT)[:, 0]
+    return Transcript(out, ticks, log, exits, other)

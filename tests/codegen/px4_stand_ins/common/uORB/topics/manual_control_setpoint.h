@@ -1,0 +1,18 @@
+#pragma once
+
+#include <uORB/uORB.h>
+
+struct manual_control_setpoint_s {
+	uint64_t timestamp;
+	uint64_t timestamp_sample;
+	float roll;
+	float pitch;
+	float yaw;
+	float throttle;
+	float flaps;
+	bool valid;
+	uint8_t data_source;
+	bool sticks_moving;
+};
+
+ORB_DECLARE(manual_control_setpoint);

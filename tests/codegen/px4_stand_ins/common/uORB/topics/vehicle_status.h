@@ -1,0 +1,13 @@
+#pragma once
+
+#include <uORB/uORB.h>
+
+struct vehicle_status_s {
+	uint64_t timestamp;
+	uint64_t armed_time;
+	uint8_t arming_state;
+	uint8_t nav_state;
+	uint8_t vehicle_type;
+};
+
+ORB_DECLARE(vehicle_status);

@@ -1,0 +1,297 @@
+// Feeds topics to the emitted module and prints what it publishes, floats as 32-bit words. Reads one command a line.
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
+
+#include <iostream>
+#include <map>
+#include <sstream>
+#include <string>
+
+#include "attitude.hpp"
+#include "excitation.hpp"
+#include "mc_mimo_pid.hpp"
+
+#define DEFINE_TOPIC(name) const orb_metadata __orb_##name{#name, sizeof(name##_s)}
+extern "C" {
+DEFINE_TOPIC(control_allocator_status);
+DEFINE_TOPIC(debug_vect);
+DEFINE_TOPIC(manual_control_setpoint);
+DEFINE_TOPIC(parameter_update);
+DEFINE_TOPIC(rate_ctrl_status);
+DEFINE_TOPIC(vehicle_angular_velocity);
+DEFINE_TOPIC(vehicle_attitude);
+DEFINE_TOPIC(vehicle_attitude_setpoint);
+DEFINE_TOPIC(vehicle_control_mode);
+DEFINE_TOPIC(vehicle_land_detected);
+DEFINE_TOPIC(vehicle_rates_setpoint);
+DEFINE_TOPIC(vehicle_status);
+DEFINE_TOPIC(vehicle_thrust_setpoint);
+DEFINE_TOPIC(vehicle_torque_setpoint);
+}
+
+extern "C" int mc_mimo_pid_main(int argc, char *argv[]);
+
+namespace {
+
+uint64_t now = 1000000;
+uint64_t gyro_interval = 4000;
+
+}  // namespace
+
+namespace uORB {
+
+px4::WorkItem *scheduled = nullptr;
+
+Node &node(const orb_metadata *meta)
+{
+	static std::map<const orb_metadata *, Node> nodes;
+	return nodes[meta];
+}
+
+}  // namespace uORB
+
+hrt_abstime hrt_absolute_time() { return now; }
+
+void px4_log(const char *level, const char *format, ...)
+{
+	va_list arguments;
+	va_start(arguments, format);
+	printf("log %s ", level);
+	vprintf(format, arguments);
+	printf("\n");
+	va_end(arguments);
+}
+
+namespace {
+
+template<typename T>
+void publish(const orb_metadata *meta, const T &message)
+{
+	// Never unadvertised: these publishers outlive the module.
+	static uORB::Publication<T> *const publication = new uORB::Publication<T>(meta);
+	publication->publish(message);
+}
+
+template<typename T>
+T last(const orb_metadata *meta)
+{
+	T message{};
+	uORB::Subscription(meta).copy(&message);
+	return message;
+}
+
+void gyro(const float (&rates)[3])
+{
+	vehicle_angular_velocity_s message{};
+	message.timestamp = message.timestamp_sample = now;
+
+	for (int i = 0; i < 3; i++) { message.xyz[i] = rates[i]; }
+
+	publish(ORB_ID(vehicle_angular_velocity), message);
+
+	if (uORB::scheduled != nullptr) { uORB::scheduled->Run(); }
+}
+
+void words(const float *values, int count)
+{
+	for (int i = 0; i < count; i++) {
+		uint32_t word;
+		memcpy(&word, &values[i], sizeof(word));
+		printf(" %08x", word);
+	}
+}
+
+// torque, rate set-point, integral, excitation, thrust; then the angles as the module's own functions see them.
+void print_published()
+{
+	const auto torque = last<vehicle_torque_setpoint_s>(ORB_ID(vehicle_torque_setpoint));
+	const auto rates = last<vehicle_rates_setpoint_s>(ORB_ID(vehicle_rates_setpoint));
+	const auto status = last<rate_ctrl_status_s>(ORB_ID(rate_ctrl_status));
+	const auto excitation = last<debug_vect_s>(ORB_ID(debug_vect));
+	const auto thrust = last<vehicle_thrust_setpoint_s>(ORB_ID(vehicle_thrust_setpoint));
+	const auto attitude = last<vehicle_attitude_s>(ORB_ID(vehicle_attitude));
+	const auto setpoint = last<vehicle_attitude_setpoint_s>(ORB_ID(vehicle_attitude_setpoint));
+	float angles[3];
+	float wanted[3];
+	mimopilot::angles(attitude.q, angles);
+	mimopilot::setpoint_angles(setpoint.q_d, angles[2], wanted);
+	printf("out %llu", static_cast<unsigned long long>(torque.timestamp_sample));
+	words(torque.xyz, 3);
+	words(&rates.roll, 1);
+	words(&rates.pitch, 1);
+	words(&rates.yaw, 1);
+	words(&status.rollspeed_integ, 1);
+	words(&status.pitchspeed_integ, 1);
+	words(&status.yawspeed_integ, 1);
+	words(&excitation.x, 1);
+	words(&excitation.y, 1);
+	words(&excitation.z, 1);
+	words(thrust.xyz, 3);
+	words(angles, 3);
+	words(wanted, 3);
+	words(setpoint.q_d, 4);
+	printf(" %s\n", excitation.name);
+}
+
+void module(const char *command)
+{
+	std::string name = "mc_mimo_pid";
+	std::string argument = command;
+	char *argv[] = {&name[0], &argument[0]};
+	printf("exit %d\n", mc_mimo_pid_main(2, argv));
+}
+
+struct Line : std::istringstream {
+	using std::istringstream::istringstream;
+
+	float number()
+	{
+		std::string text;
+		*this >> text;
+		return strtof(text.c_str(), nullptr);
+	}
+
+	bool flag() { return number() > 0.0F; }
+
+	template<int n>
+	void numbers(float (&values)[n])
+	{
+		for (float &value : values) { value = number(); }
+	}
+};
+
+void execute(Line &line)
+{
+	std::string command;
+	line >> command;
+
+	if (command == "start" || command == "stop" || command == "status") {
+		module(command.c_str());
+
+	} else if (command == "gyro") {
+		long long step;
+		float rates[3];
+		line >> step;
+		line.numbers(rates);
+		now += static_cast<uint64_t>(step);
+		const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
+		gyro(rates);
+
+		if (uORB::node(ORB_ID(vehicle_torque_setpoint)).generation != before) {
+			print_published();
+
+		} else {
+			printf("quiet\n");
+		}
+
+	} else if (command == "gyro_interval") {
+		line >> gyro_interval;
+
+	} else if (command == "param") {
+		std::string name;
+		line >> name;
+		px4::set_value(name.c_str(), line.number());
+		publish(ORB_ID(parameter_update), parameter_update_s{});
+
+	} else if (command == "stock") {
+		uORB::node(ORB_ID(vehicle_torque_setpoint)).advertised = line.flag();
+		uORB::node(ORB_ID(vehicle_rates_setpoint)).advertised = line.flag();
+		uORB::node(ORB_ID(vehicle_attitude_setpoint)).advertised = line.flag();
+
+	} else if (command == "mode") {
+		vehicle_control_mode_s mode{};
+		vehicle_status_s status{};
+		mode.flag_armed = line.flag();
+		mode.flag_control_manual_enabled = line.flag();
+		mode.flag_control_altitude_enabled = line.flag();
+		mode.flag_control_attitude_enabled = line.flag();
+		mode.flag_control_rates_enabled = true;
+		status.nav_state = static_cast<uint8_t>(line.number());
+		publish(ORB_ID(vehicle_control_mode), mode);
+		publish(ORB_ID(vehicle_status), status);
+
+	} else if (command == "land") {
+		vehicle_land_detected_s land{};
+		land.landed = line.flag();
+		land.maybe_landed = line.flag();
+		publish(ORB_ID(vehicle_land_detected), land);
+
+	} else if (command == "sticks") {
+		manual_control_setpoint_s sticks{};
+		sticks.valid = line.flag();
+		sticks.roll = line.number();
+		sticks.pitch = line.number();
+		sticks.yaw = line.number();
+		sticks.throttle = line.number();
+		publish(ORB_ID(manual_control_setpoint), sticks);
+
+	} else if (command == "alloc") {
+		control_allocator_status_s status{};
+		status.torque_setpoint_achieved = line.flag();
+		line.numbers(status.unallocated_torque);
+		publish(ORB_ID(control_allocator_status), status);
+
+	} else if (command == "setpoint") {
+		vehicle_attitude_setpoint_s setpoint{};
+		setpoint.timestamp = now;
+		line.numbers(setpoint.q_d);
+		setpoint.yaw_sp_move_rate = line.number();
+		line.numbers(setpoint.thrust_body);
+		publish(ORB_ID(vehicle_attitude_setpoint), setpoint);
+
+	} else if (command == "attitude") {
+		vehicle_attitude_s attitude{};
+		attitude.timestamp = attitude.timestamp_sample = now;
+		line.numbers(attitude.q);
+		attitude.quat_reset_counter = static_cast<uint8_t>(line.number());
+		line.numbers(attitude.delta_q_reset);
+		publish(ORB_ID(vehicle_attitude), attitude);
+
+	} else if (command == "prbs") {
+		mimopilot::Prbs prbs;
+		unsigned seed;
+		int shortest;
+		int longest;
+		int count;
+		line >> seed >> shortest >> longest >> count;
+		prbs.restart(seed, shortest, longest);
+		printf("prbs");
+
+		for (int i = 0; i < count; i++) { printf(" %d", static_cast<int>(prbs.next())); }
+
+		printf("\n");
+
+	} else {
+		printf("unknown command %s\n", command.c_str());
+		exit(2);
+	}
+}
+
+}  // namespace
+
+// Time passes, and the gyro goes on.
+int px4_usleep(unsigned microseconds)
+{
+	const uint64_t end = now + microseconds;
+	const float still[3] = {};
+
+	while (now + gyro_interval <= end) {
+		now += gyro_interval;
+		gyro(still);
+	}
+
+	return 0;
+}
+
+int main()
+{
+	std::string text;
+
+	while (std::getline(std::cin, text)) {
+		Line line(text);
+		execute(line);
+	}
+
+	return 0;
+}

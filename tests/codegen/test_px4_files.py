@@ -1,0 +1,167 @@
+"""The files of the PX4 target: module.yaml by PX4's rules, start-up scripts, and the golden directories."""
+
+import dataclasses
+import difflib
+import json
+import re
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from codegen.errors import CodegenError
+from codegen.parameters import EXCITATION, IDENTITY, PARAMETERS
+from codegen.px4 import APIS, yaml_number
+from codegen.render import TEMPLATES, render
+from codegen.toolchain import find_compiler
+from tests.codegen.px4_host import PX4_FLAGS, definitions
+
+GOLDEN = Path(__file__).parent / "golden"
+MODULE = "px4/src/modules/mc_mimo_pid"
+PLAIN = ("attitude", "excitation", "sticks")
+#: The units that PX4's validators accept, of those that we could need.
+PX4_UNITS = {"1/s", "s", "rad", "rad/s", "rad/s^2", "deg", "deg/s", "Hz", "Nm", "norm"}
+
+
+def test_every_parameter_of_the_module_is_in_its_yaml_with_the_gains_as_defaults(gains):
+    entries = definitions(render(gains, "px4"))
+    values = gains.elements()
+    for parameter in PARAMETERS:
+        assert np.float32(entries[parameter.name]["default"]) == np.float32(values[parameter.code])
+    assert [np.float32(entries[p.name]["default"]) for p in IDENTITY] == list(np.float32(gains.moment_scale))
+    for setting in EXCITATION:
+        assert entries[setting.name]["default"] == pytest.approx(setting.default)
+        assert entries[setting.name]["type"] == ("int32" if setting.integer else "float")
+    assert set(entries) == {p.name for p in (*PARAMETERS, *IDENTITY, *EXCITATION)} | {"MIMO_EN"}
+
+
+def test_the_yaml_keeps_the_rules_that_px4s_validators_do_not_all_check(gains):
+    text = render(gains.with_elements({"RD_RP": 1e-5, "RD_PR": -2.5e-7}), "px4")[f"{MODULE}/module.yaml"]
+    (group,) = yaml.safe_load(text)["parameters"]
+    for name, entry in group["definitions"].items():
+        assert re.fullmatch("[A-Z][A-Z0-9_]{0,15}", name)
+        assert entry.keys() <= {
+            *("description", "type", "unit", "default", "min", "max", "decimal", "increment"),
+        }, name  # a volatile key of any value would mark it volatile
+        assert len(entry["description"]["short"]) <= 70 and "\n" not in entry["description"]["short"]
+        assert len(entry["description"]["long"]) > len(entry["description"]["short"])
+        number = {"float": float, "int32": int}[entry["type"]]
+        for key in ("default", "min", "max"):
+            assert type(entry[key]) is number, (name, key, entry[key])  # 1e-05 would be a string
+            assert np.isfinite(entry[key])
+        assert entry["min"] <= entry["default"] <= entry["max"]
+        if "unit" in entry:
+            assert entry["unit"] in PX4_UNITS
+        if number is float:
+            assert 0 < entry["increment"] <= 0.01 and 3 <= entry["decimal"] <= 6
+    assert ".nan" not in text.lower() and "volatile" not in text
+    assert "1.0e-05" in text and "-2.5e-07" in text
+
+
+def test_off_diagonal_gains_may_be_negative_and_what_is_fixed_has_one_value(gains):
+    entries = definitions(render(gains, "px4"))
+    for parameter in PARAMETERS:
+        entry = entries[parameter.name]
+        if re.fullmatch("[AR][PIDF]_(RP|PR)", parameter.code):
+            assert entry["min"] == -entry["max"] < 0
+        if not parameter.writable:
+            assert entry["min"] == entry["default"] == entry["max"]
+
+
+def test_gains_that_do_not_say_their_unit_of_moment_publish_none(gains):
+    files = render(dataclasses.replace(gains, moment_scale=None), "px4")
+    assert not [name for name in definitions(files) if "SCALE" in name]
+    assert "MIMO_SCALE" not in files[f"{MODULE}/parameters.hpp"]
+
+
+@given(st.floats(width=32, allow_nan=False, allow_infinity=False))
+def test_a_yaml_number_reads_back_as_a_float_of_the_same_bits(value):
+    read = yaml.safe_load(yaml_number(value))
+    assert type(read) is float
+    assert np.float32(read).tobytes() == np.float32(value).tobytes()
+
+
+def test_the_defaults_script_sets_every_gain_and_the_rates_that_the_module_needs(gains):
+    files = render(gains, "px4")
+    lines = files["px4/sd_card/etc/config.txt"].splitlines()
+    defaults = dict(line.split()[2:] for line in lines if line.startswith("param set-default"))
+    values = gains.elements()
+    for parameter in PARAMETERS:
+        if parameter.writable:
+            assert np.float32(defaults.pop(parameter.name)) == np.float32(values[parameter.code])
+    assert defaults == {"MIMO_EN": "1", "IMU_GYRO_RATEMAX": "250", "SDLOG_PROFILE": "49"}
+    assert files["px4/airframe/mimo_defaults.txt"] in files["px4/sd_card/etc/config.txt"]
+
+
+def test_the_stock_controllers_stop_only_after_ours_has_started(gains):
+    script = render(gains, "px4")["px4/sd_card/etc/extras.txt"]
+    order = [script.index(word) for word in ("set +e", "MIMO_EN 1", "mc_mimo_pid start", "then\n\t\tmc_rate", "set -e")]
+    assert order == sorted(order)
+    assert subprocess.run(["sh", "-n"], input=script, text=True, check=False).returncode == 0
+
+
+def test_the_module_needs_no_px4_library_and_the_core_no_fast_math(gains):
+    cmake = render(gains, "px4")[f"{MODULE}/CMakeLists.txt"]
+    assert "DEPENDS" not in re.sub("#.*", "", cmake)
+    for flag in ("-fno-fast-math", "-fno-reciprocal-math", "-fno-associative-math"):
+        assert flag in cmake
+
+
+def test_the_core_says_so_when_px4s_flags_reach_it(gains, tmp_path):
+    files = render(gains, "px4")
+    for name in ("mimo_pid.cpp", "mimo_pid.hpp"):
+        (tmp_path / name).write_text(files[f"core/{name}"])
+    command = [find_compiler(), "-std=gnu++14", *PX4_FLAGS, "-fsyntax-only", str(tmp_path / "mimo_pid.cpp")]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode != 0 and "add -fno-fast-math" in result.stderr
+
+
+@pytest.mark.parametrize("name", PLAIN)
+def test_what_needs_no_px4_includes_none(name):
+    folder = TEMPLATES / MODULE
+    for path in (folder / f"{name}.hpp", folder / f"{name}.cpp"):
+        included = set(re.findall(r"#include [<\"](.*)[>\"]", path.read_text()))
+        assert included <= {f"{name}.hpp", "stdint.h", *(["math.h"] if name != "excitation" else [])}
+    flags = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
+    subprocess.run([find_compiler(), *flags, str(folder / f"{name}.cpp")], check=True)
+
+
+def test_an_unknown_interface_is_refused(gains):
+    with pytest.raises(CodegenError, match="px4-api: got 'v9', expected one of crtp, descriptor"):
+        render(gains, "px4", "v9")
+
+
+def templated(api, gains):
+    """The files of px4/ that are not plain copies of a template."""
+    files = render(gains, "px4", api)
+    return {name: text for name, text in files.items() if (TEMPLATES / f"{name}.jinja").is_file() and "px4/" in name}
+
+
+@pytest.mark.parametrize("api", APIS)
+def test_the_rendered_files_are_the_golden_ones(gains, api, request):
+    files = templated(api, gains)
+    folder = GOLDEN / f"px4-{api}"
+    if request.config.getoption("--update-golden"):
+        for name, text in files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_text(text)
+    kept = {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
+    difference = [
+        line
+        for name in sorted(kept.keys() | files.keys())
+        for line in difflib.unified_diff(
+            kept.get(name, "").splitlines(), files.get(name, "").splitlines(), f"golden/{name}", name, lineterm=""
+        )
+    ]
+    assert not difference, "\n".join(["run pytest --update-golden if this is meant:", *difference])
+
+
+def test_the_interfaces_differ_in_the_module_alone(gains):
+    crtp, descriptor = (render(gains, "px4", api) for api in APIS)
+    different = {name for name in crtp if crtp[name] != descriptor[name]}
+    assert different == {f"{MODULE}/mc_mimo_pid.cpp", f"{MODULE}/mc_mimo_pid.hpp", "px4/README.md", "manifest.json"}
+    assert json.loads(crtp["manifest.json"])["gains_sha256"] == json.loads(descriptor["manifest.json"])["gains_sha256"]

@@ -1,0 +1,425 @@
+"""What the emitted PX4 module publishes for what it is fed, in both dialects, against stand-ins (no PX4 build)."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from scipy.stats import ks_2samp
+
+from codegen.layout import INPUT
+from codegen.native import NativeController, load_native
+from tests.codegen.px4_host import PX4_PARAMETERS, STANDARD, build, drive
+from tuning.excitation import prbs
+
+HOLD_MODE = 4
+LEVEL = "attitude 1 0 0 0 0 1 0 0 0"
+AIRBORNE = ["gyro 0 0 0 0", "start", f"mode 1 0 1 1 {HOLD_MODE}", "land 0 0", LEVEL, "setpoint 1 0 0 0 0 0 0 -0.5"]
+STEP = "gyro 4000 0 0 0"
+
+
+@pytest.fixture(scope="module")
+def programs(tmp_path_factory):
+    from tests.conftest import gains
+
+    return {api: build(gains.__wrapped__(), api, tmp_path_factory.mktemp(api)) for api in STANDARD}
+
+
+@pytest.fixture(scope="module", params=STANDARD)
+def program(request, programs):
+    return programs[request.param]
+
+
+def text(*values):
+    """Numbers as the host program reads them back to the same bits."""
+    return " ".join("nan" if np.isnan(v) else float(np.float32(v)).hex() for v in values)
+
+
+def quaternion(roll, pitch, yaw):
+    x, y, z, w = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_quat()
+    return w, x, y, z
+
+
+def native_outputs(gains, inputs):
+    return NativeController(load_native(gains), gains).run(inputs)
+
+
+def assert_same_bits(got, expected):
+    assert len(got) == len(expected)
+    assert got.tobytes() == np.ascontiguousarray(expected).tobytes()
+
+
+def test_a_random_flight_gives_the_bits_of_the_native_library(program, gains):
+    rng = np.random.default_rng(7)
+    commands, rows = list(AIRBORNE), []
+    row = np.zeros(1, INPUT)[0]
+    row["armed"] = 1
+    move = wanted_q = None
+    for k in range(1500):
+        attitude = quaternion(*(rng.normal(size=3) * [0.2, 0.2, 1.0]))
+        commands.append(f"attitude {text(*attitude)} 0 1 0 0 0")
+        if k % 2 == 0:
+            move = rng.choice([np.nan, 0.0, 0.7, -9.0])
+            wanted_q = quaternion(*(rng.normal(size=3) * [0.3, 0.3, 2.0])) if rng.random() > 0.05 else (np.nan,) * 4
+            commands.append(f"setpoint {text(*wanted_q, move, np.nan, np.nan, -0.4)}")
+        if k % 5 == 0:
+            missing = rng.choice([-0.1, 0.0, 1e-9, 0.1], 3)
+            achieved = rng.random() < 0.3
+            commands.append(f"alloc {int(achieved)} {text(*missing)}")
+            row["saturation"] = np.where(np.abs(missing) > 1e-7, np.sign(missing), 0) * (not achieved)
+        if k % 50 == 0:
+            row["armed"] = rng.random() > 0.2
+            commands.append(f"mode {row['armed']} 0 1 1 {HOLD_MODE}")
+            landed, maybe = rng.choice([0, 0, 1], 2)
+            commands.append(f"land {landed} {maybe}")
+            row["landed"] = landed or maybe
+        row["rates"] = rng.normal(size=3) * 1.5
+        commands.append(f"gyro 4000 {text(*row['rates'])}")
+        rows.append((row.copy(), np.float32(move), np.isnan(wanted_q[0])))
+    out = drive(program, commands).out
+    rows = rows[len(rows) - len(out) :]  # it watches for the other controllers first
+    assert len(out) == 1499
+    inputs = np.array([r for r, _, _ in rows], INPUT)
+    inputs["attitude"], inputs["attitude_setpoint"] = out["angles"], out["wanted"]
+    for k, (_, rate, _) in enumerate(rows):
+        offset = np.float32(0) if np.isnan(rate) else np.clip(rate / np.float32(gains.yaw.Kp_o), -1.5, 1.5)
+        inputs["attitude_setpoint"][k, 2] += np.float32(offset)
+    expected = native_outputs(gains, inputs)
+    assert_same_bits(out["torque"], expected["moment"])
+    assert_same_bits(out["rates"], expected["rates_setpoint"])
+    # The rows reach what they are meant to reach.
+    assert (np.abs(expected["moment"]) >= [1.0, 0.9, 0.8]).any(axis=1).sum() > 20
+    assert np.isnan(out["wanted"]).any(axis=1).sum() > 20
+    assert np.isfinite(out["torque"]).all()
+    assert len(np.unique(inputs["saturation"], axis=0)) > 20
+
+
+def test_the_angles_are_those_of_the_quaternions(program):
+    rng = np.random.default_rng(3)
+    commands, expected = list(AIRBORNE), []
+    for _ in range(200):
+        vehicle, wanted = rng.uniform([-2, -1.4, -3], [2, 1.4, 3]), rng.uniform([-1, -1, -3], [1, 1, 3])
+        commands += [f"attitude {text(*quaternion(*vehicle))} 0 1 0 0 0"]
+        commands += [f"setpoint {text(*quaternion(*wanted), 0, 0, 0, -0.5)}", STEP]
+        expected.append((vehicle, wanted))
+    out = drive(program, commands).out
+    for row, (vehicle, wanted) in zip(out, expected[1:], strict=True):
+        np.testing.assert_allclose(row["angles"], vehicle, atol=2e-6)
+        assert row["wanted"][2] == pytest.approx(wanted[2], abs=2e-6)
+        # The thrust points where the set-point wants it, at the vehicle's own heading.
+        axis = Rotation.from_euler("ZYX", [vehicle[2], row["wanted"][1], row["wanted"][0]]).apply([0, 0, 1])
+        np.testing.assert_allclose(axis, Rotation.from_euler("ZYX", wanted[::-1]).apply([0, 0, 1]), atol=2e-6)
+
+
+def test_fields_that_are_not_set_poison_nothing(program):
+    unset = [
+        "setpoint 1 0 0 0 nan nan nan nan",
+        "sticks 1 nan nan nan nan",
+        "alloc 0 nan nan nan",
+    ]
+    out = drive(program, [*AIRBORNE, STEP, STEP, *unset, *[STEP] * 50]).out
+    assert np.isfinite(out["torque"]).all() and np.isfinite(out["thrust"]).all() and np.isfinite(out["rates"]).all()
+    assert (out["thrust"][:, 2] == np.float32(-0.5)).all()
+
+
+def test_a_setpoint_that_ends_is_held_for_25_samples_and_then_only_the_rates_are_damped(program):
+    tilted = f"setpoint {text(*quaternion(0.2, 0, 0), 0, 0, 0, -0.5)}"
+    lost = "setpoint nan nan nan nan 0 0 0 -0.5"
+    out = drive(program, [*AIRBORNE, tilted, STEP, STEP, lost, *[STEP] * 40]).out
+    assert (out["rates"][:26, 0] > 1.0).all()
+    assert (out["rates"][26:] == 0).all() and (out["torque"][26:] == 0).all()
+
+
+def test_integrators_are_zero_when_disarmed_and_held_on_the_ground(program, gains):
+    turning = ["gyro 4000 0.3 -0.2 0.1"] * 20
+    disarmed, armed = f"mode 0 0 1 1 {HOLD_MODE}", f"mode 1 0 1 1 {HOLD_MODE}"
+    commands = [*AIRBORNE, STEP]
+    for before in ("", "land 1 0", "land 0 0", "land 0 1", "land 0 0", disarmed, armed):
+        commands += [*filter(None, [before]), *turning]
+    integral = drive(program, commands).out["integral"].reshape(7, 20, 3)
+    flying, landed, again, maybe, more, off, on = integral
+    for grown in (flying, again, more, on):
+        assert (np.abs(np.diff(grown, axis=0)) > 0).all()
+    assert (landed == flying[-1]).all()
+    assert (maybe == again[-1]).all()
+    assert (off == 0).all()
+    assert (np.abs(on[-1]) > 0).all()
+
+
+def test_an_axis_whose_moment_is_not_given_does_not_wind_up(program):
+    turning = ["gyro 4000 -0.3 -0.3 -0.3"] * 10
+    integral = drive(program, [*AIRBORNE, STEP, "alloc 0 0.1 0 -0.1", *turning]).out["integral"]
+    assert (integral[:, 0] == 0).all()
+    assert (np.diff(integral[:, 1:], axis=0) > 0).all()
+
+
+def test_time_that_repeats_or_goes_back_makes_no_step(program):
+    odd = ["gyro 0 0.1 0 0", "gyro -4000 0.1 0 0", "gyro 8000 0.1 0 0", "gyro 7000 0.1 0 0", "gyro 1000 0.1 0 0"]
+    result = drive(program, [*AIRBORNE, STEP, STEP, *odd, STEP, "status"])
+    assert result.ticks[1:] == [False, True, False, False, True, True, True, True]
+    # Repeated, back, too long, too short; 8000 us after going back is 4000 us after the last good one.
+    assert "4 bad sample times" in result.log[0]
+
+
+@pytest.mark.parametrize(
+    ("interval", "started"), [(4000, True), (4100, True), (3850, True), (4300, False), (3700, False), (1250, False)]
+)
+def test_it_starts_only_when_the_gyro_keeps_the_period_of_the_gains(program, interval, started):
+    result = drive(program, [f"gyro_interval {interval}", *AIRBORNE])
+    assert result.exits == [0 if started else -1]
+    assert started == (not any("IMU_GYRO_RATEMAX" in line for line in result.log))
+
+
+def test_it_does_not_start_without_a_gyro(program):
+    result = drive(program, ["start"])
+    assert result.exits == [-1]
+    assert "no vehicle_angular_velocity" in result.log[0]
+
+
+def test_it_takes_over_when_both_stock_controllers_have_stopped(program):
+    commands = [*AIRBORNE, "stock 1 1 1", STEP, STEP, "stock 0 1 1", STEP, STEP, "stock 0 0 1", STEP, STEP, STEP]
+    result = drive(program, commands)
+    assert result.ticks[1:] == [False] * 5 + [True] * 2
+
+
+def test_setpoints_still_arrive_when_the_stock_controllers_withdrew_their_topic(program):
+    tilted = f"setpoint {text(*quaternion(0.2, 0, 0), 0, 0, 0, -0.5)}"
+    out = drive(program, [*AIRBORNE, "stock 1 1 1", STEP, "stock 0 0 0", STEP, STEP, tilted, STEP, STEP]).out
+    assert out["rates"][-1, 0] == pytest.approx(6.0 * 0.2, rel=1e-4)
+
+
+def test_it_can_be_stopped_and_started_again(program):
+    result = drive(program, [*AIRBORNE, STEP, STEP, "stop", STEP, STEP, "status", "start", STEP, STEP])
+    assert result.exits == [0, 0, -1, 0]
+    assert result.ticks[1:] == [False, True, False, False, False, True]
+
+
+def test_new_gains_act_within_a_second_without_a_bump(program, gains):
+    changed = gains.with_elements({"RP_RR": 0.25, "AP_PP": 3.0})
+    rates, rng = [], np.random.default_rng(2)
+    commands = [*AIRBORNE, STEP]
+    for k in range(400):
+        if k == 100:
+            commands += ["param MIMO_RP_RR 0.25", "param MIMO_AP_PP 3.0"]
+        rates.append(rng.normal(size=3) * 0.05)
+        commands.append(f"gyro 4000 {text(*rates[-1])}")
+    out = drive(program, commands).out
+    inputs = np.zeros(400, INPUT)
+    inputs["rates"], inputs["armed"] = rates, 1
+    unchanged = native_outputs(gains, inputs)["moment"]
+    change = int(np.flatnonzero((unchanged != out["torque"]).any(axis=1))[0])
+    assert 100 <= change <= 350
+    controller = NativeController(load_native(gains), gains)
+    before = controller.run(inputs[:change])
+    controller.set_gains(changed)
+    assert_same_bits(out["torque"], np.concatenate([before, controller.run(inputs[change:])])["moment"])
+
+
+def test_gains_out_of_their_range_are_refused_by_name_and_the_old_ones_fly_on(program, gains):
+    wrong = ["param MIMO_RP_RR 99", "param MIMO_RP_PP 0.2"]
+    result = drive(program, [*AIRBORNE, STEP, *wrong, *["gyro 4000 0.1 0.1 0.1"] * 300])
+    inputs = np.zeros(300, INPUT)
+    inputs["rates"], inputs["armed"] = 0.1, 1
+    assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
+    assert any("MIMO_RP_RR is not within -5 to 5" in line for line in result.log)
+
+
+def test_a_reset_heading_turns_the_setpoint_with_it(program):
+    step = quaternion(0, 0, 0.5)
+    wanted = f"setpoint {text(*quaternion(0.1, 0, 0), 0, 0, 0, -0.5)}"
+    reset = f"attitude {text(*step)} 1 {text(*step)}"
+    out = drive(program, [*AIRBORNE, wanted, STEP, STEP, "gyro 4000 0 0 0", reset, STEP, STEP]).out
+    np.testing.assert_allclose(out["rates"][-1], out["rates"][0], atol=1e-5)
+    assert out["rates"][0, 0] > 0.5
+
+
+# The excitation.
+
+
+def excited(program, *events, axis=3, seconds=0.2, mode=HOLD_MODE, steps=600, settings=()):
+    """A flight with an excitation asked for in the air; events: (sample, command)."""
+    setup = [f"param MIMO_EX_DUR {seconds}", "param MIMO_EX_HMIN 2", "param MIMO_EX_HMAX 9", *settings]
+    commands = [*AIRBORNE[:2], *setup, *AIRBORNE[2:], f"mode 1 0 1 1 {mode}", *[STEP] * 300]
+    commands += [f"param MIMO_EX_AX {axis}"]
+    events = dict(events)
+    for k in range(steps):
+        commands += [*filter(None, [events.get(k)]), STEP]
+    return drive(program, [*commands, "status"])
+
+
+def last_end(result):
+    return next(line for line in result.log if line.startswith("INFO excitation") and "last one" in line)
+
+
+def active(result):
+    return (result.out["excitation"][:, :2] != 0).any(axis=1)
+
+
+def test_the_excitation_runs_once_on_roll_then_pitch_and_is_logged(program, gains):
+    result = excited(program)
+    x, y, code = result.out["excitation"].T
+    roll, pitch, pause = (np.flatnonzero(code == value) for value in (0, 1, 2))
+    for samples, count in ((roll, 50), (pause, 250), (pitch, 50)):
+        assert len(samples) == count
+        assert np.ptp(samples) == count - 1
+    assert roll[-1] + 1 == pause[0] and pause[-1] + 1 == pitch[0]
+    amplitude = np.float32(0.1)
+    assert set(np.abs(x[roll])) == {amplitude} and not x[np.setdiff1d(np.arange(len(x)), roll)].any()
+    assert set(np.abs(y[pitch])) == {amplitude} and not y[np.setdiff1d(np.arange(len(y)), pitch)].any()
+    assert set(code) == {-1, 0, 1, 2}
+    assert "finished" in last_end(result)
+    # It is the excitation input of the core.
+    inputs = np.zeros(len(x), INPUT)
+    inputs["excitation"], inputs["armed"] = np.column_stack([x, y, 0 * x]), 1
+    assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
+
+
+@pytest.mark.parametrize(("axis", "column"), [(1, 0), (2, 1)])
+def test_one_axis_alone_can_be_excited(program, axis, column):
+    excitation = excited(program, axis=axis).out["excitation"]
+    assert np.count_nonzero(excitation[:, column]) == 50
+    assert not excitation[:, 1 - column].any()
+
+
+@pytest.mark.parametrize(
+    ("event", "reason"),
+    [
+        ("sticks 1 0.2 0 0 0", "a stick moved"),
+        ("sticks 1 0 0 0 -0.2", "a stick moved"),
+        (f"attitude {text(*quaternion(0.6, 0, 0))} 0 1 0 0 0", "MIMO_EX_TILT"),
+        (f"attitude {text(*quaternion(0, -0.6, 0))} 0 1 0 0 0", "MIMO_EX_TILT"),
+        (f"mode 0 0 1 1 {HOLD_MODE}", "disarmed"),
+        ("mode 1 0 1 1 2", "mode left"),
+        ("land 0 1", "on the ground"),
+    ],
+)
+def test_the_excitation_stops_at_once(program, event, reason):
+    start = np.flatnonzero(active(excited(program, seconds=10)))[0] - 299  # in samples after the request
+    result = excited(program, (start + 100, event), seconds=10)
+    running = np.flatnonzero(active(result))
+    assert len(running) == 100 and np.ptp(running) == 99
+    assert reason in last_end(result)
+
+
+def test_the_axis_set_to_zero_stops_the_excitation(program):
+    result = excited(program, (300, "param MIMO_EX_AX 0"), seconds=10)
+    assert 50 <= np.count_nonzero(active(result)) <= 600 and not active(result)[-1]
+    assert "cancelled" in last_end(result)
+
+
+def test_after_a_stop_it_does_not_begin_again_by_itself(program):
+    result = excited(program, (350, "land 1 0"), (360, "land 0 0"), seconds=10, steps=2000)
+    assert not active(result)[300 + 351 :].any() and active(result)[300 + 340]
+
+
+@pytest.mark.parametrize("event", [f"mode 0 0 1 1 {HOLD_MODE}", "mode 1 0 1 1 2", "land 1 0", "land 0 1"])
+def test_it_waits_until_the_vehicle_is_ready(program, event):
+    ready = 1000
+    back = f"mode 1 0 1 1 {HOLD_MODE}" if event.startswith("mode") else "land 0 0"
+    result = excited(program, (0, event), (ready, back), steps=1100)
+    assert not active(result)[: 299 + ready].any()
+    assert active(result)[299 + ready]
+
+
+def test_an_axis_that_was_set_before_the_start_excites_nothing(program):
+    commands = ["param MIMO_EX_AX 3", *AIRBORNE, *[STEP] * 600]
+    assert not active(drive(program, commands)).any()
+
+
+@pytest.mark.parametrize("setting", ["MIMO_EX_AMP nan", "MIMO_EX_AMP 0.9", "MIMO_EX_HMIN 0", "MIMO_EX_HMAX 1"])
+def test_settings_that_make_no_sense_are_refused(program, setting):
+    result = excited(program, settings=[f"param {setting}"])
+    assert not active(result).any()
+    assert "refused" in last_end(result)
+
+
+def pulses(signs):
+    """Lengths of the whole pulses between changes of sign."""
+    return np.diff(np.flatnonzero(np.diff(signs)))
+
+
+def test_the_pulses_are_those_of_the_tuning_rooms_prbs(programs):
+    for shortest, longest in ((10, 60), (1, 3), (7, 7)):
+        lengths = []
+        for seed in range(5):
+            (line,) = drive(programs["crtp"], [f"prbs {seed} {shortest} {longest} 20000"]).other
+            signs = np.array(line.split()[1:], int)
+            assert set(signs) == {-1, 1}
+            lengths.append(pulses(signs))
+        ours = np.concatenate(lengths)
+        theirs = pulses(np.sign(prbs(100_000, 1.0, shortest, longest, np.random.default_rng(0))))
+        assert (ours.min(), ours.max()) == (shortest, longest) == (theirs.min(), theirs.max())
+        assert ks_2samp(ours, theirs).pvalue > 0.05
+    first = [drive(programs["crtp"], [f"prbs {seed} 10 60 1"]).other[0] for seed in range(20)]
+    assert set(first) == {"prbs 1", "prbs -1"}
+
+
+# Sticks: Stabilized is nav_state 15, manual without altitude control.
+
+
+def by_sticks(program, *commands, attitude=1):
+    return drive(program, [*AIRBORNE, f"mode 1 1 0 {attitude} 15", "sticks 1 0 0 0 0", *[STEP] * 300, *commands])
+
+
+def test_sticks_command_the_tilt_that_px4_would(program):
+    tilt = np.radians(PX4_PARAMETERS["MPC_MAN_TILT_MAX"])
+    for roll, pitch in ((0.5, 0.0), (0.0, 0.5), (1.0, 1.0), (-0.3, 0.6)):
+        out = by_sticks(program, f"sticks 1 {roll} {pitch} 0 0", STEP, STEP).out
+        w, x, y, z = out["q_d"][-1].astype(float)
+        length = np.hypot(roll, pitch)
+        assert 2 * np.arccos(w) == pytest.approx(tilt * min(1, length), abs=1e-3)
+        np.testing.assert_allclose([x, y], np.array([roll, -pitch]) / length * np.sqrt(x * x + y * y), atol=1e-6)
+        assert z == 0
+        assert np.sign(out["rates"][-1, 0]) == np.sign(roll) or roll == 0
+
+
+def test_the_throttle_is_hover_in_the_middle_and_zero_until_the_motors_have_spooled_up(program):
+    out = by_sticks(program, "sticks 1 0 0 0 1", STEP, STEP, "sticks 1 0 0 0 -1", STEP, STEP).out
+    thrust = -out["thrust"][:, 2]
+    assert (thrust[:240] == 0).all()
+    assert thrust[260] == np.float32(0.5)
+    assert thrust[-3] == 1.0
+    assert thrust[-1] == pytest.approx(0.08, abs=1e-6)
+
+
+def test_the_yaw_stick_turns_and_the_heading_is_held_after_it(program):
+    out = by_sticks(program, "sticks 1 0 0 0.5 0", STEP, STEP).out
+    assert out["rates"][-1, 2] == pytest.approx(0.5 * np.radians(PX4_PARAMETERS["MPC_MAN_Y_MAX"]), rel=1e-5)
+    turned = f"attitude {text(*quaternion(0, 0, 0.4))} 0 1 0 0 0"
+    held = f"attitude {text(*quaternion(0, 0, 0.3))} 0 1 0 0 0"
+    out = by_sticks(program, "sticks 1 0 0 0.5 0", turned, STEP, "sticks 1 0 0 0 0", held, STEP, STEP).out
+    assert out["wanted"][-1, 2] == pytest.approx(0.4, abs=1e-5)
+    assert out["rates"][-1, 2] > 0.1
+
+
+def test_the_heading_follows_while_the_throttle_is_at_the_bottom(program):
+    turned = f"attitude {text(*quaternion(0, 0, 0.4))} 0 1 0 0 0"
+    for throttle, heading in ((-1, 0.4), (0, 0.0)):
+        out = by_sticks(program, f"sticks 1 0 0 0 {throttle}", turned, STEP, STEP).out
+        assert out["wanted"][-1, 2] == pytest.approx(heading, abs=1e-5)
+
+
+def test_a_reset_heading_moves_the_heading_that_the_sticks_hold(program):
+    step = quaternion(0, 0, 0.4)
+    out = by_sticks(program, f"attitude {text(*step)} 1 {text(*step)}", STEP, STEP).out
+    assert out["wanted"][-1, 2] == pytest.approx(0.4, abs=1e-5)
+
+
+def test_the_lowest_throttle_on_the_ground_is_zero(program):
+    out = by_sticks(program, "sticks 1 0 0 0 -1", "land 1 0", STEP, STEP).out
+    assert out["thrust"][-1, 2] == pytest.approx(0, abs=1e-6)
+
+
+def test_acro_flies_as_stabilized_and_says_so(program):
+    result = by_sticks(program, "sticks 1 0.5 0 0 0", STEP, STEP, attitude=0)
+    assert sum("Acro flies as Stabilized" in line for line in result.log) == 1
+    assert result.out["wanted"][-1, 0] == pytest.approx(0.5 * np.radians(35), abs=1e-3)
+
+
+def test_other_gains_compile_and_fly_their_own_numbers(gains, tmp_path):
+    other = dataclasses.replace(gains, Ts=0.002, moment_scale=None)
+    program = build(other, "crtp", tmp_path)
+    start = ["gyro_interval 2000", *AIRBORNE, *["gyro 2000 0.1 -0.2 0.3"] * 20]
+    inputs = np.zeros(19, INPUT)
+    inputs["rates"], inputs["armed"] = [0.1, -0.2, 0.3], 1
+    assert_same_bits(drive(program, start).out["torque"], native_outputs(other, inputs)["moment"])
