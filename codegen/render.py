@@ -14,7 +14,7 @@ from codegen.errors import CodegenError
 from codegen.layout import GAINS, INPUT, OUTPUT, STATE
 from codegen.literals import float_literal
 from codegen.parameters import PARAMETERS, check_ranges
-from codegen.toolchain import CXX_FLAGS, WARNINGS
+from codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
 from codegen.vectors import emitted_vectors
 from tuning.files import sha256, write_atomically
 from tuning.gains import Gains, gains_to_toml
@@ -25,7 +25,10 @@ MANIFEST = "manifest.json"
 MANIFEST_SCHEMA = 1
 
 #: Target -> the folders of firmware_templates that it is made of. ``package`` is the root of the output.
-TARGETS = {"native": ("core", "native", "package")}
+TARGETS = {
+    "native": ("core", "native", "package"),
+    "cortex-m4": ("core", "native", "cortex_m4", "package"),
+}
 
 
 def generator_version() -> str:
@@ -115,6 +118,7 @@ def _context(gains: Gains, target: str) -> dict[str, Any]:
             "state": STATE.itemsize,
         },
         "cxx_flags": " ".join((*CXX_FLAGS, *WARNINGS)),
+        "cortex_m4_flags": " ".join(CORTEX_M4_FLAGS),
         "vectors": emitted_vectors(gains),
     }
 
