@@ -10,6 +10,7 @@ import ctypes
 import mmap
 import re
 import subprocess
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -219,6 +220,12 @@ class EmulatedController:
         outputs = self.run(inputs, take)
         self._uc.hook_del(hook)
         return outputs, periods
+
+
+def load_emulated(gains: Gains) -> EmulatedController:
+    """`build_image` in a folder of its own, and the controller on it."""
+    with tempfile.TemporaryDirectory() as folder:
+        return EmulatedController(build_image(gains, Path(folder)), gains)
 
 
 def run_in_qemu(image: Image, inputs: NDArray[Any]) -> NDArray[Any]:

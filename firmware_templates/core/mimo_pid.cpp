@@ -1,6 +1,6 @@
 // Bit-exactness: every multiplication and addition below must round by itself, in the order written.
 // Compilers may fuse or reorder them unless told not to, and flight stacks often tell them to.
-#if defined(__clang__)
+#ifdef __clang__
 #pragma STDC FP_CONTRACT OFF
 #elif defined(__GNUC__)
 #pragma GCC optimize("fp-contract=off", "no-fast-math", "no-unsafe-math-optimizations", "no-associative-math", \
@@ -21,6 +21,11 @@ namespace {
 
 constexpr float kTwoPi = 6.2831855F;
 constexpr float kPi = 3.1415927F;
+
+[[gnu::always_inline]] inline bool unlikely(bool condition)
+{
+	return __builtin_expect(static_cast<long>(condition), 0L) != 0L;
+}
 
 // A range test on the bits: infinity and NaN stand above all numbers there, whatever the optimisation flags.
 bool within(float value, float limit)
@@ -44,7 +49,7 @@ float row(const float (&gain)[2], float roll, float pitch) { return gain[0] * ro
 // Shortest way round: the difference of two angles within 4 pi needs at most four turns.
 float wrap(float angle)
 {
-	if (__builtin_expect(__builtin_fabsf(angle) > kPi, false)) {
+	if (unlikely(__builtin_fabsf(angle) > kPi)) {
 		const float turn = angle > 0.0F ? -kTwoPi : kTwoPi;
 		int turns = 0;
 
@@ -68,7 +73,7 @@ float wrap(float angle)
 	}
 
 	for (int j = 0; j < kAxes; j++) {
-		if (!(gains.rate_max[j] > 0.0F && gains.moment_max[j] > 0.0F && gains.integral_max[j] > 0.0F)) { return false; }
+		if (gains.rate_max[j] <= 0.0F || gains.moment_max[j] <= 0.0F || gains.integral_max[j] <= 0.0F) { return false; }
 	}
 
 	return gains.derivative_pole >= 0.0F && gains.derivative_pole < 1.0F
@@ -154,17 +159,17 @@ float sum(const Terms &terms, float integral)
 // Takes an input that is within its range; keeps the last good value otherwise. True: invalid for too long.
 [[gnu::always_inline]] inline bool accept(float value, float limit, float &held, int32_t &age, uint32_t &fault_count)
 {
-	if (__builtin_expect(within(value, limit), true)) {
-		held = value;
-		age = 0;
-		return false;
+	if (unlikely(!within(value, limit))) {
+		fault_count++;
+
+		if (age <= kHoldSamples) { age++; }
+
+		return age > kHoldSamples;
 	}
 
-	fault_count++;
-
-	if (age <= kHoldSamples) { age++; }
-
-	return age > kHoldSamples;
+	held = value;
+	age = 0;
+	return false;
 }
 
 // Returns the bits of Output::fault.
@@ -193,7 +198,7 @@ float sum(const Terms &terms, float integral)
 			failed |= 64 << i;
 			derivative = 0.0F;
 
-		} else if (__builtin_expect(first, false)) {
+		} else if (unlikely(first)) {
 			derivative = 0.0F;
 
 		} else {
@@ -266,7 +271,7 @@ void control(State &state, const Input &input, Output &output)
 			held = moment < -limit || input.saturation[j] < 0;
 		}
 
-		if (__builtin_expect(held || __builtin_fabsf(integral) > gains.integral_max[j], false)) {
+		if (unlikely(held || __builtin_fabsf(integral) > gains.integral_max[j])) {
 			integral = held ? before : clamp(integral, gains.integral_max[j]);
 			moment = sum(terms, integral) + excitation;
 		}

@@ -24,8 +24,8 @@ void start_system_tick()
 
 extern "C" void system_tick(void) { periods = periods + 1U; }
 
-__attribute__((weak)) void read_board(mimopilot::Input &) {}
-__attribute__((weak)) void write_board(const mimopilot::Output &) {}
+__attribute__((weak)) void read_board(mimopilot::Input & /*input*/) {}
+__attribute__((weak)) void write_board(const mimopilot::Output & /*output*/) {}
 
 int main()
 {

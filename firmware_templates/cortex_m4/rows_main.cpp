@@ -6,11 +6,20 @@
 
 int main()
 {
-	FILE *const inputs = fopen("inputs.bin", "rb");
-	FILE *const outputs = fopen("outputs.bin", "wb");
 	mimopilot::State state;
 
-	if (inputs == nullptr || outputs == nullptr || !mimopilot::initialise(state, mimopilot::kGains)) { return 1; }
+	if (!mimopilot::initialise(state, mimopilot::kGains)) { return 1; }
+
+	FILE *const inputs = fopen("inputs.bin", "rb");
+
+	if (inputs == nullptr) { return 1; }
+
+	FILE *const outputs = fopen("outputs.bin", "wb");
+
+	if (outputs == nullptr) {
+		fclose(inputs);
+		return 1;
+	}
 
 	mimopilot::Input input;
 	mimopilot::Output output;
@@ -21,5 +30,6 @@ int main()
 		written = fwrite(&output, sizeof(output), 1, outputs) == 1 && written;
 	}
 
+	fclose(inputs);
 	return fclose(outputs) == 0 && written ? 0 : 1;
 }

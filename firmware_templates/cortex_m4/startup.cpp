@@ -9,12 +9,12 @@
 extern "C" {
 
 // From stm32f4.ld.
-extern uint32_t stack_top;
-extern const uint32_t data_load;
-extern uint32_t data_start;
-extern uint32_t data_end;
-extern uint32_t bss_start;
-extern uint32_t bss_end;
+extern uint32_t stack_top[];
+extern const uint32_t data_load[];
+extern uint32_t data_start[];
+extern uint32_t data_end[];
+extern uint32_t bss_start[];
+extern uint32_t bss_end[];
 
 int program(void) __asm__("main");  // ISO C++ forbids calling main by its name
 
@@ -35,9 +35,14 @@ constexpr uint32_t kFullAccessToFpu = 0xFU << 20;
 
 using Vector = void (*)();
 
+uintptr_t words(const uint32_t *first, const uint32_t *last)
+{
+	return (reinterpret_cast<uintptr_t>(last) - reinterpret_cast<uintptr_t>(first)) / sizeof(uint32_t);
+}
+
 // The exceptions of the core; a board appends its interrupts. A fault stops here, for the debugger to see.
 __attribute__((section(".vectors"), used)) const Vector vectors[] = {
-	reinterpret_cast<Vector>(&stack_top),
+	reinterpret_cast<Vector>(stack_top),
 	reset,
 	stop,                                    // NMI
 	stop,                                    // hard fault
@@ -59,11 +64,9 @@ void reset(void)
 	*reinterpret_cast<volatile uint32_t *>(kCoprocessorAccess) |= kFullAccessToFpu;
 	__asm__ volatile("dsb\n\tisb" ::: "memory");
 
-	const uint32_t *source = &data_load;
+	for (uintptr_t k = 0; k < words(data_start, data_end); k++) { data_start[k] = data_load[k]; }
 
-	for (uint32_t *word = &data_start; word < &data_end; word++) { *word = *source++; }
-
-	for (uint32_t *word = &bss_start; word < &bss_end; word++) { *word = 0; }
+	for (uintptr_t k = 0; k < words(bss_start, bss_end); k++) { bss_start[k] = 0; }
 
 #ifdef MIMO_PID_SEMIHOSTING
 	initialise_monitor_handles();

@@ -166,5 +166,5 @@ def test_a_gain_out_of_its_range_is_refused_by_name(gains):
 
 
 def test_an_unknown_target_is_refused(gains):
-    with pytest.raises(CodegenError, match="expected one of native"):
+    with pytest.raises(CodegenError, match="expected one of cortex-m4, native"):
         render(gains, "toaster")
