@@ -54,11 +54,11 @@ def pil(
     if as_json:
         print_json({figure.name: figure.value for figure in figures} | {"emulator": emulator, "failed": failed})
     else:
-        lines = [
-            [f.text, f"{f.value:.4g}" if isinstance(f.value, float) else str(f.value)]
-            + ["" if f.limit is None else f"{f.limit:g}", "" if f.limit is None else "pass" if f.passed else "FAIL"]
-            for f in figures
-        ]
+        lines = []
+        for figure in figures:
+            value = f"{figure.value:.4g}" if isinstance(figure.value, float) else str(figure.value)
+            verdict = ("", "") if figure.limit is None else (f"{figure.limit:g}", "pass" if figure.passed else "FAIL")
+            lines.append([figure.text, value, *verdict])
         print_table(f"controller on a Cortex-M4F, {emulator}", ["what", "figure", "at most", ""], lines)
     if failed:
         raise CodegenError(f"over its budget: {', '.join(failed)}", exit_code=1)

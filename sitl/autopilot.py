@@ -109,7 +109,7 @@ class Autopilot:
     ) -> None:
         check_moment_scale(airframe, gains)
         self.gains = gains
-        self.controller: NativeController | EmulatedController = controller or NativeController(load_native(gains), gains)
+        self.controller = controller or NativeController(load_native(gains), gains)
         self.step_address = self.controller.step_address
         self.allocation = airframe.allocation()
         self.hover = airframe.plant().mass * GRAVITY / (len(airframe.rotors) * airframe.motors.thrust_max)

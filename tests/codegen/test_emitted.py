@@ -134,7 +134,9 @@ def test_cppcheck_finds_nothing(tree):
 
 def test_cppcheck_would_find_a_mistake(tree):
     core = tree / "core" / "mimo_pid.cpp"
-    core.write_text(core.read_text().replace("i < 3 * kAxes; i++) { state.age[i]", "i <= 3 * kAxes; i++) { state.age[i]"))
+    right = "i < 3 * kAxes; i++) { state.age[i]"
+    assert right in core.read_text()
+    core.write_text(core.read_text().replace(right, right.replace("<", "<=")))
     result = run(BIN / "cppcheck", "--error-exitcode=1", "--language=c++", "--quiet", core)
     assert result.returncode == 1
     assert "arrayIndexOutOfBounds" in result.stderr
