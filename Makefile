@@ -7,14 +7,22 @@ JOBS ?= $(shell nproc)
 demo: $(VENV)/.installed
 	$(BIN)/mimopilot demo --out demo
 
-test: $(VENV)/.installed-test
+test: $(VENV)/.installed-test cross
 	$(BIN)/pytest -n $(JOBS)
+
+# What emulates and builds for the vehicle's processor; installed when missing.
+CROSS = gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
+cross:
+	@test -f "$$(arm-none-eabi-g++ -print-file-name=librdimon.a 2>&1)" && command -v qemu-system-arm >/dev/null \
+	|| { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && export DEBIAN_FRONTEND=noninteractive \
+	&& apt-get update -qq && apt-get install -qq -y --no-install-recommends $(CROSS); } \
+	|| { echo "the tests need a cross compiler and QEMU; on Debian, as root: apt-get install $(CROSS)"; exit 1; }
 
 lint: $(VENV)/.installed-test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
-bench: $(VENV)/.installed-test
+bench: $(VENV)/.installed-test cross
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[bench]'
 	$(BIN)/python -m tests.bench
 
@@ -32,4 +40,4 @@ $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 clean:
 	rm -rf $(VENV) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-.PHONY: demo test lint bench clean
+.PHONY: demo test lint bench clean cross

@@ -134,11 +134,6 @@ class NativeLibrary:
         if layout != LAYOUT:
             raise CodegenError(f"{path}: sizes and offsets are {layout}, expected {LAYOUT}; generate again")
 
-    @property
-    def step_address(self) -> int:
-        """Address of mimo_pid_step, for calls from compiled loops."""
-        return int(self.ffi.cast("uintptr_t", self.ffi.addressof(self.lib, "mimo_pid_step")))
-
     def default_gains(self) -> NDArray[np.float32]:
         """The gains that the library was generated with, (36,) float32."""
         gains = np.zeros(GAINS.shape, np.float32)
@@ -164,6 +159,12 @@ class NativeController:
         array = library.default_gains() if gains is None else to_array(gains)
         if not library.lib.mimo_pid_initialise(self._state, library.ffi.from_buffer("float[]", array)):
             raise CodegenError("the controller refused its gains: every one must be finite and within its range")
+
+    @property
+    def step_address(self) -> int:
+        """Address of mimo_pid_step, for calls from compiled loops."""
+        ffi = self.library.ffi
+        return int(ffi.cast("uintptr_t", ffi.addressof(self.library.lib, "mimo_pid_step")))
 
     def set_gains(self, gains: Gains | NDArray[np.float32]) -> bool:
         """Change the gains, bumpless. False: refused, the old ones stay.

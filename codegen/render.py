@@ -16,7 +16,7 @@ from codegen.layout import GAINS, INPUT, OUTPUT, STATE
 from codegen.literals import float_literal
 from codegen.parameters import EXCITATION, PARAMETERS, check_names, check_ranges, identity_parameters
 from codegen.px4 import APIS, entries
-from codegen.toolchain import CXX_FLAGS, WARNINGS
+from codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
 from codegen.vectors import emitted_vectors
 from tuning.files import sha256, write_atomically
 from tuning.gains import Gains, gains_to_toml
@@ -30,6 +30,7 @@ MANIFEST_SCHEMA = 1
 TARGETS = {
     "native": ("core", "native", "package"),
     "px4": ("core", "native", "px4", "package"),
+    "cortex-m4": ("core", "native", "cortex_m4", "package"),
 }
 
 
@@ -128,6 +129,7 @@ def _context(gains: Gains, target: str) -> dict[str, Any]:
             "state": STATE.itemsize,
         },
         "cxx_flags": " ".join((*CXX_FLAGS, *WARNINGS)),
+        "cortex_m4_flags": " ".join(CORTEX_M4_FLAGS),
         "vectors": emitted_vectors(gains),
     }
 

@@ -1,4 +1,4 @@
-"""The host's C++ compiler."""
+"""Compilers: of the host, and for the Cortex-M4."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from codegen.errors import CodegenError
 
-#: Flags of every host build; the Makefile that is emitted uses the same.
+#: Flags of every build; the Makefiles that are emitted use the same.
 CXX_FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fno-exceptions", "-fno-rtti")
 WARNINGS = (
     "-Wall",
@@ -23,6 +23,9 @@ WARNINGS = (
     "-Wshadow",
     "-Werror",
 )
+#: The Pixhawk Mini's processor: single-precision FPU, arguments in its registers.
+CORTEX_M4_FLAGS = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard")
+CROSS = "arm-none-eabi-"
 
 
 def find_compiler() -> str:
@@ -42,19 +45,52 @@ def find_compiler() -> str:
     raise CodegenError(f"no C++ compiler: {missing}; install one, on Debian: apt-get install g++")
 
 
+def find_tool(name: str, packages: str) -> str:
+    """Path of a program that Debian's `packages` bring.
+
+    Raises
+    ------
+    CodegenError
+        When it is not on the PATH, naming the packages.
+    """
+    path = shutil.which(name)
+    if path is None:
+        raise CodegenError(f"{name} is not on the PATH; install it, on Debian: apt-get install {packages}")
+    return path
+
+
+def cross_tool(name: str) -> str:
+    """Path of a program of the Cortex-M4's toolchain: ``g++``, ``nm``, ..."""
+    return find_tool(CROSS + name, "gcc-arm-none-eabi libnewlib-arm-none-eabi")
+
+
+def run_tool(command: Sequence[str | Path], folder: Path | None = None) -> str:
+    """What a compiler or one of its tools prints.
+
+    Raises
+    ------
+    CodegenError
+        When it fails: its first lines and the command to repeat.
+    """
+    words = [str(word) for word in command]
+    result = subprocess.run(words, capture_output=True, text=True, check=False, cwd=folder)
+    if result.returncode != 0:
+        first = "\n".join(result.stderr.splitlines()[:5]) or f"exit status {result.returncode}, no message"
+        raise CodegenError(f"{Path(words[0]).name} failed:\n{first}\nto repeat: {' '.join(words)}", exit_code=1)
+    return result.stdout
+
+
 def compile_shared(compiler: str, sources: Sequence[Path], output: Path) -> None:
     """Build `sources` into the shared library `output`; nothing is left behind on failure.
 
     Raises
     ------
     CodegenError
-        When the compiler fails: its first lines and the command to repeat.
+        When the compiler fails.
     """
     temporary = output.with_name(f".{output.name}.{os.getpid()}")
-    command = [compiler, *CXX_FLAGS, *WARNINGS, "-shared", "-fPIC", "-o", str(temporary), *map(str, sources)]
-    result = subprocess.run(command, capture_output=True, text=True, check=False)
-    if result.returncode != 0:
+    try:
+        run_tool([compiler, *CXX_FLAGS, *WARNINGS, "-shared", "-fPIC", "-o", temporary, *sources])
+        temporary.replace(output)
+    finally:
         temporary.unlink(missing_ok=True)
-        first = "\n".join(result.stderr.splitlines()[:5]) or f"exit status {result.returncode}, no message"
-        raise CodegenError(f"the C++ compiler failed:\n{first}\nto repeat: {' '.join(command)}", exit_code=1)
-    temporary.replace(output)

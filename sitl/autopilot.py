@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from codegen.cortex_m4 import EmulatedController
 from codegen.layout import INPUT, OUTPUT
 from codegen.native import NativeController, load_native
 from sitl.airframe import Airframe
@@ -88,8 +89,8 @@ class Autopilot:
         The vehicle that it flies.
     gains : Gains
         What the controller starts with.
-    controller : NativeController, optional
-        A loaded controller; by default one is generated from the gains and compiled.
+    controller : NativeController or EmulatedController, optional
+        A loaded controller; by default one is generated from the gains and compiled for this machine.
     altitude : float, m
         Altitude to hold.
 
@@ -100,12 +101,16 @@ class Autopilot:
     """
 
     def __init__(
-        self, airframe: Airframe, gains: Gains, controller: NativeController | None = None, altitude: float = 10.0
+        self,
+        airframe: Airframe,
+        gains: Gains,
+        controller: NativeController | EmulatedController | None = None,
+        altitude: float = 10.0,
     ) -> None:
         check_moment_scale(airframe, gains)
         self.gains = gains
         self.controller = controller or NativeController(load_native(gains), gains)
-        self.step_address = self.controller.library.step_address
+        self.step_address = self.controller.step_address
         self.allocation = airframe.allocation()
         self.hover = airframe.plant().mass * GRAVITY / (len(airframe.rotors) * airframe.motors.thrust_max)
         self.altitude = altitude

@@ -101,11 +101,13 @@ def fly(
     ] = 0.42,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
+    on: Annotated[str, typer.Option(help="native, or cortex-m4: the emulated processor of the vehicle.")] = "native",
     as_json: JsonOption = False,
 ) -> None:
     """Fly the generated C++ in process and print how well it followed."""
     from dataclasses import asdict
 
+    from codegen.cortex_m4 import load_emulated
     from sitl.autopilot import Autopilot
     from sitl.errors import SitlError
     from sitl.loop import fly as fly_scenario
@@ -117,7 +119,10 @@ def fly(
 
     body, controller = _load(airframe, gains)
     task = make_scenario(scenario, axis, amplitude_deg, period_s, controller.Ts)
-    flight = fly_scenario(body, Autopilot(body, controller), task, seed)
+    if on not in ("native", "cortex-m4"):
+        raise SitlError(f"--on: got {on!r}, expected native or cortex-m4")
+    processor = load_emulated(controller) if on == "cortex-m4" else None
+    flight = fly_scenario(body, Autopilot(body, controller, processor), task, seed)
     inner, outer = reference_models(controller, task.axis)
     figures: dict[str, Any] = {**asdict(performance(flight, inner, outer)), "crashed_at_s": flight.crashed_at}
     if out is not None:

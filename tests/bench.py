@@ -11,6 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
+from codegen.budget import processor_in_the_loop
+from codegen.cortex_m4 import load_emulated
 from codegen.native import NativeController, build_native, load_native
 from codegen.vectors import random_inputs, reference_outputs
 from sitl.airframe import load_airframe
@@ -44,6 +46,14 @@ def main() -> None:
         build = best(lambda: build_native(gains, folder / f"b{next(numbers)}"), 3)
         rows.append(["emit and compile the native library", f"{build:.2f} s", ""])
 
+        begin = time.perf_counter()
+        figures = {figure.name: figure for figure in processor_in_the_loop(gains)}
+        pace = figures["rows"].value / (time.perf_counter() - begin)
+        rows.append(["pil, compiled, traced and compared", f"{pace:.0f} rows/s", ""])
+        for figure in figures.values():
+            if figure.limit is not None:
+                rows.append([f"pil, {figure.text}", f"{figure.value:.4g}", f"at most {figure.limit:g}"])
+
         scenario = excitation_flight(20.0, 0.15, 50.0, TS, np.random.default_rng(0))
         library = load_native(gains)
 
@@ -53,6 +63,9 @@ def main() -> None:
         flight()
         speed = 40.0 / best(flight)
         rows.append(["flight in process, 6 degrees of freedom, RK4 at 1 kHz", f"{speed:.0f} x real time", ""])
+        processor = load_emulated(gains)
+        emulated = 40.0 / best(lambda: fly(airframe, Autopilot(airframe, gains, processor), scenario, 0), 2)
+        rows.append(["the same on the emulated Cortex-M4", f"{emulated:.0f} x real time", f"1/{speed / emulated:.0f}"])
 
         task = doublet("roll", 0.39, 4.0, TS, tail=20.0)
         autopilot = Autopilot(airframe, gains, NativeController(library, gains))

@@ -1,6 +1,6 @@
 // Bit-exactness: every multiplication and addition below must round by itself, in the order written.
 // Compilers may fuse or reorder them unless told not to, and flight stacks often tell them to.
-#if defined(__clang__)
+#ifdef __clang__
 #pragma STDC FP_CONTRACT OFF
 #elif defined(__GNUC__)
 #pragma GCC optimize("fp-contract=off", "no-fast-math", "no-unsafe-math-optimizations", "no-associative-math", \
@@ -17,166 +17,273 @@ namespace mimopilot {
 
 namespace {
 
+// Size and time are budgeted: the attributes and expectations below are what makes the step short and the rest small.
+
 constexpr float kTwoPi = 6.2831855F;
 constexpr float kPi = 3.1415927F;
 
-// A range test, not isfinite: it catches NaN and infinity too, and survives every optimisation flag.
-bool within(float value, float limit) { return value >= -limit && value <= limit; }
+[[gnu::always_inline]] inline bool unlikely(bool condition)
+{
+	return __builtin_expect(static_cast<long>(condition), 0L) != 0L;
+}
 
-bool nonzero(float value) { return value > 0.0F || value < 0.0F; }  // some flight stacks forbid != between floats
+// A range test on the bits: infinity and NaN stand above all numbers there, whatever the optimisation flags.
+bool within(float value, float limit)
+{
+	uint32_t bits;
+	uint32_t limit_bits;
+	__builtin_memcpy(&bits, &value, sizeof(bits));
+	__builtin_memcpy(&limit_bits, &limit, sizeof(limit_bits));
+	return bits << 1 <= limit_bits << 1;
+}
 
 float clamp(float value, float limit)
 {
-	if (value > limit) { return limit; }
-
-	if (value < -limit) { return -limit; }
+	if (__builtin_fabsf(value) > limit) { value = value > 0.0F ? limit : -limit; }
 
 	return value;
 }
 
-float row(const float (&gain)[2], const float (&x)[kAxes]) { return gain[0] * x[0] + gain[1] * x[1]; }
+float row(const float (&gain)[2], float roll, float pitch) { return gain[0] * roll + gain[1] * pitch; }
 
 // Shortest way round: the difference of two angles within 4 pi needs at most four turns.
 float wrap(float angle)
 {
-	for (int turn = 0; turn < 4 && angle > kPi; turn++) { angle -= kTwoPi; }
+	if (unlikely(__builtin_fabsf(angle) > kPi)) {
+		const float turn = angle > 0.0F ? -kTwoPi : kTwoPi;
+		int turns = 0;
 
-	for (int turn = 0; turn < 4 && angle < -kPi; turn++) { angle += kTwoPi; }
+		do {
+			angle += turn;
+			turns++;
+		} while (turns < 4 && __builtin_fabsf(angle) > kPi);
+	}
 
 	return angle;
 }
 
-bool acceptable(const Gains &gains)
+[[gnu::cold, gnu::noinline]] bool acceptable(const Gains &gains)
 {
-	const float (*const matrices[])[2] = {gains.kp_o, gains.kp_i, gains.ki_i, gains.kd_i, gains.kff_i};
+	constexpr int kCount = 36;
+	static_assert(sizeof(Gains) == kCount * sizeof(float), "Gains is a row of floats");
+	const float *const values = reinterpret_cast<const float *>(&gains);
 
-	for (const auto matrix : matrices) {
-		for (int i = 0; i < 2; i++) {
-			for (int j = 0; j < 2; j++) {
-				if (!within(matrix[i][j], kMaxGain)) { return false; }
-			}
-		}
+	for (int i = 0; i < kCount; i++) {
+		if (!within(values[i], kMaxGain)) { return false; }
 	}
 
-	const float yaw[] = {gains.yaw_kp_o, gains.yaw_kp_i, gains.yaw_ki_i, gains.yaw_kd_i, gains.yaw_kff_i};
-
-	for (const float gain : yaw) {
-		if (!within(gain, kMaxGain)) { return false; }
-	}
-
-	const float *const limits[] = {gains.rate_max, gains.moment_max, gains.integral_max};
-
-	for (const auto limit : limits) {
-		for (int i = 0; i < kAxes; i++) {
-			if (!(limit[i] > 0.0F && limit[i] <= kMaxGain)) { return false; }
-		}
+	for (int j = 0; j < kAxes; j++) {
+		if (gains.rate_max[j] <= 0.0F || gains.moment_max[j] <= 0.0F || gains.integral_max[j] <= 0.0F) { return false; }
 	}
 
 	return gains.derivative_pole >= 0.0F && gains.derivative_pole < 1.0F
 	       && gains.period >= 1.0e-4F && gains.period <= 1.0F;
 }
 
-// The terms of v that hold no memory of the error.
-struct Terms {
-	float rates_setpoint[kAxes];
-	float proportional[kAxes];
-	float derivative[kAxes];
-	float feedforward[kAxes];
-	float increment[kAxes];  // dI = Ts Ki e
+// The outer loop: rate set-points r.
+[[gnu::noinline]] void outer_loop(const Gains &gains, const State &state, float (&r)[kAxes])
+{
+	const float roll = state.setpoint[0] - state.attitude[0];
+	const float pitch = state.setpoint[1] - state.attitude[1];
+	const float yaw = wrap(state.setpoint[2] - state.attitude[2]);
+	r[0] = clamp(row(gains.kp_o[0], roll, pitch), gains.rate_max[0]);
+	r[1] = clamp(row(gains.kp_o[1], roll, pitch), gains.rate_max[1]);
+	r[2] = clamp(gains.yaw_kp_o * yaw, gains.rate_max[2]);
+}
+
+struct Axes {
+	float roll;
+	float pitch;
+	float yaw;
 };
 
-void evaluate(const Gains &gains, const State &state, Terms &terms)
-{
-	const float angle_error[kAxes] = {
-		state.setpoint[0] - state.attitude[0],
-		state.setpoint[1] - state.attitude[1],
-		wrap(state.setpoint[2] - state.attitude[2]),
-	};
-	float *const r = terms.rates_setpoint;
-	r[0] = clamp(row(gains.kp_o[0], angle_error), gains.rate_max[0]);
-	r[1] = clamp(row(gains.kp_o[1], angle_error), gains.rate_max[1]);
-	r[2] = clamp(gains.yaw_kp_o * angle_error[2], gains.rate_max[2]);
-	const float error[kAxes] = {r[0] - state.rates[0], r[1] - state.rates[1], r[2] - state.rates[2]};
+// What the inner loop works on.
+struct Signals {
+	Axes rates_setpoint;
+	Axes error;
+	Axes derivative;
+};
 
-	for (int j = 0; j < 2; j++) {
-		terms.proportional[j] = row(gains.kp_i[j], error);
-		terms.derivative[j] = row(gains.kd_i[j], state.derivative);
-		terms.feedforward[j] = row(gains.kff_i[j], terms.rates_setpoint);
-		terms.increment[j] = gains.period * row(gains.ki_i[j], error);
+[[gnu::always_inline]] inline Signals signals(const State &state, const float (&r)[kAxes])
+{
+	return {
+		{r[0], r[1], r[2]},
+		{r[0] - state.rates[0], r[1] - state.rates[1], r[2] - state.rates[2]},
+		{state.derivative[0], state.derivative[1], state.derivative[2]},
+	};
+}
+
+// The terms of v on one axis.
+struct Terms {
+	float proportional;
+	float derivative;
+	float feedforward;
+	float slope;  // Ki e
+};
+
+[[gnu::always_inline]] inline Terms inner_loop(const Gains &gains, const Signals &x, int j)
+{
+	if (j == 2) {
+		return {
+			gains.yaw_kp_i * x.error.yaw,
+			gains.yaw_kd_i * x.derivative.yaw,
+			gains.yaw_kff_i * x.rates_setpoint.yaw,
+			gains.yaw_ki_i * x.error.yaw,
+		};
 	}
 
-	terms.proportional[2] = gains.yaw_kp_i * error[2];
-	terms.derivative[2] = gains.yaw_kd_i * state.derivative[2];
-	terms.feedforward[2] = gains.yaw_kff_i * r[2];
-	terms.increment[2] = gains.period * (gains.yaw_ki_i * error[2]);
+	return {
+		row(gains.kp_i[j], x.error.roll, x.error.pitch),
+		row(gains.kd_i[j], x.derivative.roll, x.derivative.pitch),
+		row(gains.kff_i[j], x.rates_setpoint.roll, x.rates_setpoint.pitch),
+		row(gains.ki_i[j], x.error.roll, x.error.pitch),
+	};
 }
 
-float sum(const Terms &terms, int j, float integral)
+float sum(const Terms &terms, float integral)
 {
-	return ((terms.proportional[j] + integral) - terms.derivative[j]) + terms.feedforward[j];
+	return ((terms.proportional + integral) - terms.derivative) + terms.feedforward;
 }
 
-// Takes an input that is within its range; keeps the last good value otherwise.
-void accept(float value, float limit, float &held, int32_t &age, uint32_t &fault_count)
+// v of each axis.
+[[gnu::cold, gnu::noinline]] void evaluate(const Gains &gains, const State &state, const float (&integral)[kAxes],
+					   float (&v)[kAxes])
 {
-	if (within(value, limit)) {
-		held = value;
-		age = 0;
+	float r[kAxes];
+	outer_loop(gains, state, r);
+	const Signals x = signals(state, r);
 
-	} else {
+	for (int j = 0; j < kAxes; j++) { v[j] = sum(inner_loop(gains, x, j), integral[j]); }
+}
+
+// Takes an input that is within its range; keeps the last good value otherwise. True: invalid for too long.
+[[gnu::always_inline]] inline bool accept(float value, float limit, float &held, int32_t &age, uint32_t &fault_count)
+{
+	if (unlikely(!within(value, limit))) {
 		fault_count++;
 
 		if (age <= kHoldSamples) { age++; }
+
+		return age > kHoldSamples;
 	}
+
+	held = value;
+	age = 0;
+	return false;
 }
 
-int32_t accept_inputs(State &state, const Input &input)
+// Returns the bits of Output::fault.
+[[gnu::always_inline]] inline int32_t accept_inputs(State &state, const Input &input)
 {
 	int32_t failed = 0;
-	const float filter_gain = (1.0F - state.gains.derivative_pole) / state.gains.period;
+	const float pole = state.gains.derivative_pole;
+	const float filter_gain = (1.0F - pole) / state.gains.period;
+	uint32_t fault_count = state.fault_count;
 
 	for (int i = 0; i < kAxes; i++) {
-		accept(input.attitude_setpoint[i], kMaxAngle, state.setpoint[i], state.age[i], state.fault_count);
-		accept(input.attitude[i], kMaxAngle, state.attitude[i], state.age[kAxes + i], state.fault_count);
+		if (accept(input.attitude_setpoint[i], kMaxAngle, state.setpoint[i], state.age[i], fault_count)) {
+			failed |= 1 << i;
+		}
+
+		if (accept(input.attitude[i], kMaxAngle, state.attitude[i], state.age[kAxes + i], fault_count)) {
+			failed |= 8 << i;
+		}
 
 		int32_t &age = state.age[2 * kAxes + i];
 		const bool first = age > kHoldSamples;
 		const float previous = state.rates[i];
-		accept(input.rates[i], kMaxRate, state.rates[i], age, state.fault_count);
-		state.derivative[i] = first || age > kHoldSamples
-				      ? 0.0F
-				      : state.gains.derivative_pole * state.derivative[i] + filter_gain * (state.rates[i] - previous);
+		float derivative = pole * state.derivative[i];
+
+		if (accept(input.rates[i], kMaxRate, state.rates[i], age, fault_count)) {
+			failed |= 64 << i;
+			derivative = 0.0F;
+
+		} else if (unlikely(first)) {
+			derivative = 0.0F;
+
+		} else {
+			derivative += filter_gain * (state.rates[i] - previous);
+		}
+
+		state.derivative[i] = derivative;
 	}
 
-	for (int i = 0; i < 3 * kAxes; i++) {
-		if (state.age[i] > kHoldSamples) { failed |= 1 << i; }
-	}
-
+	state.fault_count = fault_count;
 	return failed;
 }
 
+// NaN means that nothing is injected; anything else out of range is a fault.
+float accept_excitation(float value, uint32_t &fault_count)
+{
+	if (!within(value, kMaxExcitation)) {
+		if (within(value, __builtin_inff())) { fault_count++; }
+
+		value = 0.0F;
+	}
+
+	return value;
+}
+
 // An input has been invalid for too long: damp the rates that are still measured, leave the failed axes alone.
-void damp_rates(const State &state, int32_t failed, float (&moment)[kAxes])
+[[gnu::cold, gnu::noinline]] void damp_rates(State &state, int32_t failed, const Input &input, Output &output)
 {
 	const Gains &gains = state.gains;
-	bool valid[kAxes];
-	float rates[kAxes];
+	const int32_t lost = failed >> (2 * kAxes);
+	const float roll = (lost & 1) != 0 ? 0.0F : state.rates[0];
+	const float pitch = (lost & 2) != 0 ? 0.0F : state.rates[1];
 
-	for (int i = 0; i < kAxes; i++) {
-		valid[i] = (failed & (1 << (2 * kAxes + i))) == 0;
-		rates[i] = valid[i] ? state.rates[i] : 0.0F;
+	for (int j = 0; j < kAxes; j++) {
+		float moment = j == 2 ? -(gains.yaw_kp_i * state.rates[2]) - gains.yaw_kd_i * state.derivative[2]
+			       : -row(gains.kp_i[j], roll, pitch) - row(gains.kd_i[j], state.derivative[0], state.derivative[1]);
+
+		if ((lost & (1 << j)) != 0) { moment = 0.0F; }
+
+		accept_excitation(input.excitation[j], state.fault_count);
+		output.moment[j] = clamp(moment, gains.moment_max[j]);
+		output.rates_setpoint[j] = 0.0F;
 	}
+}
 
-	for (int j = 0; j < 2; j++) {
-		moment[j] = valid[j] ? -row(gains.kp_i[j], rates) - row(gains.kd_i[j], state.derivative) : 0.0F;
+// The whole controller, with anti-windup for each output. The integral is within its limit from the period before,
+// and never a negative zero: adding nothing to it changes no bit.
+void control(State &state, const Input &input, Output &output)
+{
+	const Gains &gains = state.gains;
+	const bool integrating = input.armed != 0 && input.landed == 0;
+	const float period = integrating ? gains.period : 0.0F;
+	outer_loop(gains, state, output.rates_setpoint);
+	const Signals x = signals(state, output.rates_setpoint);
+
+	for (int j = 0; j < kAxes; j++) {
+		const Terms terms = inner_loop(gains, x, j);
+		const float excitation = accept_excitation(input.excitation[j], state.fault_count);
+		const float limit = gains.moment_max[j];
+		const float increment = period * terms.slope;
+		const float before = state.integral[j];
+		float integral = before + increment;
+		float moment = sum(terms, integral) + excitation;
+		bool held = false;
+
+		if (increment > 0.0F) {
+			held = moment > limit || input.saturation[j] > 0;
+
+		} else if (increment < 0.0F) {
+			held = moment < -limit || input.saturation[j] < 0;
+		}
+
+		if (unlikely(held || __builtin_fabsf(integral) > gains.integral_max[j])) {
+			integral = held ? before : clamp(integral, gains.integral_max[j]);
+			moment = sum(terms, integral) + excitation;
+		}
+
+		state.integral[j] = integral;
+		output.moment[j] = clamp(moment, limit);
 	}
-
-	moment[2] = valid[2] ? -(gains.yaw_kp_i * rates[2]) - gains.yaw_kd_i * state.derivative[2] : 0.0F;
 }
 
 }  // namespace
 
-bool initialise(State &state, const Gains &gains)
+[[gnu::cold]] bool initialise(State &state, const Gains &gains)
 {
 	state = State{};
 
@@ -194,20 +301,20 @@ bool initialise(State &state, const Gains &gains)
 	return accepted;
 }
 
-bool set_gains(State &state, const Gains &gains)
+[[gnu::cold]] bool set_gains(State &state, const Gains &gains)
 {
 	if (!acceptable(gains)) { return false; }
 
-	Terms before;
-	Terms after;
-	evaluate(state.gains, state, before);
-	evaluate(gains, state, after);
+	const float zero[kAxes] = {};
+	float before[kAxes];
+	float rest[kAxes];
+	evaluate(state.gains, state, state.integral, before);
+	evaluate(gains, state, zero, rest);
 
 	for (int j = 0; j < kAxes; j++) {
-		const float output = sum(before, j, state.integral[j]);
-		const float rest = sum(after, j, 0.0F);
-		const bool integrates = j == 2 ? nonzero(gains.yaw_ki_i) : nonzero(gains.ki_i[j][0]) || nonzero(gains.ki_i[j][1]);
-		state.integral[j] = integrates ? clamp(output - rest, gains.integral_max[j]) : 0.0F;
+		const bool unused = j == 2 ? within(gains.yaw_ki_i, 0.0F)
+				    : within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F);
+		state.integral[j] = unused ? 0.0F : clamp(before[j] - rest[j], gains.integral_max[j]);
 	}
 
 	state.gains = gains;
@@ -216,43 +323,17 @@ bool set_gains(State &state, const Gains &gains)
 
 void step(State &state, const Input &input, Output &output)
 {
-	const Gains &gains = state.gains;
 	const int32_t failed = accept_inputs(state, input);
-	Terms terms;
-	evaluate(gains, state, terms);
 
-	if (failed != 0) { damp_rates(state, failed, output.moment); }
+	if (input.armed == 0) {
+		for (int j = 0; j < kAxes; j++) { state.integral[j] = 0.0F; }
+	}
 
-	for (int j = 0; j < kAxes; j++) {
-		float excitation = input.excitation[j];
+	if (failed != 0) {
+		damp_rates(state, failed, input, output);
 
-		// NaN means that nothing is injected; anything else out of range is a fault.
-		if (excitation > kMaxExcitation || excitation < -kMaxExcitation) { state.fault_count++; }
-
-		if (!within(excitation, kMaxExcitation)) { excitation = 0.0F; }
-
-		if (failed == 0) {
-			const float limit = gains.moment_max[j];
-			float increment = terms.increment[j];
-			const float attempt = sum(terms, j, state.integral[j] + increment) + excitation;
-			const bool high = attempt > limit || input.saturation[j] > 0;
-			const bool low = attempt < -limit || input.saturation[j] < 0;
-
-			if (input.landed != 0 || (high && increment > 0.0F) || (low && increment < 0.0F)) { increment = 0.0F; }
-
-			state.integral[j] = clamp(state.integral[j] + increment, gains.integral_max[j]);
-
-			if (input.armed == 0) { state.integral[j] = 0.0F; }
-
-			output.moment[j] = clamp(sum(terms, j, state.integral[j]) + excitation, limit);
-			output.rates_setpoint[j] = terms.rates_setpoint[j];
-
-		} else {
-			if (input.armed == 0) { state.integral[j] = 0.0F; }
-
-			output.moment[j] = clamp(output.moment[j], gains.moment_max[j]);
-			output.rates_setpoint[j] = 0.0F;
-		}
+	} else {
+		control(state, input, output);
 	}
 
 	output.fault = failed;

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
+from codegen.cortex_m4 import EmulatedController
 from codegen.native import NativeController
 from codegen.parameters import IDENTITY, PARAMETERS, Parameter, identity_parameters, to_array
 from tuning.gains import Gains
@@ -23,13 +24,13 @@ class ParameterServer:
 
     Parameters
     ----------
-    controller : NativeController
+    controller : NativeController or EmulatedController
         The running controller.
     gains : Gains
         What it runs with.
     """
 
-    def __init__(self, controller: NativeController, gains: Gains) -> None:
+    def __init__(self, controller: NativeController | EmulatedController, gains: Gains) -> None:
         self.controller = controller
         self.values = to_array(gains)
         identity = identity_parameters(gains)

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pyulog import ULog
 
+from codegen.cortex_m4 import load_emulated
 from codegen.parameters import PARAMETERS
 from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
@@ -51,6 +52,27 @@ def test_the_flown_moments_are_those_of_the_python_reference(vehicle):
         out = controller.step(row["setpoint"], row["attitude"], row["rates"], row["excitation"], saturation)
         assert (out.moment == row["moment"]).all()
         saturation = row["unallocated"]
+
+
+def test_a_minute_on_the_emulated_processor_is_the_flight_of_the_native_library_in_every_bit(vehicle):
+    scenario = excitation_flight(30.0, 0.15, 50.0, TS, np.random.default_rng(2))
+    gains = vehicle.default_gains()
+    native = fly(vehicle.airframe, fresh(vehicle), scenario, 5)
+    emulated = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains, load_emulated(gains)), scenario, 5)
+    assert len(native.record) == 15_000
+    assert np.abs(native.record["moment"]).max() > 0.1
+    assert native.record.tobytes() == emulated.record.tobytes()
+    assert native.truth.tobytes() == emulated.truth.tobytes()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_processor_that_stops_loses_the_vehicle_and_flies_no_stale_moment(vehicle):
+    gains = vehicle.default_gains()
+    processor = load_emulated(gains)
+    processor.image.functions["step"] = 0x3000_0000  # no memory there
+    flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains, processor), hover("roll", 1.0, TS), 0)
+    assert np.isnan(flight.record["moment"]).all()
+    assert flight.crashed_at == 0.0
 
 
 def test_noise_has_the_stated_size_and_no_noise_means_none(vehicle):

@@ -1,0 +1,263 @@
+"""The controller on an emulated Cortex-M4F: its image, and the two emulators that run it.
+
+`EmulatedController` (unicorn) takes the place of `codegen.native.NativeController`; `run_in_qemu` starts the
+emitted firmware as a board would, from reset.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import re
+import subprocess
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.errors import CodegenError
+from codegen.layout import GAINS, INPUT, OUTPUT, STATE
+from codegen.parameters import to_array
+from codegen.render import render, write_tree
+from codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS, cross_tool, find_tool, run_tool
+from tuning.gains import Gains
+
+FLASH, FLASH_SIZE = 0x0800_0000, 1 << 20
+RAM, RAM_SIZE = 0x2000_0000, 1 << 16
+#: Where the structures stand in the emulated RAM; the stack grows from its end towards them.
+STATE_AT, INPUT_AT, OUTPUT_AT, GAINS_AT = RAM, RAM + 0x400, RAM + 0x600, RAM + 0x800
+#: A function returns to here, and the emulator stops.
+RETURN = FLASH + FLASH_SIZE - 0x100
+#: vmsr fpscr, r0; bx lr: a write to FPSCR from outside is not applied.
+SET_FPSCR = bytes.fromhex("e1ee100a7047")
+
+FUNCTIONS = ("initialise", "set_gains", "step")
+QEMU_SECONDS = 300
+
+
+@dataclass(frozen=True)
+class Image:
+    """Firmware that runs rows.
+
+    Attributes
+    ----------
+    elf : Path
+        Linked image.
+    core : Path
+        Object file of the controller alone; beside it lies its call graph (``.ci``).
+    flash : bytes
+        What stands in the flash memory.
+    functions : dict
+        Name in `FUNCTIONS` -> address.
+    """
+
+    elf: Path
+    core: Path
+    flash: bytes
+    functions: dict[str, int]
+
+
+def build_image(gains: Gains, folder: Path, flags: Sequence[str] = CXX_FLAGS) -> Image:
+    """Emit the cortex-m4 target into `folder` and compile it.
+
+    Parameters
+    ----------
+    gains : Gains
+        The gains that the firmware starts with.
+    folder : Path
+        Empty, or one that was generated.
+    flags : sequence of str
+        What the controller itself is compiled with, beside those of the processor.
+
+    Raises
+    ------
+    CodegenError
+        When there is no cross compiler or it fails, or the folder is not ours to write.
+    """
+    compiler = cross_tool("g++")
+    write_tree(render(gains, "cortex-m4"), folder)
+    build, target = folder / "build", folder / "cortex_m4"
+    build.mkdir(exist_ok=True)
+    core, elf, flash = build / "mimo_pid.o", build / "rows.elf", build / "rows.bin"
+    source = folder / "core" / "mimo_pid.cpp"
+    run_tool([compiler, *flags, *WARNINGS, *CORTEX_M4_FLAGS, "-fcallgraph-info=su", "-c", source, "-o", core])
+    sources = (target / "startup.cpp", target / "rows_main.cpp", core)
+    libraries = ("-Wl,--start-group", "-lc", "-lgcc", "-lrdimon", "-Wl,--end-group")
+    link = ("-nostdlib", "-DMIMO_PID_SEMIHOSTING", "-T", target / "stm32f4.ld")
+    run_tool([compiler, *CXX_FLAGS, *WARNINGS, *CORTEX_M4_FLAGS, *link, *sources, *libraries, "-o", elf])
+    run_tool([cross_tool("objcopy"), "-O", "binary", elf, flash])
+    symbols = run_tool([cross_tool("nm"), "-C", elf])
+    found = re.findall(rf"^([0-9a-f]+) T mimopilot::({'|'.join(FUNCTIONS)})\(", symbols, re.MULTILINE)
+    return Image(elf, core, flash.read_bytes(), {name: int(address, 16) for address, name in found})
+
+
+class EmulatedController:
+    """One controller on a Cortex-M4F emulated by unicorn; called as a `NativeController` is.
+
+    Parameters
+    ----------
+    image : Image
+        The firmware; its functions are called directly.
+    gains : Gains
+        What it starts with.
+
+    Raises
+    ------
+    CodegenError
+        When unicorn is not installed, or the controller refuses its gains.
+    """
+
+    def __init__(self, image: Image, gains: Gains) -> None:
+        try:
+            import unicorn
+            from unicorn import arm_const as arm
+        except ImportError:
+            raise CodegenError(
+                "the emulator unicorn is not installed; install it: pip install 'mimopilot[emulator]'"
+            ) from None
+        self.image = image
+        self._memory = mmap.mmap(-1, RAM_SIZE)
+        self._uc = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)
+        self._uc.ctl_set_cpu_model(arm.UC_CPU_ARM_CORTEX_M4)
+        self._uc.mem_map(FLASH, FLASH_SIZE)
+        self._uc.mem_write(FLASH, image.flash)
+        self._uc.mem_write(RETURN - len(SET_FPSCR), SET_FPSCR)
+        pointer = ctypes.addressof(ctypes.c_char.from_buffer(self._memory))
+        self._uc.mem_map_ptr(RAM, RAM_SIZE, unicorn.UC_PROT_READ | unicorn.UC_PROT_WRITE, pointer)
+        self._registers = (arm.UC_ARM_REG_R0, arm.UC_ARM_REG_R1, arm.UC_ARM_REG_R2)
+        self._sp, self._lr = arm.UC_ARM_REG_SP, arm.UC_ARM_REG_LR
+        self._block_hook = unicorn.UC_HOOK_BLOCK
+        self._error: type[Exception] = unicorn.UcError
+        self._uc.reg_write(arm.UC_ARM_REG_C1_C0_2, 0xF << 20)
+        self._uc.reg_write(arm.UC_ARM_REG_FPEXC, 1 << 30)
+        self._call(RETURN - len(SET_FPSCR), 0)
+
+        def view(at: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+            return np.frombuffer(self._memory, dtype, 1, at - RAM)
+
+        #: The controller's state, (1,) array of `codegen.layout.STATE`: the emulated memory itself.
+        self.state = view(STATE_AT, STATE)
+        self._input, self._output, self._gains = view(INPUT_AT, INPUT), view(OUTPUT_AT, OUTPUT), view(GAINS_AT, GAINS)
+        self._gains[0] = to_array(gains)
+        if not self._call(image.functions["initialise"], STATE_AT, GAINS_AT):
+            raise CodegenError("the controller refused its gains: every one must be finite and within its range")
+        self._foreign_step = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(self._step_at)
+
+    def _call(self, function: int, *arguments: int) -> int:
+        """Call a function as the ARM procedure call standard has it; returns r0."""
+        for register, value in zip(self._registers, arguments, strict=False):
+            self._uc.reg_write(register, value)
+        self._uc.reg_write(self._sp, RAM + RAM_SIZE)
+        self._uc.reg_write(self._lr, RETURN | 1)
+        try:
+            self._uc.emu_start(function | 1, RETURN)
+        except self._error as error:
+            raise CodegenError(f"the emulated controller stopped: {error}", exit_code=1) from error
+        return int(self._uc.reg_read(self._registers[0]))
+
+    def _step(self) -> None:
+        self._call(self.image.functions["step"], STATE_AT, INPUT_AT, OUTPUT_AT)
+
+    def _step_at(self, state: int, inputs: int, outputs: int) -> None:
+        # `state` is the emulated memory already. An error leaves NaN behind: a lost vehicle, never a stale moment.
+        ctypes.memset(outputs, 0xFF, OUTPUT.itemsize)
+        ctypes.memmove(self._input.ctypes.data, inputs, INPUT.itemsize)
+        self._step()
+        ctypes.memmove(outputs, self._output.ctypes.data, OUTPUT.itemsize)
+
+    @property
+    def step_address(self) -> int:
+        """Address of a function like mimo_pid_step, for calls from compiled loops; `state` is this one's."""
+        return int(ctypes.cast(self._foreign_step, ctypes.c_void_p).value or 0)
+
+    def set_gains(self, gains: Gains | NDArray[np.float32]) -> bool:
+        """Change the gains, bumpless. False: refused, the old ones stay.
+
+        Parameters
+        ----------
+        gains : Gains or (36,) float32 array
+            The new set.
+        """
+        self._gains[0] = gains if isinstance(gains, np.ndarray) else to_array(gains)
+        return bool(self._call(self.image.functions["set_gains"], STATE_AT, GAINS_AT))
+
+    def run(self, inputs: NDArray[Any], after_each: Callable[[], None] = lambda: None) -> NDArray[Any]:
+        """Consecutive control periods.
+
+        Parameters
+        ----------
+        inputs : (N,) array of `codegen.layout.INPUT`
+            One row a period.
+        after_each : callable
+            Called after each period.
+
+        Returns
+        -------
+        (N,) array of `codegen.layout.OUTPUT`
+        """
+        outputs = np.zeros(len(inputs), OUTPUT)
+        for k in range(len(inputs)):
+            self._input[0] = inputs[k]
+            self._step()
+            outputs[k] = self._output[0]
+            after_each()
+        return outputs
+
+    def run_traced(self, inputs: NDArray[Any]) -> tuple[NDArray[Any], list[list[tuple[int, int]]]]:
+        """As `run`; also the basic blocks that each period executed, as (address, bytes)."""
+        blocks: list[tuple[int, int]] = []
+        periods: list[list[tuple[int, int]]] = []
+
+        def take() -> None:
+            periods.append(blocks.copy())
+            blocks.clear()
+
+        hook = self._uc.hook_add(self._block_hook, lambda _uc, address, size, _data: blocks.append((address, size)))
+        outputs = self.run(inputs, take)
+        self._uc.hook_del(hook)
+        return outputs, periods
+
+
+def load_emulated(gains: Gains) -> EmulatedController:
+    """`build_image` in a folder of its own, and the controller on it."""
+    with tempfile.TemporaryDirectory() as folder:
+        return EmulatedController(build_image(gains, Path(folder)), gains)
+
+
+def run_in_qemu(image: Image, inputs: NDArray[Any]) -> NDArray[Any]:
+    """The same periods on a whole emulated board (QEMU's netduinoplus2, an STM32F405), from reset.
+
+    Parameters
+    ----------
+    image : Image
+        The firmware; it starts with its own gains.
+    inputs : (N,) array of `codegen.layout.INPUT`
+        One row a period.
+
+    Returns
+    -------
+    (N,) array of `codegen.layout.OUTPUT`
+
+    Raises
+    ------
+    CodegenError
+        When QEMU is missing, or the firmware fails.
+    """
+    qemu = find_tool("qemu-system-arm", "qemu-system-arm")
+    folder = image.elf.parent
+    (folder / "inputs.bin").write_bytes(inputs.tobytes())
+    machine = ("-machine", "netduinoplus2", "-display", "none", "-serial", "none", "-monitor", "none")
+    host = ("-semihosting-config", "enable=on,target=native")
+    command = [qemu, *machine, *host, "-kernel", str(image.elf)]
+    try:
+        status = subprocess.run(command, cwd=folder, capture_output=True, check=False, timeout=QEMU_SECONDS).returncode
+    except subprocess.TimeoutExpired:
+        raise CodegenError(f"the firmware did not end within {QEMU_SECONDS} s in QEMU", exit_code=1) from None
+    written = (folder / "outputs.bin").read_bytes() if status == 0 else b""
+    if len(written) != len(inputs) * OUTPUT.itemsize:
+        raise CodegenError(f"the firmware failed in QEMU (exit status {status}): {' '.join(command)}", exit_code=1)
+    return np.frombuffer(written, OUTPUT)

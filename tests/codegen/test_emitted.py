@@ -1,0 +1,202 @@
+"""What is emitted, as its user builds and runs it: checked, sanitised, fuzzed, on this machine and on the target."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from codegen.layout import OUTPUT
+from codegen.native import NativeController, load_native
+from codegen.parameters import to_array
+from codegen.render import render, write_tree
+from codegen.toolchain import CORTEX_M4_FLAGS, WARNINGS, find_compiler
+from codegen.vectors import random_inputs
+
+BIN = Path(sys.executable).parent
+HERE = Path(__file__).parent
+
+
+@pytest.fixture
+def tree(gains, tmp_path):
+    write_tree(render(gains, "cortex-m4"), tmp_path / "tree")
+    return tmp_path / "tree"
+
+
+def run(*command, cwd=None):
+    return subprocess.run(list(map(str, command)), capture_output=True, text=True, check=False, cwd=cwd, timeout=300)
+
+
+def sources(tree):
+    return sorted(path for folder in ("core", "native", "cortex_m4") for path in (tree / folder).glob("*.cpp"))
+
+
+def test_both_makefiles_build_every_file_with_all_warnings_as_errors_and_run(tree):
+    for folder in ("native", "cortex_m4"):
+        text = (tree / folder / "Makefile").read_text()
+        for flag in WARNINGS:
+            assert f" {flag}" in text
+        result = run("make", "-C", tree / folder, "all", "test", "example")
+        assert result.returncode == 0, result.stderr
+        assert "0 of 256 rows differ" in result.stdout
+        assert "9  roll" in result.stdout
+
+
+def test_the_host_and_the_target_print_the_same_example(tree):
+    printed = [run("make", "-s", "-C", tree / folder, "example").stdout for folder in ("native", "cortex_m4")]
+    assert len(printed[0].splitlines()) == 10
+    assert printed[0] == printed[1]
+
+
+def test_the_test_on_the_target_fails_when_one_bit_is_wrong(tree):
+    vectors = tree / "native" / "test_vectors.hpp"
+    head, outputs = vectors.read_text().split("kVectorOutputs")
+    at = outputs.index("0x") + 9
+    vectors.write_text(f"{head}kVectorOutputs{outputs[:at]}{int(outputs[at], 16) ^ 1:x}{outputs[at + 1 :]}")
+    result = run("make", "-s", "-C", tree / "cortex_m4", "test")
+    assert result.returncode != 0
+    assert "1 of 256 rows differ" in result.stdout
+
+
+def test_the_firmware_steps_once_a_period_and_calls_its_board(tree):
+    # A board that counts periods and ends the emulation, telling whether the controller answered its error.
+    (tree / "board.cpp").write_text("""
+#include "cortex_m4/board.hpp"
+namespace {
+int periods = 0;
+int answered = 0;
+}
+void read_board(mimopilot::Input &input)
+{
+    input.armed = 1;
+    input.attitude[0] = 0.1F;
+}
+void write_board(const mimopilot::Output &output)
+{
+    if (output.moment[0] < 0.0F) { answered++; }
+    if (++periods < 250) { return; }
+    const int reason = answered == 250 ? 0x20026 : 0;
+    __asm__ volatile("mov r1, %0; mov r0, #0x18; bkpt 0xab" : : "r"(reason) : "r0", "r1", "memory");  // SYS_EXIT
+}
+""")
+    folder = tree / "cortex_m4"
+    built = run("make", "-C", folder, "build/mimo_pid.elf", "BOARD=../board.cpp")
+    assert built.returncode == 0, built.stderr
+    machine = ("-machine", "netduinoplus2", "-display", "none", "-serial", "none", "-monitor", "none")
+    ended = run("qemu-system-arm", *machine, "-semihosting", "-kernel", folder / "build" / "mimo_pid.elf")
+    assert ended.returncode == 0, ended.stderr
+
+
+CMAKE = """
+cmake_minimum_required(VERSION 3.10)
+project(caller CXX)
+add_subdirectory(${TREE}/core core)
+set(SOURCES ${TREE}/native/test_main.cpp)
+if(CMAKE_CROSSCOMPILING)
+  list(APPEND SOURCES ${TREE}/cortex_m4/startup.cpp)
+  add_definitions(-DMIMO_PID_SEMIHOSTING)
+  link_libraries(-nostdlib -T${TREE}/cortex_m4/stm32f4.ld mimo_pid -Wl,--start-group -lc -lgcc -lrdimon -Wl,--end-group)
+endif()
+add_executable(test_main ${SOURCES})
+target_link_libraries(test_main mimo_pid)
+"""
+
+
+@pytest.mark.parametrize("target", ["host", "cortex-m4"])
+def test_the_cmake_library_serves_host_and_target(tree, tmp_path, target):
+    (tmp_path / "CMakeLists.txt").write_text(CMAKE)
+    options = [f"-DTREE={tree}"]
+    if target == "cortex-m4":
+        options += ["-DCMAKE_SYSTEM_NAME=Generic", "-DCMAKE_TRY_COMPILE_TARGET_TYPE=STATIC_LIBRARY"]
+        options += ["-DCMAKE_CXX_COMPILER=arm-none-eabi-g++", f"-DCMAKE_CXX_FLAGS={' '.join(CORTEX_M4_FLAGS)}"]
+    build = tmp_path / "build"
+    for command in ([BIN / "cmake", "-S", tmp_path, "-B", build, *options], [BIN / "cmake", "--build", build]):
+        result = run(*command)
+        assert result.returncode == 0, result.stdout + result.stderr
+    program = [build / "test_main"]
+    if target == "cortex-m4":
+        quiet = ("-display", "none", "-serial", "none", "-monitor", "none", "-chardev", "stdio,id=host")
+        semihosting = "enable=on,target=native,chardev=host"
+        program = ["qemu-system-arm", "-machine", "netduinoplus2", *quiet, "-semihosting-config", semihosting]
+        program += ["-kernel", build / "test_main"]
+    ended = run(*program)
+    assert ended.returncode == 0
+    assert "0 of 256 rows differ" in ended.stdout
+
+
+def test_cppcheck_finds_nothing(tree):
+    checks = "--enable=warning,style,performance,portability"
+    command = (BIN / "cppcheck", checks, "--error-exitcode=1", "--language=c++", "--std=c++17", "--quiet")
+    result = run(*command, *sources(tree))
+    assert (result.returncode, result.stderr) == (0, "")
+
+
+def test_cppcheck_would_find_a_mistake(tree):
+    core = tree / "core" / "mimo_pid.cpp"
+    right = "i < 3 * kAxes; i++) { state.age[i]"
+    assert right in core.read_text()
+    core.write_text(core.read_text().replace(right, right.replace("<", "<=")))
+    result = run(BIN / "cppcheck", "--error-exitcode=1", "--language=c++", "--quiet", core)
+    assert result.returncode == 1
+    assert "arrayIndexOutOfBounds" in result.stderr
+
+
+def test_clang_tidy_finds_nothing(tree):
+    configuration = f"--config-file={HERE / '.clang-tidy'}"
+    result = run(BIN / "clang-tidy", "--quiet", configuration, *sources(tree), "--", "-std=c++17")
+    assert result.returncode == 0, result.stdout
+    assert "error:" not in result.stdout
+
+
+def test_the_vectors_run_clean_under_the_sanitisers(tree):
+    flags = "-std=c++17 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all"
+    result = run("make", "-s", "-C", tree / "native", "test", "example", f"CXXFLAGS={flags}")
+    assert result.returncode == 0, result.stderr
+    assert "0 of 256 rows differ" in result.stdout
+
+
+def test_no_function_of_the_core_has_an_unbounded_or_large_frame(tree):
+    for compiler in (find_compiler(), "arm-none-eabi-g++"):
+        target = CORTEX_M4_FLAGS if "arm" in compiler else ()
+        flags = ("-std=c++11", "-O2", "-Wstack-usage=256", "-Werror", "-c", "-o", tree / "core.o")
+        result = run(compiler, *flags, *target, tree / "core" / "mimo_pid.cpp")
+        assert result.returncode == 0, result.stderr
+
+
+def test_a_million_wild_steps_with_gain_changes_stay_finite_and_within_their_limits(gains):
+    rng = np.random.default_rng(7)
+    wild = np.array([np.nan, np.inf, -np.inf, 1e38, -1e38, 3e38, 1e-40, -1e-45, 0.0, -0.0, 12.5, 100.0], np.float32)
+    controller = NativeController(load_native(gains), gains)
+    current = to_array(gains)
+    accepted = refused = faulty = bumped = 0
+    for _ in range(100):
+        inputs = random_inputs(10_000, rng)
+        for name in ("attitude_setpoint", "attitude", "rates", "excitation"):
+            hit = rng.random(inputs[name].shape) < rng.choice([0.0, 0.001, 0.3])
+            inputs[name][hit] = rng.choice(wild, int(hit.sum()))
+        inputs["saturation"] = rng.integers(-(2**31), 2**31, inputs["saturation"].shape)
+        outputs = controller.run(inputs)
+        limits = {"moment": current[28:31], "rates_setpoint": current[25:28]}
+        for name, limit in limits.items():
+            assert np.isfinite(outputs[name]).all()
+            assert (np.abs(outputs[name]) <= limit).all()
+        assert (np.abs(controller.state["integral"]) <= current[31:34]).all()
+        assert np.isfinite(controller.state["derivative"]).all()
+        faulty += int((outputs["fault"] != 0).sum())
+        bumped += int((np.abs(outputs["moment"]) == limits["moment"]).any(axis=1).sum())
+        changed = to_array(gains)
+        changed[:25] *= rng.choice([1e-30, 1.0, 30.0, 1e5]).astype(np.float32) * rng.choice([-1, 1], 25)
+        changed[25:34] = rng.uniform(1e-3, 50, 9)
+        changed[34] = rng.uniform(0, 0.999)
+        if rng.random() < 0.3:
+            changed[rng.integers(36)] = rng.choice(wild[:6])
+        if controller.set_gains(changed):
+            current, accepted = changed, accepted + 1
+        else:
+            refused += 1
+    assert len(outputs) == 10_000 and outputs.dtype == OUTPUT
+    assert accepted > 40
+    assert refused > 15
+    assert faulty > 5_000
+    assert bumped > 10_000
