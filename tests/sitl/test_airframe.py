@@ -1,8 +1,8 @@
 import pytest
 
 from sitl.airframe import FOLDER, known_airframes, load_airframe
-from sitl.autopilot import check_moment_scale
 from sitl.errors import SitlError
+from sitl.moment_scale import check_moment_scale
 
 
 def test_the_airframes_of_the_thesis_come_with_their_gains():
@@ -10,7 +10,7 @@ def test_the_airframes_of_the_thesis_come_with_their_gains():
     for name in known_airframes():
         vehicle = load_airframe(name)
         assert vehicle.airframe.name == name
-        check_moment_scale(vehicle.airframe, vehicle.default_gains())
+        check_moment_scale(vehicle.default_gains(), vehicle.airframe.moment_scale(), name)
 
 
 def test_an_unknown_airframe_lists_the_known_ones():
@@ -44,6 +44,7 @@ def test_gains_for_another_unit_of_moment_are_refused(gains):
 
     airframe = load_airframe("adam0").airframe
     with pytest.raises(SitlError, match=r"3\.6, 3\.6, 0\.2736 N m per unit, adam0 has 2\.546"):
-        check_moment_scale(airframe, dataclasses.replace(gains, moment_scale=(3.6, 3.6, 0.2736)))
+        other = dataclasses.replace(gains, moment_scale=(3.6, 3.6, 0.2736))
+        check_moment_scale(other, airframe.moment_scale(), airframe.name)
     with pytest.raises(SitlError, match="do not say"):
-        check_moment_scale(airframe, dataclasses.replace(gains, moment_scale=None))
+        check_moment_scale(dataclasses.replace(gains, moment_scale=None), airframe.moment_scale(), airframe.name)

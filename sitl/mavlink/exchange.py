@@ -1,0 +1,401 @@
+"""The parameter protocol of one ground station with one vehicle: what to send, and when to believe an answer.
+
+No socket and no clock: a `Conversation` is a set of generators. Each yields a `Turn` (what to send, and when
+to wake it at the latest) and is sent an `Event` (the time, and what was heard). `drive` runs one over a link,
+be it a radio or a simulated one that loses, doubles and reorders.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol, TypeVar
+
+from sitl.errors import SitlError
+
+#: One try, s; how many; how many requests may be under way. At 30 % loss each way 24 tries lose 1 exchange in 10^7.
+TRY_S, TRIES, WINDOW = 0.5, 24, 10
+#: A HEARTBEAT older than this (s) does not tell whether the vehicle is armed now: writing waits for the next.
+FRESH_S = 3.0
+#: After so many tries that were answered with another value, the vehicle is believed to keep that.
+CONTRADICTIONS = 4
+#: PX4 saves by itself at most 2.3 s after a change, ArduPilot sooner.
+AUTOSAVE_S = 2.5
+#: Least silence (s) after which what was sent before is taken to have arrived or to be lost.
+QUIET_S = 0.1
+BEAT_S = 1.0
+
+REAL32 = 9
+STORAGE_COMMAND = 245
+ACCEPTED, FAILED, IN_PROGRESS = 0, 4, 5
+REASONS = {
+    1: "it does not exist",
+    2: "value out of its range",
+    3: "permission denied",
+    4: "component not found",
+    5: "read only",
+    6: "type not supported",
+    7: "wrong type",
+    8: "it could not be read",
+}
+
+
+class Heartbeat(NamedTuple):
+    """HEARTBEAT of an autopilot."""
+
+    system: int
+    component: int
+    autopilot: int
+    armed: bool
+
+
+class Value(NamedTuple):
+    """PARAM_VALUE; `kind` is its param_type."""
+
+    system: int
+    component: int
+    name: str
+    value: float
+    kind: int = REAL32
+
+
+class Refusal(NamedTuple):
+    """PARAM_ERROR."""
+
+    system: int
+    component: int
+    name: str
+    reason: int
+
+
+class Ack(NamedTuple):
+    """COMMAND_ACK."""
+
+    system: int
+    component: int
+    command: int
+    result: int
+
+
+class Beat(NamedTuple):
+    """Our own HEARTBEAT, so that the vehicle knows where to answer."""
+
+
+class Read(NamedTuple):
+    """PARAM_REQUEST_READ by name."""
+
+    system: int
+    component: int
+    name: str
+
+
+class Write(NamedTuple):
+    """PARAM_SET of a float."""
+
+    system: int
+    component: int
+    name: str
+    value: float
+
+
+class Store(NamedTuple):
+    """MAV_CMD_PREFLIGHT_STORAGE: write the parameters to the vehicle's memory."""
+
+    system: int
+    component: int
+
+
+Incoming = Heartbeat | Value | Refusal | Ack
+Outgoing = Beat | Read | Write | Store
+T = TypeVar("T")
+
+
+class Turn(NamedTuple):
+    """What to send now, and the time (s) at which to come back at the latest."""
+
+    send: Sequence[Outgoing]
+    wake: float
+
+
+class Event(NamedTuple):
+    """The time (s) now, what was heard since, and whether the link is gone for good."""
+
+    now: float
+    heard: Sequence[Incoming]
+    closed: bool = False
+
+
+Steps = Generator[Turn, Event, T]
+
+
+class Link(Protocol):
+    """What carries a conversation."""
+
+    closed: bool
+
+    def now(self) -> float:
+        """Monotonic time, s."""
+
+    def send(self, messages: Sequence[Outgoing]) -> None:
+        """Send; may lose."""
+
+    def receive(self, until: float) -> Sequence[Incoming]:
+        """What has been heard; waits for it until a time (s)."""
+
+
+def drive(steps: Steps[T], link: Link) -> T:
+    """Run a conversation over a link to its end and return its result."""
+    try:
+        turn = next(steps)
+        while True:
+            link.send(turn.send)
+            heard = link.receive(turn.wake)
+            turn = steps.send(Event(link.now(), heard, link.closed))
+    except StopIteration as end:
+        result: T = end.value
+        return result
+
+
+def single(value: float) -> float:
+    """`value` rounded to single precision, as a vehicle stores it; zero has no sign.
+
+    Raises
+    ------
+    SitlError
+        When it is not finite in single precision.
+    """
+    try:
+        rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
+    except OverflowError:
+        rounded = float("inf")
+    if not abs(rounded) < float("inf"):
+        raise SitlError(f"got {value}, expected a number that is finite in single precision")
+    return rounded + 0.0
+
+
+class Answer(NamedTuple):
+    """End of one request: the value that the vehicle stated last, and what is wrong (empty: nothing)."""
+
+    value: float | None
+    problem: str = ""
+
+
+@dataclass
+class _Request:
+    """One request under way."""
+
+    due: float
+    sent_at: float = 0.0
+    tries: int = 0
+    contradicted: set[int] = field(default_factory=set)
+
+
+class Conversation:
+    """State of a talk with one vehicle, from its first HEARTBEAT on.
+
+    Parameters
+    ----------
+    now : float, s
+        Time at the start.
+    tries : int
+        How often a request is sent before its silence is final.
+    system : int
+        The vehicle's system number; 0: the first that is heard.
+    force_armed : bool
+        Write even while it is armed.
+
+    Attributes
+    ----------
+    vehicle : Heartbeat or None
+        Its last HEARTBEAT.
+    others : set of int
+        Systems of other autopilots on the link.
+    interrupted : bool
+        Set from outside (Ctrl-C): reading and writing end, putting back does not.
+    possible : dict
+        Name -> every value that the vehicle may hold now, given what was sent and heard.
+    written : set of str
+        Names for which a write was ever sent.
+    progress : callable
+        Told (phase, done, of) after each answer.
+    """
+
+    def __init__(self, now: float, tries: int = TRIES, system: int = 0, force_armed: bool = False) -> None:
+        self.now, self.tries, self.system, self.force_armed = now, tries, system, force_armed
+        self.vehicle: Heartbeat | None = None
+        self.others: set[int] = set()
+        self.interrupted = self.closed = False
+        self.possible: dict[str, set[float]] = {}
+        self.written: set[str] = set()
+        self.progress: Callable[[str, int, int], None] = lambda phase, done, of: None
+        self._heartbeat_at = self._heard_at = now
+        self._beat_due = now
+        self._round_trip = 0.0
+
+    @property
+    def patience(self) -> float:
+        """Silence that is taken for the end, s."""
+        return self.tries * TRY_S
+
+    def resume(self, now: float) -> None:
+        """Go on after a pause in which nobody listened: writing waits for another HEARTBEAT."""
+        self.now = self._heard_at = now
+        self._heartbeat_at = now - FRESH_S
+
+    def _turn(self, send: Sequence[Outgoing], wake: float) -> Steps[list[Value | Refusal | Ack]]:
+        """Send, wait, and return what the vehicle itself said; every other speaker is ignored."""
+        if self.now >= self._beat_due:
+            send = [Beat(), *send]
+            self._beat_due = self.now + BEAT_S
+        event = yield Turn(send, min(wake, self._beat_due))
+        self.now, self.closed = event.now, event.closed
+        heard: list[Value | Refusal | Ack] = []
+        for message in event.heard:
+            if isinstance(message, Heartbeat) and self.vehicle is None and self.system in (0, message.system):
+                self.vehicle = message
+            if self.vehicle is None or message.system != self.vehicle.system:
+                if isinstance(message, Heartbeat):
+                    self.others.add(message.system)
+            elif message.component == self.vehicle.component:
+                self._heard_at = self.now
+                if isinstance(message, Heartbeat):
+                    self.vehicle, self._heartbeat_at = message, self.now
+                else:
+                    heard.append(message)
+        return heard
+
+    def meet(self) -> Steps[Heartbeat]:
+        """Wait for the vehicle's HEARTBEAT.
+
+        Raises
+        ------
+        SitlError
+            When none comes in time.
+        """
+        deadline = self.now + self.patience
+        while self.vehicle is None:
+            if self.now >= deadline or self.closed or self.interrupted:
+                whose = f"of system {self.system}" if self.system else "of an autopilot"
+                raise SitlError(f"no HEARTBEAT {whose} in {self.patience:g} s", exit_code=1)
+            yield from self._turn([], deadline)
+        return self.vehicle
+
+    def ask(self, names: Sequence[str], phase: str, keep_going: bool = False) -> Steps[dict[str, Answer]]:
+        """Read each by name. Ends at the first that fails, unless told to keep going (which Ctrl-C does not end)."""
+        answers = yield from self._exchange(dict.fromkeys(names, None), phase, keep_going)
+        for name, answer in answers.items():
+            if answer.value is not None:
+                self.possible[name] = {answer.value}
+        return answers
+
+    def tell(self, values: Mapping[str, float], phase: str, keep_going: bool = False) -> Steps[dict[str, Answer]]:
+        """Write each. With `keep_going` neither a failure, nor Ctrl-C, nor an armed vehicle ends it."""
+        return (yield from self._exchange(values, phase, keep_going))
+
+    def _exchange(self, orders: Mapping[str, float | None], phase: str, keep_going: bool) -> Steps[dict[str, Answer]]:
+        assert self.vehicle is not None
+        answers: dict[str, Answer] = {}
+        waiting, under_way = list(orders)[::-1], dict[str, _Request]()
+        begin, writes = self.now, None not in orders.values()
+        while waiting or under_way:
+            obstacle = self._obstacle(begin, keep_going, writes)
+            if obstacle:
+                return answers | {name: Answer(None, obstacle) for name in [*under_way, *reversed(waiting)]}
+            while waiting and len(under_way) < WINDOW:
+                under_way[waiting.pop()] = _Request(due=self.now)
+            hold = writes and not keep_going and self.now - self._heartbeat_at >= FRESH_S
+            send: list[Outgoing] = []
+            for name, request in list(under_way.items()):
+                if request.due > self.now or hold:
+                    continue
+                if request.tries == self.tries:
+                    answers[name] = Answer(None, f"no answer in {self.patience:g} s")
+                    del under_way[name]
+                else:
+                    send.append(self._order(name, orders[name]))
+                    request.tries += 1
+                    request.sent_at, request.due = self.now, self.now + TRY_S
+            if not keep_going and any(answer.problem for answer in answers.values()):
+                return answers
+            wake = self.now + TRY_S if hold else min((r.due for r in under_way.values()), default=self.now)
+            for message in (yield from self._turn(send, wake)):
+                if isinstance(message, Ack) or message.name not in under_way:
+                    continue
+                answer = self._judge(message, under_way[message.name], orders[message.name])
+                if answer is not None:
+                    answers[message.name] = answer
+                    del under_way[message.name]
+                    self.progress(phase, len(answers), len(orders))
+        return answers
+
+    def _obstacle(self, begin: float, keep_going: bool, writes: bool) -> str:
+        """Why nothing more may be sent; empty when all is well."""
+        assert self.vehicle is not None
+        if self.closed:
+            return "the link was lost"
+        if self.now - max(self._heard_at, begin) >= self.patience:
+            return f"nothing was heard from the vehicle for {self.patience:g} s"
+        if keep_going:
+            return ""
+        if self.interrupted:
+            return "interrupted"
+        if writes and self.vehicle.armed and not self.force_armed:
+            return "the vehicle is armed"
+        if writes and self.now - max(self._heartbeat_at, begin) >= self.patience:
+            return f"no HEARTBEAT in {self.patience:g} s"
+        return ""
+
+    def _order(self, name: str, value: float | None) -> Outgoing:
+        assert self.vehicle is not None
+        address = self.vehicle.system, self.vehicle.component
+        if value is None:
+            return Read(*address, name)
+        self.written.add(name)
+        self.possible.setdefault(name, set()).add(value)
+        return Write(*address, name, value)
+
+    def _judge(self, message: Value | Refusal, request: _Request, wanted: float | None) -> Answer | None:
+        """What a message says about a request; None: nothing final."""
+        if isinstance(message, Refusal):
+            return Answer(None, f"refused: {REASONS.get(message.reason, f'PARAM_ERROR {message.reason}')}")
+        if message.kind != REAL32:
+            return Answer(None, f"is no float on the vehicle (param_type {message.kind})")
+        if wanted is not None and message.value != wanted:
+            # The echo of a refused or altered write, or an old answer that comes late, or another station's.
+            request.contradicted.add(request.tries)
+            if len(request.contradicted) < CONTRADICTIONS:
+                return None
+            self.possible[message.name].add(message.value)
+            return Answer(message.value, f"stays {message.value:.9g}")
+        if request.tries == 1:
+            self._round_trip = max(self._round_trip, self.now - request.sent_at)
+        if wanted is not None:
+            self.possible[message.name] = {wanted}
+        return Answer(message.value)
+
+    def settle(self) -> Steps[None]:
+        """Wait until what is under way has arrived: a late echo must not pass for what is held afterwards."""
+        quiet = max(QUIET_S, 2 * self._round_trip)
+        until, deadline = self.now + quiet, self.now + self.patience
+        while self.now < min(until, deadline) and not self.closed:
+            heard = yield from self._turn([], until)
+            if any(not isinstance(m, Ack) and m.name in self.possible for m in heard):
+                until = self.now + quiet
+
+    def store(self) -> Steps[str]:
+        """Have the vehicle save its parameters: ``acknowledged``, ``autosave`` (its time passed) or ``failed``."""
+        assert self.vehicle is not None
+        due, deadline, result = self.now, self.now + AUTOSAVE_S, IN_PROGRESS
+        while self.now < deadline and not self.closed:
+            send: list[Outgoing] = []
+            if self.now >= due and result == IN_PROGRESS:
+                send = [Store(self.vehicle.system, self.vehicle.component)]
+                due = self.now + TRY_S
+            wake = min(due, deadline) if result == IN_PROGRESS else deadline
+            for message in (yield from self._turn(send, wake)):
+                if isinstance(message, Ack) and message.command == STORAGE_COMMAND:
+                    result = message.result
+            if result == ACCEPTED:
+                return "acknowledged"
+        return "failed" if result == FAILED else "autosave"
