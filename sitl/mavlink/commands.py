@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -68,20 +68,20 @@ def upload(
 
     from codegen.parameters import check_verdict
     from sitl.mavlink.profiles import make_plan
-    from sitl.mavlink.upload_console import Options, check_target, transact
+    from sitl.mavlink.upload_console import Options, parse_scale, transact
     from tuning.gains import load_gains
 
     loaded = load_gains(gains)
-    warning = check_verdict(loaded, allow=uncertified)
+    warning = check_verdict(loaded, allow=uncertified, required=True)
     if warning:
         print(f"mimopilot: warning: {gains}: {warning}", file=sys.stderr)
     plan = make_plan(loaded, profile, drop_off_diagonals)
-    scale = check_target(loaded, plan, moment_scale)
+    scale = parse_scale(moment_scale)
     stem = gains.name.removesuffix(".toml").removesuffix(".gains")
     options = Options(
         connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, gains.with_name(stem)
     )
-    transact(plan, options, scale)
+    transact(plan, options, loaded, scale)
 
 
 def restore(
@@ -121,10 +121,15 @@ def params(
     as_json: JsonOption = False,
 ) -> None:
     """Write gains, or what a vehicle holds, as a parameter file; compare the two when both are given."""
+    from sitl.errors import SitlError
     from sitl.mavlink.upload_console import Options, compare, export
 
     options = Options(connect or "", system, timeout, signing_key, as_json=as_json)
-    if gains is not None and connect is not None:
-        compare(gains, options)
-    else:
+    if gains is None or connect is None:
+        if as_json:
+            raise SitlError("--json: belongs to the comparison of a gains file with a vehicle")
         export(gains, options, form, out)
+    elif out is not None:
+        raise SitlError("--out: a comparison is printed; give either a gains file or --connect to write a file")
+    else:
+        compare(gains, options)

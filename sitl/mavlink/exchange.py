@@ -27,6 +27,8 @@ QUIET_S = 0.1
 BEAT_S = 1.0
 
 REAL32 = 9
+#: Component number of an autopilot.
+AUTOPILOT = 1
 STORAGE_COMMAND = 245
 ACCEPTED, FAILED, IN_PROGRESS = 0, 4, 5
 REASONS = {
@@ -252,17 +254,18 @@ class Conversation:
         self.now, self.closed = event.now, event.closed
         heard: list[Value | Refusal | Ack] = []
         for message in event.heard:
-            if isinstance(message, Heartbeat) and self.vehicle is None and self.system in (0, message.system):
+            if message.component != AUTOPILOT:
+                continue
+            if self.vehicle is None and isinstance(message, Heartbeat) and self.system in (0, message.system):
                 self.vehicle = message
             if self.vehicle is None or message.system != self.vehicle.system:
-                if isinstance(message, Heartbeat):
-                    self.others.add(message.system)
-            elif message.component == self.vehicle.component:
-                self._heard_at = self.now
-                if isinstance(message, Heartbeat):
-                    self.vehicle, self._heartbeat_at = message, self.now
-                else:
-                    heard.append(message)
+                self.others.add(message.system)
+                continue
+            self._heard_at = self.now
+            if isinstance(message, Heartbeat):
+                self.vehicle, self._heartbeat_at = message, self.now
+            else:
+                heard.append(message)
         return heard
 
     def meet(self) -> Steps[Heartbeat]:
@@ -275,7 +278,9 @@ class Conversation:
         """
         deadline = self.now + self.patience
         while self.vehicle is None:
-            if self.now >= deadline or self.closed or self.interrupted:
+            if self.interrupted:
+                raise SitlError("interrupted; nothing was written", exit_code=1)
+            if self.now >= deadline or self.closed:
                 whose = f"of system {self.system}" if self.system else "of an autopilot"
                 raise SitlError(f"no HEARTBEAT {whose} in {self.patience:g} s", exit_code=1)
             yield from self._turn([], deadline)
@@ -310,7 +315,9 @@ class Conversation:
                 if request.due > self.now or hold:
                     continue
                 if request.tries == self.tries:
-                    answers[name] = Answer(None, f"no answer in {self.patience:g} s")
+                    answers[name] = Answer(
+                        None, f"no answer in {self.patience:g} s (a vehicle may be silent on what it lacks)"
+                    )
                     del under_way[name]
                 else:
                     send.append(self._order(name, orders[name]))

@@ -92,9 +92,7 @@ def _px4_stock(gains: Gains) -> Plan:
             Setting(f"MC_{name}RATE_MAX", "deg/s", limit, 0.0, 1800.0),
         ]
     settings.append(Setting("IMU_DGYRO_CUTOFF", "Hz", gains.derivative_cutoff_hz, 0.0, 1000.0))
-    notes = (
-        "PX4 integrates less when the rate error is large, and MC_YAW_TQ_CUTOFF filters yaw; neither is set",
-    )
+    notes = ("PX4 integrates less when the rate error is large, and MC_YAW_TQ_CUTOFF filters yaw; neither is set",)
     return Plan(tuple(settings), {}, (), {}, notes)
 
 
