@@ -259,7 +259,8 @@ class Conversation:
             if self.vehicle is None and isinstance(message, Heartbeat) and self.system in (0, message.system):
                 self.vehicle = message
             if self.vehicle is None or message.system != self.vehicle.system:
-                self.others.add(message.system)
+                if isinstance(message, Heartbeat):
+                    self.others.add(message.system)
                 continue
             self._heard_at = self.now
             if isinstance(message, Heartbeat):

@@ -1,6 +1,7 @@
 """The transaction over simulated links: thousands of bad days, in simulated time."""
 
 import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -45,7 +46,7 @@ def test_the_radio_of_these_tests_is_as_bad_as_it_says():
     vehicle.answer = lambda order: arrived.append(order.value) or []
     link.receive(1000.0)
     assert len(arrived) / 20000 == pytest.approx(0.7 * 1.1, abs=0.02)
-    late = sum(b < a for a, b in zip(arrived, arrived[1:], strict=False))
+    late = sum(b < a for a, b in pairwise(arrived))
     assert late / len(arrived) == pytest.approx(0.1, abs=0.02)
 
 
@@ -349,7 +350,7 @@ def test_whatever_else_is_said_on_the_link_a_success_is_true(noise, seed, fault)
     vehicle = ScriptedVehicle(OLD, fault, victim=NAMES[seed % 20], after=seed % 20)
     link = SimulatedLink(vehicle, seed, latency=0.02)
     for i, word in enumerate(noise):
-        # A stray value with the very bits that are hoped for could not be told from an answer: it is the one thing left out.
+        # Left out: a stray value with the very bits that are hoped for, which cannot be told from an answer.
         if not (isinstance(word, Value) and word.value == NEW.get(word.name)):
             link.schedule(0.05 * i, "to ground", word)
     try:
