@@ -17,7 +17,7 @@ from tests.conftest import assert_one_clear_line
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise"),
-    *("generate", "fly", "sitl", "plant"),
+    *("generate", "fly", "sitl", "plant", "upload", "restore", "params"),
 ]
 
 

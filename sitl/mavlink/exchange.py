@@ -12,6 +12,8 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol, TypeVar
 
+import numpy as np
+
 from sitl.errors import SitlError
 
 #: One try, s; how many; how many requests may be under way. At 30 % loss each way 24 tries lose 1 exchange in 10^7.
@@ -176,6 +178,17 @@ def single(value: float) -> float:
     return rounded + 0.0
 
 
+def shortest(value: float) -> str:
+    """Shortest decimal that reads back to float32(value).
+
+    Examples
+    --------
+    >>> shortest(0.1), shortest(-5.0), shortest(1e-7)
+    ('0.1', '-5.0', '1e-07')
+    """
+    return str(np.float32(value))
+
+
 class Answer(NamedTuple):
     """End of one request: the value that the vehicle stated last, and what is wrong (empty: nothing)."""
 
@@ -191,6 +204,7 @@ class _Request:
     sent_at: float = 0.0
     tries: int = 0
     contradicted: set[int] = field(default_factory=set)
+    kept: float | None = None
 
 
 class Conversation:
@@ -316,9 +330,9 @@ class Conversation:
                 if request.due > self.now or hold:
                     continue
                 if request.tries == self.tries:
-                    answers[name] = Answer(
-                        None, f"no answer in {self.patience:g} s (a vehicle may be silent on what it lacks)"
-                    )
+                    silence = f"no answer in {self.patience:g} s (a vehicle may be silent on what it lacks)"
+                    kept = request.kept
+                    answers[name] = Answer(kept, silence if kept is None else f"stays {shortest(kept)}")
                     del under_way[name]
                 else:
                     send.append(self._order(name, orders[name]))
@@ -372,10 +386,11 @@ class Conversation:
         if wanted is not None and message.value != wanted:
             # The echo of a refused or altered write, or an old answer that comes late, or another station's.
             request.contradicted.add(request.tries)
-            if len(request.contradicted) < CONTRADICTIONS:
-                return None
+            request.kept = message.value
             self.possible[message.name].add(message.value)
-            return Answer(message.value, f"stays {message.value:.9g}")
+            if len(request.contradicted) == CONTRADICTIONS:
+                request.due, request.tries = self.now, self.tries
+            return None
         if request.tries == 1:
             self._round_trip = max(self._round_trip, self.now - request.sent_at)
         if wanted is not None:

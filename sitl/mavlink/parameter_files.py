@@ -7,23 +7,10 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
-
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import REAL32, single
+from sitl.mavlink.exchange import REAL32, shortest, single
 
 NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
-
-
-def shortest(value: float) -> str:
-    """Shortest decimal that reads back to float32(value).
-
-    Examples
-    --------
-    >>> shortest(0.1), shortest(-5.0), shortest(1e-7)
-    ('0.1', '-5.0', '1e-07')
-    """
-    return str(np.float32(value))
 
 
 def _qgc(values: Mapping[str, float], system: int, component: int) -> str:

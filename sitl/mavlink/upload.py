@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import Answer, Conversation, Steps
+from sitl.mavlink.exchange import Answer, Conversation, Steps, shortest
 
 #: PX4 and ArduPilot do not save a value that differs from the old one by less (the epsilon of single precision).
 SMALLEST_CHANGE = 1.2e-7
@@ -99,7 +99,8 @@ def _write_and_verify(talk: Conversation, new: Mapping[str, float], old: Mapping
         return reason
     for name, answer in answers.items():
         if answer.value != new[name]:
-            return f"{name}: reads back as {answer.value:.9g}, expected {new[name]:.9g}"
+            held = "nothing" if answer.value is None else shortest(answer.value)
+            return f"{name}: reads back as {held}, expected {shortest(new[name])}"
     return ""
 
 

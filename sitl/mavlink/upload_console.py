@@ -15,8 +15,8 @@ import typer
 from codegen.parameters import PARAMETERS
 from sitl.errors import SitlError
 from sitl.mavlink.connection import Connection, read_key
-from sitl.mavlink.exchange import AUTOSAVE_S, TRY_S, Conversation, Heartbeat, Steps, T, drive
-from sitl.mavlink.parameter_files import FORMATS, parameter_text, shortest
+from sitl.mavlink.exchange import AUTOSAVE_S, TRY_S, Conversation, Heartbeat, Steps, T, drive, shortest
+from sitl.mavlink.parameter_files import FORMATS, parameter_text
 from sitl.mavlink.profiles import Plan, make_plan
 from sitl.mavlink.upload import Outcome, apply, read
 from sitl.moment_scale import check_moment_scale

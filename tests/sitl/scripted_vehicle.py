@@ -4,14 +4,17 @@ The vehicle hears and says the words of `sitl.mavlink.exchange`; `UdpVehicle` pu
 pymavlink's own packing, for the commands.
 """
 
+import contextlib
 import heapq
 import itertools
+import os
 import random
 import select
 import socket
 import struct
 import threading
 import time
+import tty
 
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -36,7 +39,7 @@ class ScriptedVehicle:
         self.values = {name: float32(value) for name, value in values.items()}
         self.fault, self.victim, self.after, self.storage = fault, victim, after, storage
         self.armed = self.dead = False
-        self.limit = float32(self.values.get(victim, 0.0) + 0.05)
+        self.first = self.values.get(victim, 0.0)
         self.writes = self.reads = self.stored = 0
 
     def heartbeat(self):
@@ -84,9 +87,9 @@ class ScriptedVehicle:
         if self.fault == "deaf to one" and hit:
             return []
         if self.fault == "clamps" and hit:
-            value = min(value, self.limit)
+            value = min(value, float32(1.05 * self.first))
         if self.fault == "rounds" and hit:
-            value = float32(round(value, 1))
+            value = float32(self.first + round(8 * (value - self.first)) / 8)
         if self.fault == "epsilon" and abs(value - self.values[name]) < 1.1920929e-07:
             return [self.value(name)]
         self.values[name] = value
@@ -214,7 +217,9 @@ class ByteVehicle:
                 self.first_beat_at = self.first_beat_at or now
                 outbox += [(now, m) for m in self.vehicle.heartbeat()]
             while outbox and outbox[0][0] <= now:
-                self.transmit(encode(outbox.pop(0)[1]).pack(self.mav))
+                message = outbox.pop(0)[1]
+                self.mav.srcSystem, self.mav.srcComponent = message.system, message.component
+                self.transmit(encode(message).pack(self.mav))
                 self.mav.seq = (self.mav.seq + 1) % 256
             wake = min([due, *(at for at, _ in outbox[:1])])
             data = self.receive(max(0.0, wake - time.monotonic()))
@@ -247,3 +252,58 @@ class UdpVehicle(ByteVehicle):
             return self.port.recv(4096)
         except ConnectionRefusedError:
             return b""
+
+
+class TcpVehicle(ByteVehicle):
+    """Behind a TCP port: the ground station connects."""
+
+    def __init__(self, vehicle, **keywords):
+        super().__init__(vehicle, **keywords)
+        self.port = socket.create_server(("127.0.0.1", 0))
+        self.url = f"tcp:127.0.0.1:{self.port.getsockname()[1]}"
+        self.ground = None
+
+    def transmit(self, data):
+        with contextlib.suppress(OSError):
+            if self.ground is not None:
+                self.ground.sendall(data)
+
+    def hang_up(self):
+        self.ground.shutdown(socket.SHUT_RDWR)
+
+    def receive(self, wait):
+        if not select.select([self.ground or self.port], [], [], wait)[0]:
+            return b""
+        if self.ground is None:
+            self.ground, _ = self.port.accept()
+            return b""
+        with contextlib.suppress(OSError):
+            return self.ground.recv(4096)
+        return b""
+
+    def __exit__(self, *_):
+        super().__exit__()
+        if self.ground is not None:
+            self.ground.close()
+
+
+class SerialVehicle(ByteVehicle):
+    """Behind a serial port: a pseudo-terminal."""
+
+    def __init__(self, vehicle, **keywords):
+        super().__init__(vehicle, **keywords)
+        self.near, self.far = os.openpty()
+        tty.setraw(self.far)
+        self.url = f"{os.ttyname(self.far)},57600"
+
+    def transmit(self, data):
+        os.write(self.near, data)
+
+    def receive(self, wait):
+        return os.read(self.near, 4096) if select.select([self.near], [], [], wait)[0] else b""
+
+    def __exit__(self, *_):
+        self.stop.set()
+        self.thread.join(timeout=10)
+        os.close(self.near)
+        os.close(self.far)

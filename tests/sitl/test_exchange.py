@@ -89,7 +89,7 @@ def test_each_fault_on_a_good_link_is_named_and_undone(fault):
         "echoes": "reads back as 0.1",
         "echoes one": f"{NAMES[7]}: reads back as",
         "ignores": f"{NAMES[7]}: stays",
-        "clamps": f"{NAMES[7]}: stays 0.85",
+        "clamps": f"{NAMES[7]}: stays 0.84",
         "rounds": f"{NAMES[7]}: stays",
         "out of range": f"{NAMES[7]}: refused: value out of its range",
         "read only": "refused: read only",
