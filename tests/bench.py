@@ -17,9 +17,10 @@ from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import fly
 from sitl.mavlink.connection import Connection
-from sitl.mavlink.exchange import Conversation, drive, single
+from sitl.mavlink.exchange import Conversation
 from sitl.mavlink.host import Host, plant_process
 from sitl.mavlink.upload import apply, read
+from sitl.mavlink.words import drive, single
 from sitl.scenario import doublet, excitation_flight
 from sitl.studies.benchmarks import lv100
 from sitl.studies.reproduce import gain_spread

@@ -12,8 +12,8 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import Ack, Beat, Heartbeat, Incoming, Outgoing, Read, Refusal, Value, Write
 from sitl.mavlink.link import Codec, udp_socket
+from sitl.mavlink.words import Ack, Beat, Heartbeat, Incoming, Outgoing, Read, Refusal, Value, Write
 
 #: How ground stations call themselves.
 GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
@@ -81,7 +81,7 @@ def read_key(path: Path) -> bytes:
 
 
 class Connection:
-    """A link to a vehicle over a socket or a serial port; see `sitl.mavlink.exchange.Link`.
+    """A link to a vehicle over a socket or a serial port; see `sitl.mavlink.words.Link`.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import REAL32, shortest, single
+from sitl.mavlink.words import REAL32, shortest, single
 
 NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from codegen.parameters import IDENTITY, PARAMETERS, check_ranges
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import single
+from sitl.mavlink.words import single
 from tuning.gains import AXES, AXIS_LETTERS, MATRICES, Gains
 
 #: Largest off-diagonal, as a share of its row's diagonal, that a stock profile may drop unasked.

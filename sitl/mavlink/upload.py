@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import Answer, Conversation, Steps, shortest
+from sitl.mavlink.exchange import Answer, Conversation
+from sitl.mavlink.words import Steps, shortest
 
 #: PX4 and ArduPilot do not save a value that differs from the old one by less (the epsilon of single precision).
 SMALLEST_CHANGE = 1.2e-7

@@ -15,10 +15,11 @@ import typer
 from codegen.parameters import PARAMETERS
 from sitl.errors import SitlError
 from sitl.mavlink.connection import Connection, read_key
-from sitl.mavlink.exchange import AUTOSAVE_S, TRY_S, Conversation, Heartbeat, Steps, T, drive, shortest
+from sitl.mavlink.exchange import AUTOSAVE_S, TRY_S, Conversation
 from sitl.mavlink.parameter_files import FORMATS, parameter_text
 from sitl.mavlink.profiles import Plan, make_plan
-from sitl.mavlink.upload import Outcome, apply, read
+from sitl.mavlink.upload import SMALLEST_CHANGE, Outcome, apply, read
+from sitl.mavlink.words import Heartbeat, Steps, T, drive, shortest
 from sitl.moment_scale import check_moment_scale
 from tuning.files import write_atomically
 from tuning.gains import Gains, Triple, load_gains
@@ -28,6 +29,9 @@ STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",
     "autosave": f"storage was not acknowledged: waited {AUTOSAVE_S:g} s, in which PX4 and ArduPilot save by themselves",
 }
+
+#: Format -> the target of code generation that emits it, and its path there.
+GENERATED = {"c-header": ("native", "core/parameters.h")}
 
 
 @dataclass(frozen=True)
@@ -234,6 +238,8 @@ def _show_plan(plan: Plan, held: Mapping[str, float], vehicle: Heartbeat) -> Non
         print(f"dropped: {code}, {share:.1%} of its diagonal")
     if plan.dropped:
         print("dropped: the certificate, if any, is of the full matrices")
+    for name in (s.name for s in plan.settings if 0 < abs(s.value - held[s.name]) < SMALLEST_CHANGE):
+        print(f"note: {name}: PX4 and ArduPilot do not save a change below {SMALLEST_CHANGE:g}")
     for note in plan.notes:
         print(f"note: {note}")
 
@@ -332,14 +338,15 @@ def export(file: Path | None, options: Options, form: str, out: Path | None) -> 
     SitlError
         When the format is unknown, or there is nothing to export.
     """
-    if form not in (*FORMATS, "c-header"):
-        raise SitlError(f"--format: got {form!r}, expected one of {', '.join(FORMATS)}, c-header")
+    if form not in (*FORMATS, *GENERATED):
+        raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *GENERATED])}")
     if file is not None:
-        text = _header(file) if form == "c-header" else parameter_text(form, make_plan(load_gains(file)).values)
+        gains = load_gains(file)
+        text = _generated(gains, form) if form in GENERATED else parameter_text(form, make_plan(gains).values)
     elif not options.connect:
         raise SitlError("give a gains file to write, --connect to read from a vehicle, or both to compare them")
-    elif form == "c-header":
-        raise SitlError("--format c-header: is made from a gains file, not from a vehicle")
+    elif form in GENERATED:
+        raise SitlError(f"--format {form}: is made from a gains file, not from a vehicle")
     else:
         with session(options) as vehicle:
             held = vehicle.read([p.name for p in PARAMETERS if p.writable])
@@ -351,7 +358,8 @@ def export(file: Path | None, options: Options, form: str, out: Path | None) -> 
         print(f"{out}: {len(text.splitlines())} lines")
 
 
-def _header(file: Path) -> str:
+def _generated(gains: Gains, form: str) -> str:
     from codegen.render import render
 
-    return render(load_gains(file))["core/parameters.h"]
+    target, path = GENERATED[form]
+    return render(gains, target)[path]

@@ -1,6 +1,6 @@
 """A vehicle that is not ours: it holds parameters, and fails in one named way. And a link that is simulated in time.
 
-The vehicle hears and says the words of `sitl.mavlink.exchange`; `UdpVehicle` puts it behind a real socket with
+The vehicle hears and says the words of `sitl.mavlink.words`; `UdpVehicle` puts it behind a real socket with
 pymavlink's own packing, for the commands.
 """
 
@@ -18,7 +18,7 @@ import tty
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.mavlink.exchange import Ack, Heartbeat, Read, Refusal, Store, Value, Write
+from sitl.mavlink.words import Ack, Heartbeat, Read, Refusal, Store, Value, Write
 
 SYSTEM, COMPONENT = 1, 1
 #: Faults that must end in anything but success, whatever the link does.
@@ -104,7 +104,7 @@ class ScriptedVehicle:
 
 
 class SimulatedLink:
-    """A link with loss, duplicates, reordering and latency each way, in simulated time; see exchange.Link."""
+    """A link with loss, duplicates, reordering and latency each way, in simulated time; see words.Link."""
 
     def __init__(self, vehicle, seed=0, loss=0.0, duplicate=0.0, reorder=0.0, latency=0.05, noise=()):
         self.vehicle, self.closed, self.time = vehicle, False, 0.0

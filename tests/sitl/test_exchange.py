@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import Ack, Conversation, Heartbeat, Refusal, Store, Value, Write, drive, single
+from sitl.mavlink.exchange import Conversation
 from sitl.mavlink.upload import apply, read
+from sitl.mavlink.words import Ack, Heartbeat, Refusal, Store, Value, Write, drive, single
 from tests.sitl.scripted_vehicle import FAILING, ScriptedVehicle, SimulatedLink
 
 NAMES = [f"MIMO_X_{i:02d}" for i in range(20)]

@@ -10,8 +10,8 @@ from pymavlink.mavparm import MAVParmDict
 
 from codegen.parameters import PARAMETERS
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import single
 from sitl.mavlink.parameter_files import FORMATS, NAME, parameter_text, read_parameters
+from sitl.mavlink.words import single
 
 names = st.from_regex(NAME, fullmatch=True)
 #: -0.0 comes back as 0.0 by intention: zero has no sign here.

@@ -9,8 +9,8 @@ import pytest
 from codegen.errors import CodegenError
 from codegen.parameters import PARAMETERS, to_array
 from sitl.errors import SitlError
-from sitl.mavlink.exchange import single
 from sitl.mavlink.profiles import PROFILES, make_plan, off_diagonals, restoration
+from sitl.mavlink.words import single
 from tuning.flown import flown_gains
 from tuning.gains import MATRICES, Limits
 

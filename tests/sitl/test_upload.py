@@ -18,10 +18,10 @@ from codegen.render import render
 from sitl.airframe import load_airframe
 from sitl.errors import SitlError
 from sitl.mavlink.connection import Connection, express, read_key, understand
-from sitl.mavlink.exchange import Beat, Heartbeat, Read, Refusal, Store, Value, Write
 from sitl.mavlink.link import Codec
 from sitl.mavlink.parameter_files import read_parameters
 from sitl.mavlink.profiles import make_plan
+from sitl.mavlink.words import Beat, Heartbeat, Read, Refusal, Store, Value, Write
 from tests.conftest import assert_one_clear_line
 from tests.sitl.scripted_vehicle import FAILING, ScriptedVehicle, SerialVehicle, TcpVehicle, UdpVehicle, encode, float32
 from tests.sitl.test_mavlink import running_sitl
