@@ -68,7 +68,8 @@ def upload(
 
     from codegen.parameters import check_verdict
     from sitl.mavlink.profiles import make_plan
-    from sitl.mavlink.upload_console import Options, parse_scale, transact
+    from sitl.mavlink.session import Options
+    from sitl.mavlink.upload_console import parse_scale, transact
     from tuning.gains import load_gains
 
     loaded = load_gains(gains)
@@ -99,7 +100,8 @@ def restore(
     """Write a snapshot's values back to a vehicle, with the same care as an upload."""
     from sitl.mavlink.parameter_files import read_parameters
     from sitl.mavlink.profiles import restoration
-    from sitl.mavlink.upload_console import Options, transact
+    from sitl.mavlink.session import Options
+    from sitl.mavlink.upload_console import transact
 
     plan = restoration(read_parameters(parameters))
     options = Options(
@@ -122,7 +124,8 @@ def params(
 ) -> None:
     """Write gains, or what a vehicle holds, as a parameter file; compare the two when both are given."""
     from sitl.errors import SitlError
-    from sitl.mavlink.upload_console import Options, compare, export
+    from sitl.mavlink.params_console import compare, export
+    from sitl.mavlink.session import Options
 
     options = Options(connect or "", system, timeout, signing_key, as_json=as_json)
     if gains is None or connect is None:

@@ -1,120 +1,30 @@
-"""What a user of `upload`, `restore` and `params` sees: tables before and after, the question, progress, messages."""
+"""What a user of `upload` and `restore` sees: tables before and after, the question, how it ended."""
 
 from __future__ import annotations
 
-import signal
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import typer
 
-from codegen.parameters import PARAMETERS
 from sitl.errors import SitlError
-from sitl.mavlink.connection import Connection, read_key
-from sitl.mavlink.exchange import AUTOSAVE_S, TRY_S, Conversation
-from sitl.mavlink.parameter_files import FORMATS, parameter_text
-from sitl.mavlink.profiles import Plan, make_plan
-from sitl.mavlink.upload import SMALLEST_CHANGE, Outcome, apply, read
-from sitl.mavlink.words import Heartbeat, Steps, T, drive, shortest
+from sitl.mavlink.exchange import AUTOSAVE_S
+from sitl.mavlink.parameter_files import parameter_text
+from sitl.mavlink.profiles import Plan
+from sitl.mavlink.session import Options, Session, session
+from sitl.mavlink.upload import SMALLEST_CHANGE, Outcome, apply
+from sitl.mavlink.words import Heartbeat, shortest
 from sitl.moment_scale import check_moment_scale
 from tuning.files import write_atomically
-from tuning.gains import Gains, Triple, load_gains
-from tuning.output import print_json, print_table, progress_console
+from tuning.gains import Gains, Triple
+from tuning.output import print_json, print_table
 
 STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",
     "autosave": f"storage was not acknowledged: waited {AUTOSAVE_S:g} s, in which PX4 and ArduPilot save by themselves",
 }
-
-#: Format -> the target of code generation that emits it, and its path there.
-GENERATED = {"c-header": ("native", "core/parameters.h")}
-
-
-@dataclass(frozen=True)
-class Options:
-    """The options that the commands share; see their help."""
-
-    connect: str
-    system: int
-    timeout: float
-    signing_key: Path | None
-    force_armed: bool = False
-    dry_run: bool = False
-    yes: bool = False
-    as_json: bool = False
-    snapshot: Path | None = None
-    stem: Path = Path("vehicle")
-
-
-class Session:
-    """A vehicle on a link, while somebody watches.
-
-    Parameters
-    ----------
-    options : Options
-        How to reach it.
-    """
-
-    def __init__(self, options: Options) -> None:
-        self.options = options
-        self.link = Connection(options.connect, read_key(options.signing_key) if options.signing_key else None)
-        tries = max(1, round(options.timeout / TRY_S))
-        self.talk = Conversation(self.link.now(), tries, options.system, options.force_armed)
-
-    def run(self, steps: Steps[T]) -> T:
-        """Run a part of the conversation; Ctrl-C and a closed terminal end it in order, not at once."""
-        from rich.progress import Progress
-
-        def interrupt(number: int, frame: object) -> None:
-            self.talk.interrupted = True
-
-        numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-        before = {number: signal.signal(number, interrupt) for number in numbers}
-        try:
-            with Progress(console=progress_console(), transient=True) as bar:
-                tasks: dict[str, Any] = {}
-
-                def progress(phase: str, done: int, of: int) -> None:
-                    if phase not in tasks:
-                        tasks[phase] = bar.add_task(phase)
-                    bar.update(tasks[phase], completed=done, total=of)
-
-                self.talk.progress = progress
-                return drive(steps, self.link)
-        except SitlError as error:
-            raise SitlError(f"{error}{self.link.hint}", error.exit_code) from error
-        finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
-
-    def read(self, names: Sequence[str]) -> dict[str, float]:
-        """What the vehicle holds, once it is clear which vehicle that is."""
-        vehicle = self.run(self.talk.meet())
-        held = self.run(read(self.talk, names))
-        if self.talk.others and not self.options.system:
-            systems = ", ".join(map(str, sorted({vehicle.system, *self.talk.others})))
-            raise SitlError(f"several vehicles are on this link (systems {systems}); say which with --system")
-        return held
-
-    @property
-    def vehicle(self) -> Heartbeat:
-        """Its last HEARTBEAT."""
-        assert self.talk.vehicle is not None
-        return self.talk.vehicle
-
-
-@contextmanager
-def session(options: Options) -> Iterator[Session]:
-    """Open a link and close it again."""
-    opened = Session(options)
-    try:
-        yield opened
-    finally:
-        opened.link.close()
 
 
 def parse_scale(text: str | None) -> Triple | Literal["flown"] | None:
@@ -302,64 +212,3 @@ def _failure(outcome: Outcome, held: Mapping[str, float], snapshot: Path | None,
     rest = "the others hold their old values" if left else "the old values were put back, but not all were read back"
     again = f"restore with: mimopilot restore {snapshot} --connect {options.connect}"
     return "; ".join([outcome.reason, *left, rest, again])
-
-
-def compare(file: Path, options: Options) -> None:
-    """Show a gains file beside what the vehicle holds.
-
-    Raises
-    ------
-    SitlError
-        With exit code 1 when they differ.
-    """
-    plan = make_plan(load_gains(file))
-    wanted = plan.values | plan.fixed
-    with session(options) as vehicle:
-        held = vehicle.read(list(wanted))
-    differ = [name for name, value in wanted.items() if held[name] != value]
-    if options.as_json:
-        both = {name: {"file": value, "vehicle": held[name]} for name, value in wanted.items()}
-        print_json({"equal": not differ, "parameters": both})
-    else:
-        rows = [
-            [name, shortest(value), shortest(held[name]), f"{held[name] - value:+.6g}" if name in differ else ""]
-            for name, value in wanted.items()
-        ]
-        print_table(str(file), ["parameter", "in the file", "on the vehicle", "difference"], rows)
-    if differ:
-        raise SitlError(f"{len(differ)} of {len(wanted)} parameters differ", exit_code=1)
-
-
-def export(file: Path | None, options: Options, form: str, out: Path | None) -> None:
-    """Write a gains file, or what a vehicle holds, as a parameter file.
-
-    Raises
-    ------
-    SitlError
-        When the format is unknown, or there is nothing to export.
-    """
-    if form not in (*FORMATS, *GENERATED):
-        raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *GENERATED])}")
-    if file is not None:
-        gains = load_gains(file)
-        text = _generated(gains, form) if form in GENERATED else parameter_text(form, make_plan(gains).values)
-    elif not options.connect:
-        raise SitlError("give a gains file to write, --connect to read from a vehicle, or both to compare them")
-    elif form in GENERATED:
-        raise SitlError(f"--format {form}: is made from a gains file, not from a vehicle")
-    else:
-        with session(options) as vehicle:
-            held = vehicle.read([p.name for p in PARAMETERS if p.writable])
-        text = parameter_text(form, held, vehicle.vehicle.system, vehicle.vehicle.component)
-    if out is None:
-        sys.stdout.write(text)
-    else:
-        write_atomically(out, text)
-        print(f"{out}: {len(text.splitlines())} lines")
-
-
-def _generated(gains: Gains, form: str) -> str:
-    from codegen.render import render
-
-    target, path = GENERATED[form]
-    return render(gains, target)[path]
