@@ -130,7 +130,6 @@ class Connection:
             return udp_socket(*address, "is another ground station listening there?")
         except OSError as error:
             raise SitlError(f"--connect {url}: cannot be opened: {error.strerror or error}", exit_code=1) from error
-        return port
 
     @staticmethod
     def _open_serial(url: str) -> Any:

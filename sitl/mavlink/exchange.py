@@ -56,8 +56,8 @@ class Answer(NamedTuple):
 class _Request:
     """One request under way."""
 
+    began: float
     due: float
-    sent_at: float = 0.0
     tries: int = 0
     contradicted: set[int] = field(default_factory=set)
     kept: float | None = None
@@ -103,12 +103,18 @@ class Conversation:
         self.progress: Callable[[str, int, int], None] = lambda phase, done, of: None
         self._heartbeat_at = self._heard_at = now
         self._beat_due = now
-        self._round_trip = 0.0
+        # Longest exchange, and longest of those answered at the first try: only these are sure to be a round trip.
+        self._longest = self._round_trip = 0.0
 
     @property
     def patience(self) -> float:
         """Silence that is taken for the end, s."""
         return self.tries * TRY_S
+
+    @property
+    def gone(self) -> bool:
+        """True when the link is closed, or the vehicle silent for too long."""
+        return self.closed or self.now - self._heard_at >= self.patience
 
     def resume(self, now: float) -> None:
         """Go on after a pause in which nobody listened: writing waits for another HEARTBEAT."""
@@ -151,7 +157,9 @@ class Conversation:
         while self.vehicle is None:
             if self.interrupted:
                 raise SitlError("interrupted; nothing was written", exit_code=1)
-            if self.now >= deadline or self.closed:
+            if self.closed:
+                raise SitlError("the link was lost; nothing was written", exit_code=1)
+            if self.now >= deadline:
                 whose = f"of system {self.system}" if self.system else "of an autopilot"
                 raise SitlError(f"no HEARTBEAT {whose} in {self.patience:g} s", exit_code=1)
             yield from self._turn([], deadline)
@@ -178,24 +186,19 @@ class Conversation:
             obstacle = self._obstacle(begin, keep_going, writes)
             if obstacle:
                 return answers | {name: Answer(None, obstacle) for name in [*under_way, *reversed(waiting)]}
-            while waiting and len(under_way) < WINDOW:
-                under_way[waiting.pop()] = _Request(due=self.now)
-            hold = writes and not keep_going and self.now - self._heartbeat_at >= FRESH_S
-            send: list[Outgoing] = []
-            for name, request in list(under_way.items()):
-                if request.due > self.now or hold:
-                    continue
-                if request.tries == self.tries:
-                    silence = f"no answer in {self.patience:g} s (a vehicle may be silent on what it lacks)"
-                    kept = request.kept
-                    answers[name] = Answer(kept, silence if kept is None else f"stays {shortest(kept)}")
-                    del under_way[name]
-                else:
-                    send.append(self._order(name, orders[name]))
-                    request.tries += 1
-                    request.sent_at, request.due = self.now, self.now + TRY_S
+            for name in [name for name, r in under_way.items() if r.tries == self.tries and r.due <= self.now]:
+                answers[name] = self._give_up(under_way.pop(name))
             if not keep_going and any(answer.problem for answer in answers.values()):
                 return answers
+            while waiting and len(under_way) < WINDOW:
+                name = waiting.pop()
+                under_way[name] = _Request(began=self.now, due=self.now)
+            hold = writes and not keep_going and self.now - self._heartbeat_at >= FRESH_S
+            send: list[Outgoing] = []
+            for name, request in under_way.items():
+                if request.due <= self.now and not hold:
+                    send.append(self._order(name, orders[name]))
+                    request.tries, request.due = request.tries + 1, self.now + TRY_S
             wake = self.now + TRY_S if hold else min((r.due for r in under_way.values()), default=self.now)
             for message in (yield from self._turn(send, wake)):
                 if isinstance(message, Ack) or message.name not in under_way:
@@ -220,9 +223,16 @@ class Conversation:
             return "interrupted"
         if writes and self.vehicle.armed and not self.force_armed:
             return "the vehicle is armed"
-        if writes and self.now - max(self._heartbeat_at, begin) >= self.patience:
-            return f"no HEARTBEAT in {self.patience:g} s"
+        wait = max(self.patience, FRESH_S)
+        if writes and self.now - max(self._heartbeat_at, begin) >= wait:
+            return f"no HEARTBEAT in {wait:g} s"
         return ""
+
+    def _give_up(self, request: _Request) -> Answer:
+        """Answer to a request whose tries are used up: what the vehicle held on to, or silence."""
+        if request.kept is not None:
+            return Answer(request.kept, f"stays {shortest(request.kept)}")
+        return Answer(None, f"no answer in {self.patience:g} s (a vehicle may be silent on what it lacks)")
 
     def _order(self, name: str, value: float | None) -> Outgoing:
         assert self.vehicle is not None
@@ -247,15 +257,17 @@ class Conversation:
             if len(request.contradicted) == CONTRADICTIONS:
                 request.due, request.tries = self.now, self.tries
             return None
+        took = self.now - request.began
+        self._longest = max(self._longest, took)
         if request.tries == 1:
-            self._round_trip = max(self._round_trip, self.now - request.sent_at)
+            self._round_trip = max(self._round_trip, took)
         if wanted is not None:
             self.possible[message.name] = {wanted}
         return Answer(message.value)
 
     def settle(self) -> Steps[None]:
         """Wait until what is under way has arrived: a late echo must not pass for what is held afterwards."""
-        quiet = max(QUIET_S, 2 * self._round_trip)
+        quiet = max(QUIET_S, 2 * (self._round_trip or self._longest))
         until, deadline = self.now + quiet, self.now + self.patience
         while self.now < min(until, deadline) and not self.closed:
             heard = yield from self._turn([], until)

@@ -77,8 +77,8 @@ def apply(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float]
         return Outcome("untouched", reason, _held(talk, new))
     yield from talk.settle()
     back = {name: old[name] for name in new if name in talk.written or talk.possible[name] != {old[name]}}
-    answers = yield from talk.tell(back, "putting back", keep_going=True)
-    if all(answer.problem for answer in answers.values()):
+    yield from talk.tell(back, "putting back", keep_going=True)
+    if talk.gone:
         return Outcome("mixed", reason, _held(talk, new))
     yield from talk.settle()
     answers = yield from talk.ask(list(new), "verifying", keep_going=True)
@@ -89,6 +89,7 @@ def apply(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float]
 
 def _write_and_verify(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float]) -> Steps[str]:
     """Why the new values are not all on the vehicle; empty when they are."""
+    yield from talk.settle()
     changed = {name: value for name, value in new.items() if value != old[name]}
     reason = _problem((yield from talk.tell(changed, "writing")), old, new)
     if reason:
@@ -114,9 +115,9 @@ def _problem(
         return ""
     name, answer = next(iter(bad.items()))
     more = f" (and {len(bad) - 1} more)" if len(bad) > 1 else ""
-    if old and new and answer.value is not None and abs(new[name] - old[name]) < SMALLEST_CHANGE:
-        more += f": PX4 and ArduPilot do not save a change below {SMALLEST_CHANGE:g}"
-    return f"{name}{more}: {answer.problem}" if not more.startswith(":") else f"{name}: {answer.problem}{more}"
+    tiny = old and new and answer.value is not None and abs(new[name] - old[name]) < SMALLEST_CHANGE
+    why = f": PX4 and ArduPilot do not save a change below {SMALLEST_CHANGE:g}" if tiny else ""
+    return f"{name}{more}: {answer.problem}{why}"
 
 
 def _held(talk: Conversation, names: Mapping[str, float]) -> dict[str, tuple[float, ...]]:

@@ -309,13 +309,35 @@ def test_a_vehicle_that_is_not_there_is_waited_for_as_long_as_told():
     assert link.now() == pytest.approx(3.0)
 
 
+@pytest.mark.parametrize("latency", [0.3, 0.6, 1.2])
+def test_a_round_trip_longer_than_a_try_neither_fails_nor_deceives(latency):
+    vehicle = ScriptedVehicle(OLD)
+    assert upload(SimulatedLink(vehicle, latency=latency, reorder=0.1)).state == "verified"
+    assert vehicle.values == NEW
+    for seed in range(60):
+        fault = ("echoes", "echoes one", "clamps")[seed % 3]
+        vehicle = ScriptedVehicle(OLD, fault, victim=NAMES[seed % 20])
+        assert upload(SimulatedLink(vehicle, seed, latency=latency, **RADIO)).state == "rolled back"
+        assert vehicle.values == OLD
+
+
+def test_a_vehicle_that_turns_read_only_half_way_is_read_and_told_exactly():
+    vehicle = ScriptedVehicle(OLD)
+    store = vehicle.store
+    vehicle.store = lambda name, value: [Refusal(1, 1, name, 5)] if vehicle.writes > 6 else store(name, value)
+    outcome = upload(SimulatedLink(vehicle))
+    assert (outcome.state, outcome.storage) == ("mixed", "acknowledged")
+    assert outcome.held == {name: (value,) for name, value in vehicle.values.items()}
+    assert sum(values != (OLD[name],) for name, values in outcome.held.items()) == 6
+
+
 def test_a_slow_link_is_used_to_its_window_and_no_further():
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle, latency=0.05)
     link.receive(1.1)  # its first HEARTBEAT is on the way
     begin = link.now()
     assert upload(link).state == "verified"
-    # Two windows each of reading, writing and verifying, a settling of two round trips, and the storage.
+    # Two windows each of reading, writing and verifying, two settlings of two round trips, and the storage.
     assert link.now() - begin < 1.0 + 1.1
     most = 0
     for at, _ in link.log:
