@@ -275,7 +275,14 @@ class Conversation:
                 until = self.now + quiet
 
     def store(self) -> Steps[str]:
-        """Have the vehicle save its parameters: ``acknowledged``, ``autosave`` (its time passed) or ``failed``."""
+        """Have the vehicle save its parameters.
+
+        Returns
+        -------
+        str
+            ``acknowledged``; ``autosave``: not, but the time passed in which vehicles save by themselves; ``failed``;
+            empty when the link closed.
+        """
         assert self.vehicle is not None
         due, deadline, result = self.now, self.now + AUTOSAVE_S, IN_PROGRESS
         while self.now < deadline and not self.closed:
@@ -289,4 +296,6 @@ class Conversation:
                     result = message.result
             if result == ACCEPTED:
                 return "acknowledged"
+        if self.closed:
+            return ""
         return "failed" if result == FAILED else "autosave"

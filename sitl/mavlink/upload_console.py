@@ -24,6 +24,8 @@ from tuning.output import print_json, print_table
 STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",
     "autosave": f"storage was not acknowledged: waited {AUTOSAVE_S:g} s, in which PX4 and ArduPilot save by themselves",
+    "failed": "not stored",
+    "": "the link was lost before storage was acknowledged",
 }
 
 
@@ -95,6 +97,8 @@ def transact(
                 typer.confirm(f"Write {len(changes)} parameters to vehicle {vehicle.vehicle.system}?", abort=True)
                 vehicle.link.discard()
                 vehicle.talk.resume(vehicle.link.now())
+                if vehicle.read(list(held)) != held:
+                    raise SitlError("the vehicle's values changed while the question stood: run it again", exit_code=1)
             snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
             outcome = vehicle.run(apply(vehicle.talk, plan.values, held))
         _report(plan, held, vehicle.vehicle, outcome, snapshot, options)
@@ -189,7 +193,7 @@ def _report(
             rows = [[s.name, s.unit, shortest(outcome.held[s.name][0])] for s in plan.settings]
             print_table("read back from the vehicle", ["parameter", "unit", "value"], rows)
             written = sum(s.value != held[s.name] for s in plan.settings)
-            print(f"{len(rows)} parameters verified, {written} of them written; {STORAGE.get(outcome.storage, '')}")
+            print(f"{len(rows)} parameters verified, {written} of them written; {STORAGE[outcome.storage]}")
         if outcome.storage == "failed":
             raise SitlError(
                 "all values were read back, but the vehicle could not store them: it loses them when it restarts",

@@ -172,6 +172,24 @@ def test_a_person_at_a_terminal_is_asked(certified, old, new, answer, written):
     os.close(far)
 
 
+def test_values_that_change_while_the_question_stands_are_not_overwritten(certified, old, new):
+    near, far = os.openpty()
+    with UdpVehicle(ScriptedVehicle(old)) as link:
+        command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url]
+        with subprocess.Popen(command, stdin=far, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            deadline = time.monotonic() + 20
+            while link.vehicle.reads < len(old) and time.monotonic() < deadline:
+                time.sleep(0.01)
+            time.sleep(0.5)  # the last answer is on its way
+            link.vehicle.values["MIMO_RP_RR"] = 0.5
+            os.write(near, b"y\n")
+            _, message = process.communicate(timeout=60)
+        assert (process.returncode, link.vehicle.writes) == (1, 0)
+        assert "changed while the question stood" in message
+    os.close(near)
+    os.close(far)
+
+
 def test_signed_links_need_the_key_and_say_so(mimopilot, certified, old, new, tmp_path):
     (tmp_path / "key").write_bytes(KEY)
     (tmp_path / "hex").write_text(KEY.hex() + "\n")
