@@ -8,6 +8,7 @@ import typer
 
 import codegen.commands
 import sitl.commands
+import sitl.mavlink.commands
 import sitl.studies.commands
 import tuning.commands
 from codegen.errors import CodegenError
@@ -22,7 +23,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for commands in (sitl.studies.commands, sitl.commands, tuning.commands, codegen.commands):
+for commands in (sitl.studies.commands, sitl.commands, tuning.commands, codegen.commands, sitl.mavlink.commands):
     commands.register(app)
 
 

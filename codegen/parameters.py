@@ -190,7 +190,7 @@ def check_ranges(gains: Gains) -> None:
             )
 
 
-def check_verdict(gains: Gains, allow: bool) -> str:
+def check_verdict(gains: Gains, allow: bool, required: bool = False) -> str:
     """Refuse gains whose loop is unstable or cannot be shown to be stable.
 
     Parameters
@@ -199,6 +199,8 @@ def check_verdict(gains: Gains, allow: bool) -> str:
         The set, with its certificate.
     allow : bool
         Go on all the same.
+    required : bool
+        Refuse gains that were never examined, too.
 
     Returns
     -------
@@ -208,12 +210,15 @@ def check_verdict(gains: Gains, allow: bool) -> str:
     Raises
     ------
     CodegenError
-        When the verdict is ``unstable`` or ``not certified``, or the certificate is void, and `allow` is False.
+        When the verdict is ``unstable`` or ``not certified``, or the certificate is void (or missing and required),
+        and `allow` is False.
     """
     verdict, reason = gains.verdict()
     if verdict == "certified":
         return ""
-    if verdict in ("unstable", "not certified", "void") and not allow:
+    refused = ("unstable", "not certified", "void", *(["none"] if required else []))
+    if verdict in refused and not allow:
+        verdict = "no certificate" if verdict == "none" else verdict
         raise CodegenError(f"{verdict}: {reason}; tune or certify again, or give --uncertified to go on all the same")
     return f"certificate: {verdict}: {reason}"
 

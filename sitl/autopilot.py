@@ -17,7 +17,7 @@ from codegen.native import NativeController, load_native
 from sitl.airframe import Airframe
 from sitl.allocation import allocate
 from sitl.compiled import call_step, compiled
-from sitl.errors import SitlError
+from sitl.moment_scale import check_moment_scale
 from sitl.plant import GRAVITY
 from sitl.sensors import euler_angles
 from tuning.gains import Gains
@@ -107,7 +107,7 @@ class Autopilot:
         controller: NativeController | EmulatedController | None = None,
         altitude: float = 10.0,
     ) -> None:
-        check_moment_scale(airframe, gains)
+        check_moment_scale(gains, airframe.moment_scale(), airframe.name)
         self.gains = gains
         self.controller = controller or NativeController(load_native(gains), gains)
         self.step_address = self.controller.step_address
@@ -134,26 +134,4 @@ class Autopilot:
             self.allocation,
             self.hover,
             self.altitude,
-        )
-
-
-def check_moment_scale(airframe: Airframe, gains: Gains) -> None:
-    """Refuse gains whose unit of moment is not the airframe's: the loop gain would be wrong by their ratio.
-
-    Raises
-    ------
-    SitlError
-        Naming both scales.
-    """
-    scale = airframe.moment_scale()
-    if gains.moment_scale is None:
-        raise SitlError(
-            "moment_scale: the gains do not say how many N m one unit of moment stands for; write it into the gains "
-            f"file ({airframe.name} has {scale[0]:.4g}, {scale[1]:.4g}, {scale[2]:.4g})"
-        )
-    if not np.allclose(gains.moment_scale, scale, rtol=0.01, atol=0):
-        raise SitlError(
-            f"moment_scale: the gains are for {', '.join(f'{v:.4g}' for v in gains.moment_scale)} N m per unit, "
-            f"{airframe.name} has {', '.join(f'{v:.4g}' for v in scale)}; tune on a log of this vehicle, or "
-            "convert them (mimopilot convert) if they are for this vehicle under another allocator"
         )

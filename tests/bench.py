@@ -18,9 +18,14 @@ from codegen.vectors import random_inputs, reference_outputs
 from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import fly
+from sitl.mavlink.connection import Connection
+from sitl.mavlink.exchange import Conversation
 from sitl.mavlink.host import Host, plant_process
+from sitl.mavlink.upload import apply, read
+from sitl.mavlink.words import drive, single
 from sitl.scenario import doublet, excitation_flight
 from tests.bench_tuning import best, tuning_rows
+from tests.sitl.scripted_vehicle import ScriptedVehicle, UdpVehicle
 from tuning.controller import Controller
 from tuning.logs.reader import read_log
 from tuning.output import print_table
@@ -31,6 +36,24 @@ TS = 0.004
 def command(*arguments: str) -> Callable[[], object]:
     line = [sys.executable, "-m", "mimopilot", *arguments]
     return lambda: subprocess.run(line, check=True, capture_output=True)
+
+
+def upload_seconds(round_trip: float) -> float:
+    """A 25-parameter upload to a scripted vehicle over loopback, from its first HEARTBEAT to its stored set, s."""
+    new = {f"MIMO_X_{i:02d}": single(0.1 * i + 0.05) for i in range(25)}
+    vehicle = ScriptedVehicle(dict.fromkeys(new, 0.0))
+    with UdpVehicle(vehicle, delay=round_trip) as link:
+        connection = Connection(link.url)
+        talk = Conversation(connection.now())
+        drive(talk.meet(), connection)
+        begin = time.perf_counter()
+        held = drive(read(talk, list(new)), connection)
+        outcome = drive(apply(talk, new, held), connection)
+        seconds = time.perf_counter() - begin
+        connection.close()
+    if (outcome.state, outcome.storage, vehicle.values) != ("verified", "acknowledged", new):
+        raise RuntimeError(f"the upload ended as {outcome}")
+    return seconds
 
 
 def main() -> None:
@@ -89,6 +112,10 @@ def main() -> None:
         )
 
         rows += tuning_rows(read_log(folder / "demo" / "flight.ulg"))
+        for round_trip, limit in ((0.0, "under 0.5 s"), (0.1, "under 2 s")):
+            slowest = max(upload_seconds(round_trip) for _ in range(3))
+            title = f"upload of 25 parameters, verified and stored, round trip {round_trip * 1e3:.0f} ms"
+            rows.append([title, f"{slowest:.2f} s", limit])
     print_table("mimopilot bench", ["what", "figure", "beside"], rows)
 
 

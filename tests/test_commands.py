@@ -17,7 +17,7 @@ from tests.conftest import assert_one_clear_line
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise"),
-    *("generate", "pil", "fly", "sitl", "plant"),
+    *("generate", "pil", "fly", "sitl", "plant", "convert", "upload", "restore", "params"),
 ]
 
 
@@ -25,7 +25,7 @@ COMMANDS = [
 def log(tmp_path_factory):
     """A short experiment, flown by the command."""
     path = tmp_path_factory.mktemp("log") / "flight.ulg"
-    command = [sys.executable, "-m", "mimopilot", "experiment", "adam0", "--seconds-per-axis", "8", "--out", str(path)]
+    command = [sys.executable, "-m", "mimopilot", "experiment", "adam0", "--seconds-per-axis", "10", "--out", str(path)]
     subprocess.run(command, check=True, capture_output=True)
     return path
 

@@ -62,7 +62,9 @@ def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
     return server
 
 
-def udp_socket(host: str, port: int) -> socket.socket:
+def udp_socket(
+    host: str, port: int, advice: str = "is another vehicle running? Choose another port with --vehicle-port"
+) -> socket.socket:
     """A non-blocking UDP socket bound to a local port.
 
     Raises
@@ -75,9 +77,6 @@ def udp_socket(host: str, port: int) -> socket.socket:
         link.bind((host, port))
     except OSError as error:
         link.close()
-        raise SitlError(
-            f"UDP port {port} on {host} cannot be used: {error.strerror}; is another vehicle "
-            "running? Choose another port with --vehicle-port"
-        ) from error
+        raise SitlError(f"UDP port {port} on {host} cannot be used: {error.strerror or error}; {advice}") from error
     link.setblocking(False)
     return link

@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import common as mavlink
 from codegen.cortex_m4 import EmulatedController
 from codegen.native import NativeController
 from codegen.parameters import IDENTITY, PARAMETERS, Parameter, identity_parameters, to_array
+from sitl.mavlink.words import REAL32
 from tuning.gains import Gains
 
-REAL32 = 9
 #: PARAM_ERROR (345) reasons; pymavlink's own enumeration ends before some of them.
 DOES_NOT_EXIST, OUT_OF_RANGE, READ_ONLY, TYPE_MISMATCH = 1, 2, 5, 7
 

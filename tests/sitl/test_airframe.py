@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from sitl.airframe import FOLDER, known_airframes, load_airframe
-from sitl.autopilot import Autopilot, check_moment_scale
+from sitl.autopilot import Autopilot
 from sitl.errors import SitlError
 from sitl.loop import fly
+from sitl.moment_scale import check_moment_scale
 from sitl.scenario import doublet
 from tests.conftest import assert_one_clear_line
 from tuning.errors import TuningError
@@ -20,7 +21,7 @@ def test_the_airframes_come_with_their_gains():
     for name in known_airframes():
         vehicle = load_airframe(name)
         assert vehicle.airframe.name == name
-        check_moment_scale(vehicle.airframe, vehicle.default_gains())
+        check_moment_scale(vehicle.default_gains(), vehicle.airframe.moment_scale(), name)
 
 
 def test_an_unknown_airframe_lists_the_known_ones():
@@ -56,9 +57,10 @@ def test_gains_for_another_unit_of_moment_are_refused(gains):
 
     airframe = load_airframe("adam0").airframe
     with pytest.raises(SitlError, match=r"3\.6, 3\.6, 0\.2736 N m per unit, adam0 has 2\.546"):
-        check_moment_scale(airframe, dataclasses.replace(gains, moment_scale=(3.6, 3.6, 0.2736)))
+        other = dataclasses.replace(gains, moment_scale=(3.6, 3.6, 0.2736))
+        check_moment_scale(other, airframe.moment_scale(), airframe.name)
     with pytest.raises(SitlError, match="do not say"):
-        check_moment_scale(airframe, dataclasses.replace(gains, moment_scale=None))
+        check_moment_scale(dataclasses.replace(gains, moment_scale=None), airframe.moment_scale(), airframe.name)
 
 
 def test_the_gyro_filter_is_a_butterworth_low_pass_on_the_measured_rates():
@@ -106,7 +108,8 @@ def test_convert_writes_gains_that_the_airframe_takes(mimopilot, tmp_path):
     mine = tmp_path / "mine.gains.toml"
     load_airframe("adam0").default_gains().save(mine)
     assert_one_clear_line(mimopilot("fly", "px4_sih", "--gains", mine), "mimopilot convert", "moment_scale")
+    scale = load_airframe("px4_sih").airframe.moment_scale()
     result = mimopilot("convert", mine, "px4_sih", "--out", "theirs.gains.toml")
     assert result.returncode == 0, result.stderr
     assert "2.546, 2.546, 0.2736 N m, now for 2.88, 2.88, 0.2" in result.stdout
-    check_moment_scale(load_airframe("px4_sih").airframe, load_gains(tmp_path / "theirs.gains.toml"))
+    check_moment_scale(load_gains(tmp_path / "theirs.gains.toml"), scale, "px4_sih")

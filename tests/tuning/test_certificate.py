@@ -124,7 +124,7 @@ def test_no_unstable_set_is_certified_and_most_well_damped_ones_are(flights):
         for base in (load_airframe(name).default_gains(), tuned):
             stable, unstable = random_sets(base, rng, linear, 24)
             total += len(stable) + len(unstable)
-            wrong += sum(certify(g, plant, *MODELS).verdict == CERTIFIED for g in unstable)
+            wrong += sum(certify(g, plant, *MODELS).verdict in (CERTIFIED, THIN) for g in unstable)
             damped = [g for g in stable if linear.peak(g) < 2]
             good += len(damped)
             certified += sum(certify(g, plant, *MODELS).verdict == CERTIFIED for g in damped)

@@ -13,7 +13,7 @@ def series(time, offset=0.0):
 
 
 def grid(parts=ALWAYS, **signals):
-    return on_common_grid({name: monotone(s) for name, s in signals.items()}, parts, "log", "set SDLOG_PROFILE to 17")
+    return on_common_grid({name: monotone(s) for name, s in signals.items()}, parts, "log", "set SDLOG_PROFILE to 49")
 
 
 def uniform(seconds=10.0, Ts=0.004, start=1.0):

@@ -26,7 +26,7 @@ SIGNALS = {
     "u_bar": ("u_bar_roll", "u_bar_pitch"),
 }
 ADVICE = (
-    "log it at 100 Hz or more on the vehicle (PX4: SDLOG_PROFILE 17, ArduPilot: LOG_BITMASK bit 0) and export every "
+    "log it at 100 Hz or more on the vehicle (PX4: SDLOG_PROFILE 49, ArduPilot: LOG_BITMASK bit 0) and export every "
     "sample; other names of columns are told with --columns"
 )
 

@@ -85,7 +85,7 @@ def record_ulog(path: Path) -> Recording:
         signals,
         wanted,
         sorted({dataset.name for dataset in log.ulog.data_list}),
-        f"set SDLOG_PROFILE to 17 (default and high rate{now}) and fly again",
+        f"set SDLOG_PROFILE to 49 (default, high rate and debug{now}) and fly again",
         airborne,
         evidence,
         parameters,

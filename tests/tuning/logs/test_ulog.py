@@ -150,7 +150,7 @@ def test_the_message_names_the_missing_topic_the_logging_profile_and_the_topics_
     path = write_ulog(tmp_path / "x.ulg", topics, {"SDLOG_PROFILE": 1.0})
     with pytest.raises(
         TuningError,
-        match=r"lacks vehicle_torque_setpoint .*actuator_controls_0.*SDLOG_PROFILE to 17.*it is 1\).*vehicle_attitude",
+        match=r"lacks vehicle_torque_setpoint .*actuator_controls_0.*SDLOG_PROFILE to 49.*it is 1\).*vehicle_attitude",
     ):
         read_log(path)
 
@@ -159,7 +159,7 @@ def test_default_logging_is_refused_as_too_slow(tmp_path, flight):
     topics = px4_topics(flight)
     topics[0] = ("vehicle_torque_setpoint", 0, {k: v[::12] for k, v in topics[0][2].items()})
     with pytest.raises(
-        TuningError, match=r"too slow: vehicle_torque_setpoint is logged at 20\.8 Hz.*SDLOG_PROFILE to 17"
+        TuningError, match=r"too slow: vehicle_torque_setpoint is logged at 20\.8 Hz.*SDLOG_PROFILE to 49"
     ):
         read_log(write_ulog(tmp_path / "x.ulg", topics))
 

@@ -1,0 +1,204 @@
+"""A link to a vehicle, from its URL: MAVLink 2 over UDP, TCP or a serial port, signed where a key is given."""
+
+from __future__ import annotations
+
+import select
+import socket
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from sitl.errors import SitlError
+from sitl.mavlink.link import Codec, udp_socket
+from sitl.mavlink.words import Ack, Beat, Heartbeat, Incoming, Outgoing, Read, Refusal, Value, Write
+
+#: How ground stations call themselves.
+GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
+BAUD = 57600
+FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
+KEY_BYTES = 32
+CONNECT_S = 5.0
+#: Signatures count units of 10 us from this second on (2015-01-01).
+SIGNING_EPOCH_S, SIGNING_PER_S = 1420070400, 100_000
+
+
+def understand(message: Any) -> Incoming | None:
+    """What a parsed message means to an exchange of parameters; None when nothing."""
+    kind = message.get_type()
+    speaker = message.get_srcSystem(), message.get_srcComponent()
+    if kind == "HEARTBEAT":
+        if message.type == mavlink.MAV_TYPE_GCS or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
+            return None
+        armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
+        return Heartbeat(*speaker, message.autopilot, armed)
+    if kind == "PARAM_VALUE":
+        return Value(*speaker, message.param_id, message.param_value + 0.0, message.param_type)
+    if kind == "PARAM_ERROR":
+        return Refusal(*speaker, message.param_id, message.error)
+    if kind == "COMMAND_ACK":
+        return Ack(*speaker, message.command, message.result)
+    return None
+
+
+def express(order: Outgoing) -> Any:
+    """The message that carries an order."""
+    if isinstance(order, Beat):
+        return mavlink.MAVLink_heartbeat_message(
+            mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
+        )
+    if isinstance(order, Read):
+        name = order.name.encode()
+        return mavlink.MAVLink_param_request_read_message(order.system, order.component, name, -1)
+    if isinstance(order, Write):
+        name = order.name.encode()
+        kind = mavlink.MAV_PARAM_TYPE_REAL32
+        return mavlink.MAVLink_param_set_message(order.system, order.component, name, order.value, kind)
+    command = mavlink.MAV_CMD_PREFLIGHT_STORAGE
+    return mavlink.MAVLink_command_long_message(order.system, order.component, command, 0, 1, 0, 0, 0, 0, 0, 0)
+
+
+def read_key(path: Path) -> bytes:
+    """Signing key from a file: 32 bytes, or 64 hexadecimal digits.
+
+    Raises
+    ------
+    SitlError
+        When it holds neither.
+    """
+    content = path.read_bytes()
+    if len(content) == KEY_BYTES:
+        return content
+    try:
+        key = bytes.fromhex(content.decode())
+    except ValueError:
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise SitlError(f"{path}: not a signing key: expected {KEY_BYTES} bytes or {2 * KEY_BYTES} hexadecimal digits")
+    return key
+
+
+class Connection:
+    """A link to a vehicle over a socket or a serial port; see `sitl.mavlink.words.Link`.
+
+    Parameters
+    ----------
+    url : str
+        ``udpin:HOST:PORT`` (listen), ``udpout:HOST:PORT`` (speak first), ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
+    key : bytes, optional
+        Signs what is sent; what is not signed with it is then ignored.
+
+    Raises
+    ------
+    SitlError
+        When the URL is none of these, or cannot be opened.
+    """
+
+    def __init__(self, url: str, key: bytes | None = None) -> None:
+        self.closed = False
+        self.codec = Codec(GROUND_SYSTEM, GROUND_COMPONENT)
+        if key is not None:
+            self._sign(key)
+        self.kind, _, rest = url.partition(":")
+        self.peers: dict[Any, None] = {}
+        if self.kind in ("udp", "udpin", "udpout", "tcp"):
+            self.port: Any = self._open_socket(url, rest)
+        else:
+            self.port = self._open_serial(url)
+
+    def _sign(self, key: bytes) -> None:
+        signing = self.codec.mav.signing
+        signing.secret_key, signing.sign_outgoing = key, True
+        signing.timestamp = int((time.time() - SIGNING_EPOCH_S) * SIGNING_PER_S)
+
+    def _open_socket(self, url: str, rest: str) -> socket.socket:
+        host, _, number = rest.rpartition(":")
+        if not host or not number.isascii() or not number.isdigit() or not 0 < int(number) < 65536:
+            raise SitlError(f"--connect {url}: {FORMS}")
+        address = host, int(number)
+        try:
+            if self.kind == "tcp":
+                port = socket.create_connection(address, timeout=CONNECT_S)
+                port.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                port.settimeout(CONNECT_S)
+                return port
+            if self.kind == "udpout":
+                self.peers[socket.gethostbyname(host), address[1]] = None
+                return udp_socket("", 0)
+            return udp_socket(*address, "is another ground station listening there?")
+        except OSError as error:
+            raise SitlError(f"--connect {url}: cannot be opened: {error.strerror or error}", exit_code=1) from error
+
+    @staticmethod
+    def _open_serial(url: str) -> Any:
+        import serial
+
+        device, _, baud = url.partition(",")
+        if not device.startswith(("/", "COM")) or not (baud or str(BAUD)).isdigit():
+            raise SitlError(f"--connect {url}: {FORMS}")
+        try:
+            return serial.Serial(device, int(baud or BAUD), timeout=0, write_timeout=CONNECT_S)
+        except (serial.SerialException, ValueError) as error:
+            raise SitlError(f"--connect {url}: cannot be opened: {error}", exit_code=1) from error
+
+    @property
+    def hint(self) -> str:
+        """What signatures tell about a silence; empty when nothing."""
+        signing = self.codec.mav.signing
+        if signing.secret_key is None:
+            return "; messages on this link are signed: give --signing-key" if signing.sig_count else ""
+        refused = self.codec.mav.total_receive_errors
+        return "; messages came that are not signed with this key" if refused and not signing.goodsig_count else ""
+
+    def close(self) -> None:
+        """Release the port."""
+        self.port.close()
+
+    def now(self) -> float:
+        """Monotonic time, s."""
+        return time.monotonic()
+
+    def send(self, messages: Sequence[Outgoing]) -> None:
+        """Send; what cannot be sent is lost, as on any radio."""
+        for message in messages:
+            data = self.codec.pack(express(message))
+            try:
+                if self.kind == "tcp":
+                    self.port.sendall(data)
+                elif self.kind.startswith("udp"):
+                    for peer in self.peers:
+                        self.port.sendto(data, peer)
+                else:
+                    self.port.write(data)
+            except OSError:
+                self.closed = self.closed or not self.kind.startswith("udp")
+
+    def receive(self, until: float) -> list[Incoming]:
+        """What has been heard; waits for it until a time (s)."""
+        wait = max(0.0, until - self.now())
+        if self.closed:
+            return []
+        ready, _, _ = select.select([self.port], [], [], wait)
+        return [meaning for m in self.codec.parse(self._bytes()) if (meaning := understand(m))] if ready else []
+
+    def discard(self) -> None:
+        """Throw away what has piled up."""
+        while not self.closed and select.select([self.port], [], [], 0)[0]:
+            self._bytes()
+
+    def _bytes(self) -> bytes:
+        try:
+            if self.kind.startswith("udp"):
+                data, peer = self.port.recvfrom(65536)
+                self.peers[peer] = None
+                return bytes(data)
+            data = self.port.recv(65536) if self.kind == "tcp" else self.port.read(65536)
+        except (BlockingIOError, ConnectionRefusedError):
+            return b""
+        except OSError:
+            data = b""
+        # A stream that is ready and has nothing to say has ended.
+        self.closed = not data
+        return bytes(data)

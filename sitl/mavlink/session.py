@@ -1,0 +1,100 @@
+"""A vehicle on a link while somebody watches: progress, Ctrl-C, and which vehicle it is."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sitl.errors import SitlError
+from sitl.mavlink.connection import Connection, read_key
+from sitl.mavlink.exchange import TRY_S, Conversation
+from sitl.mavlink.upload import read
+from sitl.mavlink.words import Heartbeat, Steps, T, drive
+from tuning.output import progress_console
+
+
+@dataclass(frozen=True)
+class Options:
+    """The options that the commands share; see their help."""
+
+    connect: str
+    system: int
+    timeout: float
+    signing_key: Path | None
+    force_armed: bool = False
+    dry_run: bool = False
+    yes: bool = False
+    as_json: bool = False
+    snapshot: Path | None = None
+    stem: Path = Path("vehicle")
+
+
+class Session:
+    """A vehicle on a link, while somebody watches.
+
+    Parameters
+    ----------
+    options : Options
+        How to reach it.
+    """
+
+    def __init__(self, options: Options) -> None:
+        self.options = options
+        self.link = Connection(options.connect, read_key(options.signing_key) if options.signing_key else None)
+        tries = max(1, round(options.timeout / TRY_S))
+        self.talk = Conversation(self.link.now(), tries, options.system, options.force_armed)
+
+    def run(self, steps: Steps[T]) -> T:
+        """Run a part of the conversation; Ctrl-C and a closed terminal end it in order, not at once."""
+        from rich.progress import Progress
+
+        def interrupt(number: int, frame: object) -> None:
+            self.talk.interrupted = True
+
+        numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+        before = {number: signal.signal(number, interrupt) for number in numbers}
+        try:
+            with Progress(console=progress_console(), transient=True) as bar:
+                tasks: dict[str, Any] = {}
+
+                def progress(phase: str, done: int, of: int) -> None:
+                    if phase not in tasks:
+                        tasks[phase] = bar.add_task(phase)
+                    bar.update(tasks[phase], completed=done, total=of)
+
+                self.talk.progress = progress
+                return drive(steps, self.link)
+        except SitlError as error:
+            raise SitlError(f"{error}{self.link.hint}", error.exit_code) from error
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+    def read(self, names: Sequence[str]) -> dict[str, float]:
+        """What the vehicle holds, once it is clear which vehicle that is."""
+        vehicle = self.run(self.talk.meet())
+        held = self.run(read(self.talk, names))
+        if self.talk.others and not self.options.system:
+            systems = ", ".join(map(str, sorted({vehicle.system, *self.talk.others})))
+            raise SitlError(f"several vehicles are on this link (systems {systems}); say which with --system")
+        return held
+
+    @property
+    def vehicle(self) -> Heartbeat:
+        """Its last HEARTBEAT."""
+        assert self.talk.vehicle is not None
+        return self.talk.vehicle
+
+
+@contextmanager
+def session(options: Options) -> Iterator[Session]:
+    """Open a link and close it again."""
+    opened = Session(options)
+    try:
+        yield opened
+    finally:
+        opened.link.close()

@@ -1,0 +1,176 @@
+"""What a ground station and a vehicle say to each other about parameters, apart from how it is packed and carried.
+
+A conversation is a generator: it yields a `Turn` (what to send, and when to wake it at the latest) and is sent an
+`Event` (the time, and what was heard). `drive` runs one over a link, be it a radio or a simulated one that loses,
+doubles and reorders.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Generator, Sequence
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+
+from sitl.errors import SitlError
+
+REAL32 = 9
+#: Component number of an autopilot.
+AUTOPILOT = 1
+STORAGE_COMMAND = 245
+ACCEPTED, FAILED, IN_PROGRESS = 0, 4, 5
+REASONS = {
+    1: "it does not exist",
+    2: "value out of its range",
+    3: "permission denied",
+    4: "component not found",
+    5: "read only",
+    6: "type not supported",
+    7: "wrong type",
+    8: "it could not be read",
+}
+
+
+class Heartbeat(NamedTuple):
+    """HEARTBEAT of an autopilot."""
+
+    system: int
+    component: int
+    autopilot: int
+    armed: bool
+
+
+class Value(NamedTuple):
+    """PARAM_VALUE; `kind` is its param_type."""
+
+    system: int
+    component: int
+    name: str
+    value: float
+    kind: int = REAL32
+
+
+class Refusal(NamedTuple):
+    """PARAM_ERROR."""
+
+    system: int
+    component: int
+    name: str
+    reason: int
+
+
+class Ack(NamedTuple):
+    """COMMAND_ACK."""
+
+    system: int
+    component: int
+    command: int
+    result: int
+
+
+class Beat(NamedTuple):
+    """Our own HEARTBEAT, so that the vehicle knows where to answer."""
+
+
+class Read(NamedTuple):
+    """PARAM_REQUEST_READ by name."""
+
+    system: int
+    component: int
+    name: str
+
+
+class Write(NamedTuple):
+    """PARAM_SET of a float."""
+
+    system: int
+    component: int
+    name: str
+    value: float
+
+
+class Store(NamedTuple):
+    """MAV_CMD_PREFLIGHT_STORAGE: write the parameters to the vehicle's memory."""
+
+    system: int
+    component: int
+
+
+Incoming = Heartbeat | Value | Refusal | Ack
+Outgoing = Beat | Read | Write | Store
+T = TypeVar("T")
+
+
+class Turn(NamedTuple):
+    """What to send now, and the time (s) at which to come back at the latest."""
+
+    send: Sequence[Outgoing]
+    wake: float
+
+
+class Event(NamedTuple):
+    """The time (s) now, what was heard since, and whether the link is gone for good."""
+
+    now: float
+    heard: Sequence[Incoming]
+    closed: bool = False
+
+
+Steps = Generator[Turn, Event, T]
+
+
+class Link(Protocol):
+    """What carries a conversation."""
+
+    closed: bool
+
+    def now(self) -> float:
+        """Monotonic time, s."""
+
+    def send(self, messages: Sequence[Outgoing]) -> None:
+        """Send; may lose."""
+
+    def receive(self, until: float) -> Sequence[Incoming]:
+        """What has been heard; waits for it until a time (s)."""
+
+
+def drive(steps: Steps[T], link: Link) -> T:
+    """Run a conversation over a link to its end and return its result."""
+    try:
+        turn = next(steps)
+        while True:
+            link.send(turn.send)
+            heard = link.receive(turn.wake)
+            turn = steps.send(Event(link.now(), heard, link.closed))
+    except StopIteration as end:
+        result: T = end.value
+        return result
+
+
+def single(value: float) -> float:
+    """`value` rounded to single precision, as a vehicle stores it; zero has no sign.
+
+    Raises
+    ------
+    SitlError
+        When it is not finite in single precision.
+    """
+    try:
+        rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
+    except OverflowError:
+        rounded = float("inf")
+    if not abs(rounded) < float("inf"):
+        raise SitlError(f"got {value}, expected a number that is finite in single precision")
+    return rounded + 0.0
+
+
+def shortest(value: float) -> str:
+    """Shortest decimal that reads back to float32(value).
+
+    Examples
+    --------
+    >>> shortest(0.1), shortest(-5.0), shortest(1e-7)
+    ('0.1', '-5.0', '1e-07')
+    """
+    return str(np.float32(value))
