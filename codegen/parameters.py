@@ -210,14 +210,14 @@ def check_verdict(gains: Gains, allow: bool, required: bool = False) -> str:
     Raises
     ------
     CodegenError
-        When the verdict is ``unstable`` or ``not certified``, or the certificate is void (or missing and required),
-        and `allow` is False.
+        When the verdict is any other than ``certified``, ``stable, thin margin`` and, unless required, none at all, and
+        `allow` is False.
     """
     verdict, reason = gains.verdict()
     if verdict == "certified":
         return ""
-    refused = ("unstable", "not certified", "void", *(["none"] if required else []))
-    if verdict in refused and not allow:
+    accepted = ("stable, thin margin", *([] if required else ["none"]))
+    if verdict not in accepted and not allow:
         verdict = "no certificate" if verdict == "none" else verdict
         raise CodegenError(f"{verdict}: {reason}; tune or certify again, or give --uncertified to go on all the same")
     return f"certificate: {verdict}: {reason}"

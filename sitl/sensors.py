@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.signal import butter
 
 from sitl.compiled import compiled
+from sitl.errors import SitlError
 
 SIZE = 9
 NOISES = 6
@@ -31,7 +32,17 @@ def low_pass(cutoff_hz: float, Ts: float) -> NDArray[np.float64]:
     -------
     (5,) array
         b0, b1, b2, a1, a2.
+
+    Raises
+    ------
+    SitlError
+        When the cut-off is at half of the rate or above.
     """
+    if not 0 <= cutoff_hz < 0.5 / Ts:
+        raise SitlError(
+            f"gyro_cutoff_hz: got {cutoff_hz:g} Hz, expected 0 (no filter) to below {0.5 / Ts:g} Hz, half of the "
+            "control rate"
+        )
     if cutoff_hz == 0:
         return np.array([1.0, 0.0, 0.0, 0.0, 0.0])
     b, a = butter(2, cutoff_hz, fs=1 / Ts)

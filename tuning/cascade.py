@@ -262,12 +262,20 @@ def certify_from_log(experiment: Experiment, gains: Gains) -> Gains:
     Raises
     ------
     TuningError
-        When the log has no external signal, is too short or not excited, or has another period than the gains.
+        When the log has no external signal, is too short or not excited, or has another period or another unit of
+        moment than the gains.
     """
     if abs(experiment.Ts / gains.Ts - 1) > PERIOD_TOLERANCE:
         raise TuningError(
             f"{experiment.source}: sampled every {experiment.Ts:g} s, the gains are for {gains.Ts:g} s; certify them "
             "with a log of the same control rate"
+        )
+    flown = experiment.flown.moment_scale if experiment.flown else None
+    if flown and gains.moment_scale and not np.allclose(flown[:2], gains.moment_scale[:2], rtol=0.01, atol=0):
+        theirs, ours = (", ".join(f"{v:.4g}" for v in scale[:2]) for scale in (flown, gains.moment_scale))
+        raise TuningError(
+            f"{experiment.source}: one unit of moment stands for {theirs} N m (roll, pitch), in the gains for {ours}; "
+            "convert the gains (mimopilot convert), or certify them with a log of their own allocator"
         )
     plant = measured_plant(experiment)
     spec = TuningSpec()

@@ -140,7 +140,7 @@ def certify(
     doubtful = sum(any(w) for w in windings)
     if any(normal.windings(nominal)) and doubtful > DRAWS / 2:
         where = "the rate loop alone" if normal.windings(nominal)[0] else "the whole cascade"
-        return verdict(UNSTABLE, f"the determinant goes round 0: {where} is unstable", figures, band)
+        return verdict(UNSTABLE, f"the determinant goes round 0: {where} is unstable", {}, band)
     if doubtful:
         reason = f"too close to the limit to tell: {doubtful} of {DRAWS} plants that the log allows are unstable"
         return verdict(NOT_CERTIFIED, reason, figures, band)
@@ -205,6 +205,11 @@ def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
             f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
             f"(at most {HIGH_FREQUENCY_LOOP:g}): excite a wider band"
         )
+    if loop + _outer_loop_above(gains, plant) >= 1:
+        return (
+            f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the whole cascade's gain may still reach 1: "
+            "excite a wider band"
+        )
     # The plant there is a real matrix times a scalar between a gain and an integrator: take that phase off.
     turned = plant.G_i[0] * np.exp(-1j * np.angle(np.trace(plant.G_i[0])))
     integral = gains.Ki_i @ turned.real
@@ -231,6 +236,17 @@ def _loop_above(gains: Gains, plant: PlantResponse) -> Signal:
     highest = np.maximum.accumulate(falling[::-1])[::-1][: len(plant.omega)]
     reached: Signal = np.linalg.norm(plant.G_i, ord=2, axis=(1, 2)) * plant.omega * highest
     return reached
+
+
+def _outer_loop_above(gains: Gains, plant: PlantResponse) -> float:
+    """What the attitude path (C_e + Kff) Kp_o G_o may still add to the loop's gain above the plant's band.
+
+    G_o falls at least like 1/w^2 there, see `_loop_above`.
+    """
+    grid = np.linspace(plant.omega[-1], np.pi / gains.Ts, 200)
+    C_e, _ = inner_controllers(gains, grid)
+    path = np.linalg.norm((C_e + gains.Kff_i) @ gains.Kp_o, ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
+    return float(np.linalg.norm(plant.G_o[-1], ord=2) * path.max())
 
 
 def _figures(
@@ -260,7 +276,7 @@ def _figures(
     }
     # Above the band the loop is at most this large: no gain margin is claimed beyond what that leaves.
     rest = _loop_above(gains, plant)[-1]
-    ceiling = -20 * float(np.log10(rest))
+    ceiling = -20 * float(np.log10(rest)) if rest > 0 else np.inf
     distance = np.abs(np.linalg.det(identity + nominal.L_u)).min()
     return {
         "Ms": peak(nominal),

@@ -149,8 +149,8 @@ class Gains:
         return derivative_pole(self.derivative_cutoff_hz, self.Ts)
 
     def matrices_sha256(self) -> str:
-        """Hash of everything that the loop's stability depends on: all elements, in their exact values."""
-        return sha256(repr(list(self.elements().items())))
+        """Hash of everything that the loop's stability depends on: all elements and their unit, exactly."""
+        return sha256(repr([*self.elements().items(), ("moment_scale", self.moment_scale)]))
 
     def verdict(self) -> tuple[str, str]:
         """Verdict of the certificate and its reason; ``none`` without one, ``void`` when the gains were edited."""
@@ -214,8 +214,9 @@ class Gains:
         """The same controller for an allocator whose unit of moment is another.
 
         Rate gains and the limits of the moment and of its integral are in that unit: all are multiplied by old over
-        new, an axis at a time, so that the moment in N m stays; a limit stays within 1, the most there is. What the
-        certificate says of the loop holds on, and is bound to the new matrices.
+        new, an axis at a time, so that the moment in N m stays; a limit stays within 1, the most there is. Where roll
+        and pitch have one ratio the certificate holds on and is bound to the new matrices; else its figures would
+        change, and it is left out.
 
         Parameters
         ----------
@@ -246,8 +247,15 @@ class Gains:
             limits=replace(self.limits, **limits),  # type: ignore[arg-type]
             **rows,  # type: ignore[arg-type]
         )
+        deviations = dict(self.provenance.get("standard_deviation", {}))
+        for name in deviations.keys() & rows.keys():
+            deviations[name] = (np.array(deviations[name]) * ratio[:2, None]).tolist()
+        if deviations:
+            changed = replace(changed, provenance={**self.provenance, "standard_deviation": deviations})
         if self.certificate is None or self.verdict()[0] == "void":
             return changed
+        if abs(ratio[0] / ratio[1] - 1) > 1e-3:
+            return replace(changed, certificate=None)
         return replace(changed, certificate={**self.certificate, "matrices_sha256": changed.matrices_sha256()})
 
     def save(self, path: Path) -> None:

@@ -245,7 +245,6 @@ def vrft(
         v = w if external is None else filter_by(shaped(external[part]), factors)[drop:]
         if repeated is not None:
             w = regressor(repeated[part])[0]
-            w /= np.sqrt(np.einsum("ij,ij->j", w, w))  # their units differ; nothing else depends on it
         if trim:
             # The constant (trim, initial integrator), filtered like the rest, is regressor and instrument at once:
             # to take its part off all others is the same as to estimate it.
@@ -261,7 +260,11 @@ def vrft(
             f"too short: no stretch without a gap is longer than {needed * Ts:.2f} s, which these reference "
             "models need; record a longer flight, or ask for faster models"
         )
-    lags = lags if repeated is None else 0
+    if repeated is not None:
+        lags = 0
+        # The units of P, I and D differ: brought to one size, over all stretches, the problem is well conditioned.
+        size = np.sqrt(np.sum([np.einsum("ij,ij->j", w, w) for w in ws], axis=0))
+        ws = [w / np.where(size > 0, size, 1.0) for w in ws]
     problem = Regression(xs, us, ws, lags, memory=max(lags, 2 * drop), external=vs)
     solution = solve(problem, weight, None if prior is None else np.hstack([prior[t] for t in letters]), pull)
     n_y = y.shape[1]

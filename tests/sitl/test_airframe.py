@@ -80,6 +80,13 @@ def test_the_gyro_filter_is_a_butterworth_low_pass_on_the_measured_rates():
     assert filtered.record["rates"] == pytest.approx(expected, abs=2e-6)
 
 
+def test_a_gyro_filter_beyond_half_of_the_rate_is_refused():
+    vehicle = load_airframe("adam0")
+    body = vehicle.airframe.model_copy(update={"gyro_cutoff_hz": 125.0})
+    with pytest.raises(SitlError, match=r"gyro_cutoff_hz: got 125 Hz, expected 0 .* below 125 Hz"):
+        fly(body, Autopilot(body, vehicle.default_gains()), doublet("roll", 0.2, 0.8, TS))
+
+
 def test_converted_gains_make_the_same_moment_in_newton_metres_and_keep_their_certificate():
     scale = load_airframe("px4_sih").airframe.moment_scale()
     assert scale == pytest.approx((2.88, 2.88, 0.2))
@@ -98,6 +105,10 @@ def test_converted_gains_make_the_same_moment_in_newton_metres_and_keep_their_ce
     assert converted.verdict() == ("certified", "")
     edited = dataclasses.replace(certified, Kp_o=1.1 * certified.Kp_o)
     assert edited.with_moment_scale(scale).verdict()[0] == "void"
+    assert certified.with_moment_scale((2.08, 2.5, 0.4)).verdict()[0] == "none"  # its figures would be others
+    known = dataclasses.replace(original, provenance={"standard_deviation": {"Kp_i": [[1.0, 2.0], [3.0, 4.0]]}})
+    deviation = known.with_moment_scale(scale).provenance["standard_deviation"]["Kp_i"]
+    assert deviation == pytest.approx(np.array([[1.0, 2.0], [3.0, 4.0]]) * original.moment_scale[0] / scale[0])
     back = converted.with_moment_scale(original.moment_scale)
     assert back.Kp_i == pytest.approx(original.Kp_i, rel=1e-12)
     with pytest.raises(TuningError, match="do not say"):

@@ -10,9 +10,10 @@ from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import fly
 from sitl.scenario import excitation_flight
-from tuning.cascade import tune
+from tuning.cascade import certify_from_log, tune
 from tuning.certificate import CERTIFIED, NOT_CERTIFIED, THIN, UNSTABLE, certify
 from tuning.closed_loop import PlantResponse, cascade_loop, plant_response
+from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.reference import second_order
 
@@ -172,6 +173,10 @@ def test_an_edited_matrix_voids_the_certificate(flights, tmp_path):
     assert tuned.verdict()[0] in (CERTIFIED, THIN)
     edited = dataclasses.replace(tuned, Kp_o=tuned.Kp_o * 1.0001)
     assert edited.verdict()[0] == "void"
+    other_unit = dataclasses.replace(tuned, moment_scale=(25.0, 25.0, 2.7))
+    assert other_unit.verdict()[0] == "void"
+    with pytest.raises(TuningError, match=r"stands for 2\.546, 2\.546 N m .* in the gains for 25, 25"):
+        certify_from_log(flights["adam0"][0], other_unit)
     assert dataclasses.replace(tuned, certificate=None).verdict()[0] == "none"
 
 

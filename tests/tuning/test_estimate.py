@@ -65,6 +65,16 @@ def test_noise_moves_what_every_instrument_gives_by_no_more_than_its_error(noisy
         assert np.abs(error / np.diag(found.deviations()["Kp_i"])).max() < 3.0, name
 
 
+def test_a_stretch_without_excitation_does_no_harm_to_an_identified_models_instrument(log):
+    segments = ((0, 5000), (5050, 9950))
+    quiet = dataclasses.replace(log, segments=segments, u_bar=log.u_bar * (np.arange(len(log.u)) < 5000)[:, None])
+    spec = load_spec(instrument="model", structure="P")
+    both_axes = dataclasses.replace(
+        quiet, u_bar=quiet.u_bar + log.u_bar[::-1] * (np.arange(len(log.u)) < 5000)[:, None]
+    )
+    assert np.isfinite(estimate(both_axes, spec).gains.Kp_i).all()
+
+
 def test_the_constant_takes_a_trim_moment_off_and_without_it_the_gains_are_wrong(log):
     trimmed = dataclasses.replace(log, u=log.u + np.array([0.05, -0.03]))
     clean = estimate(log, load_spec()).gains
