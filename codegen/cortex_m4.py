@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.errors import CodegenError
-from codegen.layout import GAINS, INPUT, OUTPUT, STATE
-from codegen.parameters import to_array
+from codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
 from codegen.render import render, write_tree
 from codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS, cross_tool, find_tool, run_tool
 from tuning.gains import Gains
@@ -142,7 +141,7 @@ class EmulatedController:
         #: The controller's state, (1,) array of `codegen.layout.STATE`: the emulated memory itself.
         self.state = view(STATE_AT, STATE)
         self._input, self._output, self._gains = view(INPUT_AT, INPUT), view(OUTPUT_AT, OUTPUT), view(GAINS_AT, GAINS)
-        self._gains[0] = to_array(gains)
+        self._gains[0] = gains_array(gains)
         if not self._call(image.functions["initialise"], STATE_AT, GAINS_AT):
             raise CodegenError("the controller refused its gains: every one must be finite and within its range")
         self._foreign_step = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(self._step_at)
@@ -182,7 +181,7 @@ class EmulatedController:
         gains : Gains or (36,) float32 array
             The new set.
         """
-        self._gains[0] = gains if isinstance(gains, np.ndarray) else to_array(gains)
+        self._gains[0] = gains_array(gains)
         return bool(self._call(self.image.functions["set_gains"], STATE_AT, GAINS_AT))
 
     def run(self, inputs: NDArray[Any], after_each: Callable[[], None] = lambda: None) -> NDArray[Any]:
@@ -199,9 +198,10 @@ class EmulatedController:
         -------
         (N,) array of `codegen.layout.OUTPUT`
         """
-        outputs = np.zeros(len(inputs), OUTPUT)
-        for k in range(len(inputs)):
-            self._input[0] = inputs[k]
+        rows = input_rows(inputs)
+        outputs = np.zeros(len(rows), OUTPUT)
+        for k in range(len(rows)):
+            self._input[0] = rows[k]
             self._step()
             outputs[k] = self._output[0]
             after_each()

@@ -6,9 +6,14 @@ library is loaded.
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from codegen.parameters import PARAMETERS
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.errors import CodegenError
+from codegen.parameters import PARAMETERS, to_array
+from tuning.gains import Gains
 
 GAINS = np.dtype(("<f4", (len(PARAMETERS),)))
 
@@ -45,3 +50,30 @@ STATE = np.dtype(
         ("fault_count", "<u4"),
     ]
 )
+
+
+def gains_array(gains: Gains | NDArray[np.float32]) -> NDArray[np.float32]:
+    """Gains as the controller takes them, (36,) float32.
+
+    Raises
+    ------
+    CodegenError
+        When an array is of another shape or type.
+    """
+    array = gains if isinstance(gains, np.ndarray) else to_array(gains)
+    if array.shape != GAINS.shape or array.dtype != np.float32:
+        raise CodegenError(f"gains: got {array.dtype} {array.shape}, expected float32 {GAINS.shape}")
+    return array
+
+
+def input_rows(inputs: NDArray[Any]) -> NDArray[Any]:
+    """Rows of `INPUT`, (N,), one after another in memory.
+
+    Raises
+    ------
+    CodegenError
+        When the array is of another shape or type.
+    """
+    if inputs.dtype != INPUT or inputs.ndim != 1:
+        raise CodegenError(f"inputs: got {inputs.dtype} {inputs.shape}, expected (N,) of codegen.layout.INPUT")
+    return np.ascontiguousarray(inputs)

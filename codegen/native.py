@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.errors import CodegenError
-from codegen.layout import GAINS, INPUT, OUTPUT, STATE
+from codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
 from codegen.parameters import to_array
 from codegen.render import TEMPLATES, interface_hash, render, write_tree
 from codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
@@ -174,9 +174,7 @@ class NativeController:
         gains : Gains or (36,) float32 array
             The new set.
         """
-        array = gains if isinstance(gains, np.ndarray) else to_array(gains)
-        if array.shape != GAINS.shape or array.dtype != np.float32:
-            raise CodegenError(f"gains: got {array.dtype} {array.shape}, expected float32 {GAINS.shape}")
+        array = gains_array(gains)
         return bool(self.library.lib.mimo_pid_set_gains(self._state, self.library.ffi.from_buffer("float[]", array)))
 
     def run(self, inputs: NDArray[Any]) -> NDArray[Any]:
@@ -191,9 +189,7 @@ class NativeController:
         -------
         (N,) array of `codegen.layout.OUTPUT`
         """
-        if inputs.dtype != INPUT or inputs.ndim != 1:
-            raise CodegenError(f"inputs: got {inputs.dtype} {inputs.shape}, expected (N,) of codegen.layout.INPUT")
-        rows = np.ascontiguousarray(inputs)
+        rows = input_rows(inputs)
         outputs = np.zeros(len(rows), OUTPUT)
         ffi = self.library.ffi
         self.library.lib.mimo_pid_run(

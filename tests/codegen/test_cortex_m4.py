@@ -83,6 +83,14 @@ def test_gain_changes_and_the_whole_state_agree_in_every_bit(fixed, image, input
         assert emulated.state.tobytes() == native.state.tobytes()
 
 
+def test_gains_and_rows_of_another_shape_are_refused_as_by_the_native_controller(fixed, image):
+    for controller in (EmulatedController(image, fixed), NativeController(load_native(fixed), fixed)):
+        with pytest.raises(CodegenError, match="gains: got float64"):
+            controller.set_gains(np.zeros(36))
+        with pytest.raises(CodegenError, match="inputs: got float32"):
+            controller.run(np.zeros(3, np.float32))
+
+
 def test_a_controller_refused_at_the_start_is_an_error_on_the_target_too(fixed, image):
     with pytest.raises(CodegenError, match="refused its gains"):
         EmulatedController(image, fixed.with_elements({"RP_RR": 1e7}))
