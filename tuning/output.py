@@ -35,7 +35,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
         table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
-    Console(width=None if _is_terminal() else 160, highlight=False).print(table)
+    Console(width=None if _is_terminal() else 160, highlight=False, markup=False).print(table)
 
 
 def progress_console() -> Any:
