@@ -55,8 +55,15 @@ class CascadeEstimate:
 
     def deviations(self) -> dict[str, NDArray[np.float64]]:
         """Matrix -> (2, 2) standard deviations, in the unit of the matrix, of those that were estimated."""
-        found = {TERMS[term]: self._assembled(self.inner, term) for term in self.inner[0].gains}
-        return {**found, "Kp_o": self._assembled(self.outer, "P")}
+        return {**self.inner_deviations(), "Kp_o": self.outer_deviation()}
+
+    def inner_deviations(self) -> dict[str, NDArray[np.float64]]:
+        """`deviations` of the rate loop alone."""
+        return {TERMS[term]: self._assembled(self.inner, term) for term in self.inner[0].gains}
+
+    def outer_deviation(self) -> NDArray[np.float64]:
+        """That of Kp_o: costs as much as all others, and is not needed where a refinement brings its own."""
+        return self._assembled(self.outer, "P")
 
     def _assembled(self, loops: list[LoopEstimate], term: str) -> NDArray[np.float64]:
         return _assemble([loop.deviations[term] for loop in loops], self.stretches)
@@ -221,7 +228,7 @@ def tune(
         *examine_estimates(experiment.source, found.stretches, found.inner),
         *examine_band(experiment.source, plant, [omega for omega, _, _ in spec.inner]),
     ]
-    gains, deviations = found.gains, found.deviations()
+    gains, deviations = found.gains, found.inner_deviations()
     outer_models = spec.models("outer", experiment.Ts)
     if spec.refine:
         try:
@@ -229,6 +236,8 @@ def tune(
             gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full, spec.doublet_s)
         except TuningError as error:
             warnings.append(f"the attitude gains are left as VRFT gives them: {error}")
+    if "Kp_o" not in deviations:
+        deviations["Kp_o"] = found.outer_deviation()
     certificate = certify(gains, plant, spec.models("inner", experiment.Ts), outer_models, experiment.sha256)
     provenance = {
         "method": spec.method,
