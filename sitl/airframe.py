@@ -132,6 +132,7 @@ class Airframe(_Table):
             rate_damping=self.rate_damping * np.diag(np.array(self.inertia)).copy(),
             drag=self.drag,
             wind=np.zeros(3),
+            effectiveness=np.ones(len(rotors)),
         )
 
 

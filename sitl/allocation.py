@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.compiled import compiled
+from sitl.compiled import compiled, inlined
 from sitl.errors import SitlError
 
 ROUNDING = 1e-9  # of the thrust: a command this far out of range is clipped, not a lack of authority
@@ -115,30 +115,49 @@ def _largest_share(base, part, collective, allocation):  # type: ignore[no-untyp
 
 
 @compiled
+def _shares(moments, collective, allocation):  # type: ignore[no-untyped-def]
+    """Largest shares of roll with pitch, and of yaw, that leave a collective: yaw gives way first."""
+    n = allocation.mixer.shape[0]
+    roll_pitch, yaw = np.empty(n), np.empty(n)
+    for i in range(n):
+        roll_pitch[i] = allocation.mixer[i, 0] * moments[0] + allocation.mixer[i, 1] * moments[1]
+        yaw[i] = allocation.mixer[i, 2] * moments[2]
+    yaw_share = _largest_share(roll_pitch, yaw, collective, allocation)
+    if yaw_share >= 0.0:
+        return 1.0, yaw_share
+    return max(_largest_share(np.zeros(n), roll_pitch, collective, allocation), 0.0), 0.0
+
+
+@inlined
+def _combine(moments, share, yaw_share, collective, allocation, commands):  # type: ignore[no-untyped-def]
+    """Commands for shares of the moments, with the nearest collective that keeps each within 0..1.
+
+    False when there is none: the shares are too large.
+    """
+    low, high = -np.inf, np.inf
+    if not allocation.airmode:
+        high = collective
+    for i in range(allocation.mixer.shape[0]):
+        roll_pitch = allocation.mixer[i, 0] * moments[0] + allocation.mixer[i, 1] * moments[1]
+        command = share * roll_pitch + yaw_share * (allocation.mixer[i, 2] * moments[2])
+        low = max(low, -command / allocation.mixer[i, 3])
+        high = min(high, (1.0 - command) / allocation.mixer[i, 3])
+        commands[i] = command
+    given = min(max(collective, low), high)
+    for i in range(allocation.mixer.shape[0]):
+        commands[i] = min(max(commands[i] + given * allocation.mixer[i, 3], 0.0), 1.0)
+    return low <= high
+
+
+@compiled
 def allocate(moments, collective, allocation, commands, unallocated):  # type: ignore[no-untyped-def]
     """Motor commands for the moments (3,) and collective; fills `commands` (n,) and `unallocated` (3,), the sign of
     the moment on each axis that could not be given.
     """
-    n = allocation.mixer.shape[0]
-    roll_pitch, yaw, nothing = np.empty(n), np.empty(n), np.zeros(n)
-    for i in range(n):
-        roll_pitch[i] = allocation.mixer[i, 0] * moments[0] + allocation.mixer[i, 1] * moments[1]
-        yaw[i] = allocation.mixer[i, 2] * moments[2]
-    share = 1.0
-    yaw_share = _largest_share(roll_pitch, yaw, collective, allocation)
-    if yaw_share < 0.0:
-        yaw_share = 0.0
-        share = max(_largest_share(nothing, roll_pitch, collective, allocation), 0.0)
-    low, high = -np.inf, np.inf
-    if not allocation.airmode:
-        high = collective
-    for i in range(n):
-        commands[i] = share * roll_pitch[i] + yaw_share * yaw[i]
-        low = max(low, -commands[i] / allocation.mixer[i, 3])
-        high = min(high, (1.0 - commands[i]) / allocation.mixer[i, 3])
-    given = min(max(collective, low), high)
-    for i in range(n):
-        commands[i] = min(max(commands[i] + given * allocation.mixer[i, 3], 0.0), 1.0)
+    share, yaw_share = 1.0, 1.0
+    if not _combine(moments, share, yaw_share, collective, allocation, commands):
+        share, yaw_share = _shares(moments, collective, allocation)
+        _combine(moments, share, yaw_share, collective, allocation, commands)
     for axis in range(3):
         missing = share < 1.0 if axis < 2 else yaw_share < 1.0
         unallocated[axis] = np.sign(moments[axis]) if missing else 0.0

@@ -16,7 +16,7 @@ from codegen.layout import INPUT, OUTPUT
 from codegen.native import NativeController, load_native
 from sitl.airframe import Airframe
 from sitl.allocation import allocate
-from sitl.compiled import call_step, compiled
+from sitl.compiled import call_step, compiled, inlined
 from sitl.moment_scale import check_moment_scale
 from sitl.plant import GRAVITY
 from sitl.sensors import euler_angles
@@ -42,7 +42,7 @@ RECORD = np.dtype(
 )
 
 
-@compiled
+@inlined
 def altitude_hold(altitude, climb, target, hover, tilt):  # type: ignore[no-untyped-def]
     """Collective that holds an altitude: 1 rad/s, critically damped, corrected for the tilt (its cosine)."""
     lift = 1.0 + ((target - altitude) - 2.0 * climb) / GRAVITY

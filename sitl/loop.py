@@ -13,10 +13,11 @@ from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.compiled import compiled
 from sitl.plant import STEP, advance, hover_state
 from sitl.scenario import Scenario
-from sitl.sensors import NOISES, SIZE, euler_angles, low_pass, measure
+from sitl.sensors import NOISES, SIZE, Sensors, euler_angles, low_pass, measure
 
 CRASH_ANGLE = np.radians(60.0)
 CRASH_SECONDS = 0.3
+HISTORY = 256  # control periods that a command can be late, at most
 
 #: The true state at each sample.
 TRUTH = np.dtype([("position", "f8", 3), ("velocity", "f8", 3), ("attitude", "f8", 3), ("rates", "f8", 3)])
@@ -43,41 +44,64 @@ class Flight:
     @property
     def crashed_at(self) -> float | None:
         """Time (s) of the loss: more than 60 degrees for 0.3 s, the ground, or a value that is not finite."""
-        angles = self.truth["attitude"][:, :2]
-        finite = np.isfinite(angles).all(axis=1) & np.isfinite(self.record["moment"]).all(axis=1)
-        grounded = self.truth["position"][:, 2] > 0
-        tilted = ~(np.abs(angles) <= CRASH_ANGLE).all(axis=1)
         samples = max(1, round(CRASH_SECONDS / self.scenario.Ts))
-        run = 0
-        for k in range(len(tilted)):
-            run = run + 1 if tilted[k] else 0
-            if run >= samples or not finite[k] or grounded[k]:
-                return k * self.scenario.Ts
-        return None
+        first = _first_loss(self.truth, self.record, samples)
+        return None if first < 0 else float(first * self.scenario.Ts)
 
 
 @compiled
-def _fly(plant, state, steps, step, queue, sensors, noise, autopilot, record, truth, work):  # type: ignore[no-untyped-def]
+def _first_loss(truth, record, samples):  # type: ignore[no-untyped-def]
+    run = 0
+    for k in range(truth.shape[0]):
+        roll, pitch = truth[k].attitude[0], truth[k].attitude[1]
+        tilted = not (abs(roll) <= CRASH_ANGLE and abs(pitch) <= CRASH_ANGLE)
+        finite = np.isfinite(roll) and np.isfinite(pitch)
+        for i in range(3):
+            finite = finite and np.isfinite(record[k].moment[i])
+        run = run + 1 if tilted else 0
+        if run >= samples or not finite or truth[k].position[2] > 0.0:
+            return k
+    return -1
+
+
+@compiled
+def _hold(before, row):  # type: ignore[no-untyped-def]
+    """A period that the autopilot did not see: everything stays as it was."""
+    for i in range(4):
+        row.quaternion[i] = before.quaternion[i]
+    for i in range(3):
+        row.attitude[i], row.rates[i] = before.attitude[i], before.rates[i]
+        row.rates_setpoint[i], row.moment[i] = before.rates_setpoint[i], before.moment[i]
+        row.unallocated[i] = before.unallocated[i]
+    for i in range(row.commands.shape[0]):
+        row.commands[i] = before.commands[i]
+    row.collective, row.fault = before.collective, before.fault
+
+
+@compiled
+def _fly(plant, state, steps, step, sensors, seen, autopilot, link, count, history, noise, record, truth):  # type: ignore[no-untyped-def]
     step_address, controller, controls, outputs, allocation, hover, altitude = autopilot
-    measurement = np.zeros(SIZE)
-    delay = queue.shape[0]
+    runs, delays, before = link
+    n = allocation.mixer.shape[0]
     for k in range(record.shape[0]):
-        measure(state, noise[k], sensors[0], sensors[1], sensors[2], sensors[3], measurement)
         row, true = record[k], truth[k]
-        tick(step_address, controller, controls, outputs, allocation, hover, altitude, measurement, row)
+        measure(state, noise[k], sensors, seen)
+        if runs[k] == 0:
+            _hold(before, row)
+        for _ in range(runs[k]):
+            tick(step_address, controller, controls, outputs, allocation, hover, altitude, seen, row)
+        before = row
         roll, pitch, yaw = euler_angles(state[6], state[7], state[8], state[9])
         true.attitude[0], true.attitude[1], true.attitude[2] = roll, pitch, yaw
         for i in range(3):
             true.position[i], true.velocity[i], true.rates[i] = state[i], state[3 + i], state[10 + i]
-        if delay == 0:
-            advance(state, row.commands, plant, steps, step, work)
-        else:
-            advance(state, queue[k % delay], plant, steps, step, work)
-            queue[k % delay] = row.commands
+        for i in range(n):
+            history[(count + k) % HISTORY, i] = row.commands[i]
+        advance(state, history[(count + k - delays[k]) % HISTORY], plant, steps, step)
 
 
 class Simulator:
-    """The plant of one vehicle with its sensors, one control period at a time.
+    """The plant of one vehicle with its sensors; what a fault changes is an attribute.
 
     Parameters
     ----------
@@ -85,30 +109,108 @@ class Simulator:
         The vehicle.
     Ts : float, s
         Control period.
-    seed : int
+    seed : int or sequence of int
         Of the measurement noise.
     noise : bool
         False: exact measurements.
     altitude : float, m
         Where it starts, hovering.
+
+    Attributes
+    ----------
+    plant : PlantParameters
+        What flies; may be replaced between periods.
+    state : (13 + n,) array
+        See `sitl.plant`.
+    sensors : Sensors
+        May be replaced between periods.
+    delay : int, samples
+        Whole control periods between a measurement and the motor command made from it.
     """
 
-    def __init__(self, airframe: Airframe, Ts: float, seed: int, noise: bool = True, altitude: float = 10.0) -> None:
+    def __init__(
+        self, airframe: Airframe, Ts: float, seed: int | list[int], noise: bool = True, altitude: float = 10.0
+    ) -> None:
         self.plant = airframe.plant()
         self.state = hover_state(self.plant, altitude)
         self.steps = max(1, int(np.ceil(Ts / STEP - 1e-9)))
         self.step = Ts / self.steps
+        self.delay = airframe.computing_delay
         hover = self.state[13] ** 2 * self.plant.thrust_coefficient / self.plant.thrust_max
-        self.queue = np.full((airframe.computing_delay, RECORD["commands"].shape[0]), hover, np.float32)
+        self.history = np.full((HISTORY, RECORD["commands"].shape[0]), hover, np.float32)
+        self.count = 0
         self.generator = np.random.default_rng(seed)
         scale = 1.0 if noise else 0.0
         gyro = low_pass(airframe.gyro_cutoff_hz, Ts)
-        self.sensors = (scale * airframe.noise.angle, scale * airframe.noise.rate, gyro, np.zeros((2, 3)))
-        self.work = np.zeros((6, len(self.state)))
+        self.sensors = Sensors.sound(scale * airframe.noise.angle, scale * airframe.noise.rate, gyro)
+        self.seen = np.zeros(SIZE)
+        self.before: NDArray[Any] = np.zeros(1, RECORD)
 
     def noise(self, samples: int) -> NDArray[np.float64]:
         """The next standard normal numbers of the noise, (samples, 6); the same whatever the block size."""
         return self.generator.standard_normal((samples, NOISES))
+
+    def measure(self, noise: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the autopilot is told now, see `sitl.sensors`; `noise` is one row of `noise`."""
+        measure(self.state, noise, self.sensors, self.seen)
+        return self.seen
+
+    def advance(self, commands: NDArray[np.float32]) -> None:
+        """Fly one control period; (16,) thrust fractions, which act after the delay."""
+        self.history[self.count % HISTORY] = commands
+        applied = self.history[(self.count - self.delay) % HISTORY]
+        advance(self.state, applied, self.plant, self.steps, self.step)
+        self.count += 1
+
+    def fly(
+        self,
+        autopilot: Autopilot,
+        noise: NDArray[np.float64],
+        record: NDArray[Any],
+        truth: NDArray[Any],
+        runs: NDArray[np.int64] | None = None,
+        delays: NDArray[np.int64] | None = None,
+    ) -> None:
+        """Fly consecutive control periods under an autopilot.
+
+        Parameters
+        ----------
+        autopilot : Autopilot
+            Its controller's state is carried on from where it is.
+        noise : (N, 6) array
+            From `noise`.
+        record : (N,) array of `sitl.autopilot.RECORD`
+            Set-points and excitation are given, the rest is filled.
+        truth : (N,) array of `TRUTH`
+            Filled.
+        runs : (N,) array, optional
+            How often the autopilot runs in each period: 0 when the measurement is lost; by default once.
+        delays : (N,) array, samples, optional
+            From each measurement to the motors, below `HISTORY`; by default `delay`.
+        """
+        samples = len(record)
+        link = (
+            np.ones(samples, np.int64) if runs is None else runs,
+            np.full(samples, self.delay) if delays is None else delays,
+            self.before[0],
+        )
+        _fly(
+            self.plant,
+            self.state,
+            self.steps,
+            self.step,
+            self.sensors,
+            self.seen,
+            autopilot.arguments(),
+            link,
+            self.count,
+            self.history,
+            noise,
+            record,
+            truth,
+        )
+        self.count += samples
+        self.before[0] = record[-1]
 
 
 def fly(airframe: Airframe, autopilot: Autopilot, scenario: Scenario, seed: int = 0, noise: bool = True) -> Flight:
@@ -131,17 +233,5 @@ def fly(airframe: Airframe, autopilot: Autopilot, scenario: Scenario, seed: int 
     record = np.zeros(len(scenario.setpoint), RECORD)
     record["setpoint"], record["excitation"] = scenario.setpoint, scenario.excitation
     truth = np.zeros(len(record), TRUTH)
-    _fly(
-        simulator.plant,
-        simulator.state,
-        simulator.steps,
-        simulator.step,
-        simulator.queue,
-        simulator.sensors,
-        simulator.noise(len(record)),
-        autopilot.arguments(),
-        record,
-        truth,
-        simulator.work,
-    )
+    simulator.fly(autopilot, simulator.noise(len(record)), record, truth)
     return Flight(scenario, record, truth)

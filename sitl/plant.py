@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sitl.compiled import compiled
+from sitl.compiled import compiled, inlined
 from sitl.errors import SitlError
 
 GRAVITY = 9.80665  # m/s^2, standard gravity
@@ -46,6 +46,8 @@ class PlantParameters(NamedTuple):
         Linear drag against the air.
     wind : (3,) array, m/s
         Velocity of the air, NED.
+    effectiveness : (n,) array
+        Share of its thrust that each motor still gives; 1 for a sound one.
     """
 
     mass: float
@@ -60,126 +62,169 @@ class PlantParameters(NamedTuple):
     rate_damping: NDArray[np.float64]
     drag: float
     wind: NDArray[np.float64]
+    effectiveness: NDArray[np.float64]
 
 
-@compiled
-def angular_acceleration(J, J_inverse, p, q, r, L, M, N):  # type: ignore[no-untyped-def]
-    """Euler's equation, J^-1 (moment - rates x J rates)."""
-    h0 = J[0, 0] * p + J[0, 1] * q + J[0, 2] * r
-    h1 = J[1, 0] * p + J[1, 1] * q + J[1, 2] * r
-    h2 = J[2, 0] * p + J[2, 1] * q + J[2, 2] * r
-    m0 = L - (q * h2 - r * h1)
-    m1 = M - (r * h0 - p * h2)
-    m2 = N - (p * h1 - q * h0)
+#: What the integrator carries in registers: velocity (3), quaternion (4), angular momentum in body axes (3).
+#: With the momentum in place of the rates Euler's equation needs one product with a matrix less; the scheme is
+#: the same, because the two are related linearly. The rotors' lag is linear too and is solved exactly.
+
+
+@inlined
+def _product(matrix, x, y, z):  # type: ignore[no-untyped-def]
+    """A (3, 3) matrix times a vector."""
     return (
-        J_inverse[0, 0] * m0 + J_inverse[0, 1] * m1 + J_inverse[0, 2] * m2,
-        J_inverse[1, 0] * m0 + J_inverse[1, 1] * m1 + J_inverse[1, 2] * m2,
-        J_inverse[2, 0] * m0 + J_inverse[2, 1] * m1 + J_inverse[2, 2] * m2,
+        matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z,
+        matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z,
+        matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z,
     )
 
 
-@compiled
-def quaternion_derivative(w, x, y, z, p, q, r):  # type: ignore[no-untyped-def]
-    """Half the product of the quaternion and the body rates."""
+@inlined
+def _derivative(body, wrench, plant):  # type: ignore[no-untyped-def]
+    """Newton's and Euler's equations; the wrench is thrust (N), then moment (N m)."""
+    vx, vy, vz, w, x, y, z, hx, hy, hz = body
+    thrust, L, M, N = wrench
+    p, q, r = _product(plant.inertia_inverse, hx, hy, hz)
+    lift, drag = 2.0 * thrust * (1.0 / plant.mass), plant.drag / plant.mass
     return (
+        -(x * z + w * y) * lift - drag * (vx - plant.wind[0]),
+        -(y * z - w * x) * lift - drag * (vy - plant.wind[1]),
+        GRAVITY - (0.5 - x * x - y * y) * lift - drag * (vz - plant.wind[2]),
         0.5 * (-x * p - y * q - z * r),
         0.5 * (w * p + y * r - z * q),
         0.5 * (w * q + z * p - x * r),
         0.5 * (w * r + x * q - y * p),
+        L - plant.rate_damping[0] * p - (q * hz - r * hy),
+        M - plant.rate_damping[1] * q - (r * hx - p * hz),
+        N - plant.rate_damping[2] * r - (p * hy - q * hx),
+    )
+
+
+@inlined
+def _moved(a, h, k):  # type: ignore[no-untyped-def]
+    """A + h k, written out: tuples live in registers, arrays do not."""
+    return (
+        a[0] + h * k[0],
+        a[1] + h * k[1],
+        a[2] + h * k[2],
+        a[3] + h * k[3],
+        a[4] + h * k[4],
+        a[5] + h * k[5],
+        a[6] + h * k[6],
+        a[7] + h * k[7],
+        a[8] + h * k[8],
+        a[9] + h * k[9],
+    )
+
+
+@inlined
+def _runge_kutta(body, step, before, middle, after, plant):  # type: ignore[no-untyped-def]
+    """One step of the classical scheme, with the wrench at its beginning, middle and end.
+
+    Returns the body, and how far it went.
+    """
+    k1 = _derivative(body, before, plant)
+    second = _moved(body, 0.5 * step, k1)
+    k2 = _derivative(second, middle, plant)
+    third = _moved(body, 0.5 * step, k2)
+    k3 = _derivative(third, middle, plant)
+    fourth = _moved(body, step, k3)
+    k4 = _derivative(fourth, after, plant)
+    end = _moved(body, step / 6.0, _moved(_moved(k1, 1.0, k4), 2.0, _moved(k2, 1.0, k3)))
+    vx, vy, vz, w, x, y, z, hx, hy, hz = end
+    scale = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)  # one step of Newton's towards length one
+    sixth, third_part = step / 6.0, step / 3.0
+    way = (
+        sixth * (body[0] + fourth[0]) + third_part * (second[0] + third[0]),
+        sixth * (body[1] + fourth[1]) + third_part * (second[1] + third[1]),
+        sixth * (body[2] + fourth[2]) + third_part * (second[2] + third[2]),
+    )
+    return (vx, vy, vz, w * scale, x * scale, y * scale, z * scale, hx, hy, hz), way
+
+
+@inlined
+def _take(state, plant):  # type: ignore[no-untyped-def]
+    """The body from the state vector."""
+    hx, hy, hz = _product(plant.inertia, state[10], state[11], state[12])
+    return (state[3], state[4], state[5], state[6], state[7], state[8], state[9], hx, hy, hz)
+
+
+@inlined
+def _put(body, state, plant):  # type: ignore[no-untyped-def]
+    """The body into the state vector."""
+    state[3], state[4], state[5], state[6], state[7], state[8], state[9], hx, hy, hz = body
+    state[10], state[11], state[12] = _product(plant.inertia_inverse, hx, hy, hz)
+
+
+@inlined
+def _rotor_speed(command, i, plant):  # type: ignore[no-untyped-def]
+    """Where the speed of rotor `i` settles (rad/s) under a thrust fraction."""
+    fraction = min(max(float(command), 0.0), 1.0) * plant.effectiveness[i]
+    return np.sqrt(fraction * plant.thrust_max / plant.thrust_coefficient)
+
+
+@inlined
+def _wrench_polynomial(state, commands, plant):  # type: ignore[no-untyped-def]
+    """Wrench while commands are held, as coefficients of 1, e and e^2, e = exp(-t / motor_time_constant).
+
+    Each rotor's speed is settled + gap e, its thrust proportional to the square.
+    """
+    constant, linear, square = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
+    for i in range(plant.rotors.shape[0]):
+        settled = _rotor_speed(commands[i], i, plant)
+        gap = state[ROTORS + i] - settled
+        c = plant.thrust_coefficient * settled * settled
+        b = plant.thrust_coefficient * 2.0 * settled * gap
+        a = plant.thrust_coefficient * gap * gap
+        L, M, N = -plant.rotors[i, 1], plant.rotors[i, 0], plant.spin[i] * plant.torque_ratio
+        constant = (constant[0] + c, constant[1] + L * c, constant[2] + M * c, constant[3] + N * c)
+        linear = (linear[0] + b, linear[1] + L * b, linear[2] + M * b, linear[3] + N * b)
+        square = (square[0] + a, square[1] + L * a, square[2] + M * a, square[3] + N * a)
+    return constant, linear, square
+
+
+@inlined
+def _wrench(polynomial, e):  # type: ignore[no-untyped-def]
+    constant, linear, square = polynomial
+    return (
+        constant[0] + e * (linear[0] + e * square[0]),
+        constant[1] + e * (linear[1] + e * square[1]),
+        constant[2] + e * (linear[2] + e * square[2]),
+        constant[3] + e * (linear[3] + e * square[3]),
     )
 
 
 @compiled
-def _normalise(state, first):  # type: ignore[no-untyped-def]
-    """Scale the quaternion at `first` to length one."""
-    w, x, y, z = state[first], state[first + 1], state[first + 2], state[first + 3]
-    scale = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
-    for i in range(4):
-        state[first + i] *= scale
-
-
-@compiled
-def derivative(state, speeds, plant, out):  # type: ignore[no-untyped-def]
-    """Time derivative of the state, into `out`; `speeds` are the rotor speed commands, rad/s."""
-    vx, vy, vz = state[3], state[4], state[5]
-    w, x, y, z = state[6], state[7], state[8], state[9]
-    p, q, r = state[10], state[11], state[12]
-    thrust = 0.0
-    L = -plant.rate_damping[0] * p
-    M = -plant.rate_damping[1] * q
-    N = -plant.rate_damping[2] * r
-    for i in range(plant.rotors.shape[0]):
-        speed = state[ROTORS + i]
-        force = plant.thrust_coefficient * speed * speed
-        thrust += force
-        L -= plant.rotors[i, 1] * force
-        M += plant.rotors[i, 0] * force
-        N += plant.spin[i] * plant.torque_ratio * force
-        out[ROTORS + i] = (speeds[i] - speed) / plant.motor_time_constant
-    out[0], out[1], out[2] = vx, vy, vz
-    lift, drag = thrust / plant.mass, plant.drag / plant.mass
-    out[3] = -2.0 * (x * z + w * y) * lift - drag * (vx - plant.wind[0])
-    out[4] = -2.0 * (y * z - w * x) * lift - drag * (vy - plant.wind[1])
-    out[5] = GRAVITY - (1.0 - 2.0 * (x * x + y * y)) * lift - drag * (vz - plant.wind[2])
-    out[6], out[7], out[8], out[9] = quaternion_derivative(w, x, y, z, p, q, r)
-    out[10], out[11], out[12] = angular_acceleration(plant.inertia, plant.inertia_inverse, p, q, r, L, M, N)
-
-
-@compiled
-def advance(state, commands, plant, steps, step, work):  # type: ignore[no-untyped-def]
-    """Integrate in place over `steps` Runge-Kutta steps with motor commands (thrust fractions 0..1) held.
-
-    `work` is scratch space, (6, len(state)).
-    """
-    n = state.shape[0]
-    k1, k2, k3, k4, at, speeds = work[0], work[1], work[2], work[3], work[4], work[5]
-    for i in range(plant.rotors.shape[0]):
-        fraction = min(max(float(commands[i]), 0.0), 1.0)
-        speeds[i] = np.sqrt(fraction * plant.thrust_max / plant.thrust_coefficient)
+def advance(state, commands, plant, steps, step):  # type: ignore[no-untyped-def]
+    """Integrate in place over `steps` Runge-Kutta steps with motor commands (thrust fractions 0..1) held."""
+    polynomial = _wrench_polynomial(state, commands, plant)
+    decay = np.exp(-0.5 * step / plant.motor_time_constant)
+    body, e, after = _take(state, plant), 1.0, _wrench(polynomial, 1.0)
+    x, y, z = state[0], state[1], state[2]
     for _ in range(steps):
-        derivative(state, speeds, plant, k1)
-        for i in range(n):
-            at[i] = state[i] + 0.5 * step * k1[i]
-        derivative(at, speeds, plant, k2)
-        for i in range(n):
-            at[i] = state[i] + 0.5 * step * k2[i]
-        derivative(at, speeds, plant, k3)
-        for i in range(n):
-            at[i] = state[i] + step * k3[i]
-        derivative(at, speeds, plant, k4)
-        for i in range(n):
-            state[i] += step / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-        _normalise(state, QUATERNION)
+        before, middle = after, _wrench(polynomial, e * decay)
+        e *= decay * decay
+        after = _wrench(polynomial, e)
+        body, way = _runge_kutta(body, step, before, middle, after, plant)
+        x, y, z = x + way[0], y + way[1], z + way[2]
+    state[0], state[1], state[2] = x, y, z
+    _put(body, state, plant)
+    for i in range(plant.rotors.shape[0]):
+        settled = _rotor_speed(commands[i], i, plant)
+        state[ROTORS + i] = settled + (state[ROTORS + i] - settled) * e
 
 
 @compiled
-def _rotate(x, J, J_inverse, L, M, N, out):  # type: ignore[no-untyped-def]
-    """Derivative of (quaternion, rates) under a body moment."""
-    out[0], out[1], out[2], out[3] = quaternion_derivative(x[0], x[1], x[2], x[3], x[4], x[5], x[6])
-    out[4], out[5], out[6] = angular_acceleration(J, J_inverse, x[4], x[5], x[6], L, M, N)
-
-
-@compiled
-def _integrate(J, J_inverse, moments, step, substeps, x, rates, quaternions):  # type: ignore[no-untyped-def]
-    k1, k2, k3, k4, at = np.empty(7), np.empty(7), np.empty(7), np.empty(7), np.empty(7)
+def _integrate(plant, moments, step, substeps, state, rates, quaternions):  # type: ignore[no-untyped-def]
+    body = _take(state, plant)
     for k in range(moments.shape[0]):
-        L, M, N = moments[k, 0], moments[k, 1], moments[k, 2]
+        wrench = (0.0, moments[k, 0], moments[k, 1], moments[k, 2])
         for _ in range(substeps):
-            _rotate(x, J, J_inverse, L, M, N, k1)
-            for i in range(7):
-                at[i] = x[i] + 0.5 * step * k1[i]
-            _rotate(at, J, J_inverse, L, M, N, k2)
-            for i in range(7):
-                at[i] = x[i] + 0.5 * step * k2[i]
-            _rotate(at, J, J_inverse, L, M, N, k3)
-            for i in range(7):
-                at[i] = x[i] + step * k3[i]
-            _rotate(at, J, J_inverse, L, M, N, k4)
-            for i in range(7):
-                x[i] += step / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
-            _normalise(x, 0)
-        quaternions[k + 1] = x[:4]
-        rates[k + 1] = x[4:]
+            body, _way = _runge_kutta(body, step, wrench, wrench, wrench, plant)
+        _put(body, state, plant)
+        quaternions[k + 1] = state[6:10]
+        rates[k + 1] = state[10:13]
 
 
 def integrate_moments(
@@ -190,7 +235,7 @@ def integrate_moments(
     substeps: int = 1,
     quaternion0: ArrayLike = (1.0, 0.0, 0.0, 0.0),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The rigid body alone, under pure body moments: for comparison with closed forms.
+    """The flown integrator under pure body moments: for comparison with closed forms.
 
     Parameters
     ----------
@@ -228,16 +273,18 @@ def integrate_moments(
         raise SitlError(
             f"got moments {M.shape}, omega0 {w0.shape}, quaternion0 {q0.shape}; expected (N, 3), (3,) and (4,)"
         )
-    x = np.concatenate([q0, w0])
-    length = float(np.linalg.norm(x[:4]))
-    if not (np.isfinite(M).all() and np.isfinite(x).all() and length > 0):
+    if not (np.isfinite(M).all() and np.isfinite(w0).all() and np.isfinite(q0).all() and q0.any()):
         raise SitlError("moments and initial state: expected finite numbers and a quaternion that is not zero")
     if substeps < 1 or not dt > 0:
         raise SitlError(f"got {substeps} substeps of dt {dt} s; expected at least one, and dt above 0")
-    x[:4] /= length
+    state = np.concatenate([np.zeros(6), q0 / np.linalg.norm(q0), w0])
     rates, quaternions = np.empty((len(M) + 1, 3)), np.empty((len(M) + 1, 4))
-    rates[0], quaternions[0] = x[4:], x[:4]
-    _integrate(J, np.linalg.inv(J), M, dt / substeps, substeps, x, rates, quaternions)
+    rates[0], quaternions[0] = state[10:], state[6:10]
+    nothing, inverse = np.zeros(3), np.linalg.inv(J).astype(np.float64)
+    body = PlantParameters(
+        1.0, J, inverse, np.zeros((0, 3)), np.zeros(0), 1.0, 1.0, 1.0, 1.0, nothing, 0.0, nothing, np.ones(0)
+    )
+    _integrate(body, M, dt / substeps, substeps, state, rates, quaternions)
     return rates, quaternions
 
 

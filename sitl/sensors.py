@@ -7,11 +7,13 @@ HIL_STATE_QUATERNION message carries. The in-process loop rounds the same way, s
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter
 
-from sitl.compiled import compiled
+from sitl.compiled import inlined
 from sitl.errors import SitlError
 
 SIZE = 9
@@ -49,35 +51,71 @@ def low_pass(cutoff_hz: float, Ts: float) -> NDArray[np.float64]:
     return np.concatenate([b, a[1:]]).astype(np.float64)
 
 
-@compiled
-def measure(state, noise, angle_deviation, rate_deviation, gyro, memory, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (9,) from the true state and six standard normal numbers (angles, then rates).
+class Sensors(NamedTuple):
+    """Constants and memory of the measurement; the arrays may be changed between samples.
 
-    The rates pass the filter `gyro` (5,), whose `memory` (2, 3) is carried on.
+    Attributes
+    ----------
+    angle_deviation, rate_deviation : float, rad, rad/s
+        Standard deviation of the noise.
+    gyro : (5,) array
+        From `low_pass`.
+    memory : (2, 3) array
+        Of that filter.
+    bias : (3,) array, rad/s
+        Added to the body rates.
+    stuck, failed : (3,) arrays of bool
+        Rates that repeat their last value; rates that are not a number.
+    """
+
+    angle_deviation: float
+    rate_deviation: float
+    gyro: NDArray[np.float64]
+    memory: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    stuck: NDArray[np.bool_]
+    failed: NDArray[np.bool_]
+
+    @staticmethod
+    def sound(angle_deviation: float, rate_deviation: float, gyro: NDArray[np.float64]) -> Sensors:
+        """Sensors without a fault."""
+        nothing, never = np.zeros(3), np.zeros(3, np.bool_)
+        return Sensors(angle_deviation, rate_deviation, gyro, np.zeros((2, 3)), nothing, never, never.copy())
+
+
+@inlined
+def measure(state, noise, sensors, seen):  # type: ignore[no-untyped-def]
+    """Fill `seen` (9,), which holds the last measurement, from the true state and six standard normal numbers
+    (angles, then rates).
     """
     w, x, y, z = state[6], state[7], state[8], state[9]
-    a, b, c = 0.5 * angle_deviation * noise[0], 0.5 * angle_deviation * noise[1], 0.5 * angle_deviation * noise[2]
+    half = 0.5 * sensors.angle_deviation
+    a, b, c = half * noise[0], half * noise[1], half * noise[2]
     # A small rotation about the body axes, 1 + (a, b, c), then back to length one.
     qw, qx = w - x * a - y * b - z * c, x + w * a + y * c - z * b
     qy, qz = y + w * b + z * a - x * c, z + w * c + x * b - y * a
     scale = 1.0 / np.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-    out[0], out[1], out[2], out[3] = (
+    seen[0], seen[1], seen[2], seen[3] = (
         np.float32(qw * scale),
         np.float32(qx * scale),
         np.float32(qy * scale),
         np.float32(qz * scale),
     )
+    gyro, memory = sensors.gyro, sensors.memory
     for i in range(3):
-        rate = state[10 + i] + rate_deviation * noise[3 + i]
+        rate = state[10 + i] + sensors.rate_deviation * noise[3 + i] + sensors.bias[i]
         filtered = gyro[0] * rate + memory[0, i]
         memory[0, i] = gyro[1] * rate - gyro[3] * filtered + memory[1, i]
         memory[1, i] = gyro[2] * rate - gyro[4] * filtered
-        out[4 + i] = np.float32(filtered)
-    out[7] = np.round(-1000.0 * state[2])
-    out[8] = np.round(-100.0 * state[5])
+        if sensors.failed[i]:
+            seen[4 + i] = np.nan
+        elif not sensors.stuck[i]:
+            seen[4 + i] = np.float32(filtered)
+    seen[7] = np.round(-1000.0 * state[2])
+    seen[8] = np.round(-100.0 * state[5])
 
 
-@compiled
+@inlined
 def euler_angles(w, x, y, z):  # type: ignore[no-untyped-def]
     """Roll, pitch and yaw (rad) of the aeronautical 3-2-1 sequence."""
     return (

@@ -19,8 +19,7 @@ from sitl.airframe import Airframe
 from sitl.autopilot import MAX_ROTORS
 from sitl.loop import Simulator
 from sitl.mavlink.link import Codec
-from sitl.plant import GRAVITY, advance
-from sitl.sensors import SIZE, measure
+from sitl.plant import GRAVITY
 
 FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is answered
 NOISE_BLOCK = 250
@@ -57,22 +56,19 @@ class PlantServer:
     def _warm_up(self, airframe: Airframe, seed: int) -> None:
         """Compile what each period calls now, so that the first frames come in time."""
         spare = Simulator(airframe, self.Ts, seed)
-        measure(spare.state, spare.noise(1)[0], *spare.sensors, np.zeros(SIZE))
-        commands = np.zeros(MAX_ROTORS, np.float32)
-        advance(spare.state, commands, spare.plant, spare.steps, spare.step, spare.work)
+        spare.measure(spare.noise(1)[0])
+        spare.advance(np.zeros(MAX_ROTORS, np.float32))
 
     def serve(self, connection: socket.socket) -> int:
         """Fly until the autopilot goes away; returns the number of periods."""
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         answers = self._answers(connection)
-        measurement = np.zeros(SIZE)
-        delay = len(self.simulator.queue)
         begin = time.monotonic()
         count = 0
         while True:
             if count % NOISE_BLOCK == 0:
                 noise = self.simulator.noise(NOISE_BLOCK)
-            measure(self.simulator.state, noise[count % NOISE_BLOCK], *self.simulator.sensors, measurement)
+            measurement = self.simulator.measure(noise[count % NOISE_BLOCK])
             frame = self._frame(count, measurement)
             try:
                 connection.sendall(frame)
@@ -84,14 +80,7 @@ class PlantServer:
                         connection.sendall(frame)
             except (StopIteration, OSError):
                 return count
-            commands = np.array(answer.controls, np.float32)
-            if delay:
-                applied = self.simulator.queue[count % delay].copy()
-                self.simulator.queue[count % delay] = commands
-            else:
-                applied = commands
-            simulator = self.simulator
-            advance(simulator.state, applied, simulator.plant, simulator.steps, simulator.step, simulator.work)
+            self.simulator.advance(np.array(answer.controls, np.float32))
             count += 1
             if self.speed is not None:
                 ahead = begin + count * self.Ts / self.speed - time.monotonic()

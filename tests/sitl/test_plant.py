@@ -147,9 +147,8 @@ def test_an_added_mass_is_the_same_body_seen_from_its_new_centre():
 
 def fly_open_loop(plant: PlantParameters, commands, seconds, step=1e-3):
     state = hover_state(plant, altitude=100.0)
-    work = np.zeros((6, len(state)))
     steps = round(seconds / step)
-    advance(state, np.asarray(commands, np.float32), plant, steps, step, work)
+    advance(state, np.asarray(commands, np.float32), plant, steps, step)
     return state
 
 
