@@ -68,8 +68,8 @@ class Lift:
     def rest(self, dt: float, estimate: Estimate) -> None:
         """One period without thrust: a vehicle that does not move stands."""
         self.ceiling = 0.0
-        moving = abs(estimate.climb) > STILL_CLIMB or max(map(abs, estimate.rates)) > STILL_RATE
-        self._still = 0.0 if moving else self._still + dt
+        still = abs(estimate.climb) <= STILL_CLIMB and all(abs(rate) <= STILL_RATE for rate in estimate.rates)
+        self._still = self._still + dt if still else 0.0
         self.landed = self._still >= STILL_SECONDS
         self._stand(estimate)
 

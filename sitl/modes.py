@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from sitl.lift import Estimate, Lift
 from sitl.plant import GRAVITY
-from sitl.setpoints import STALE_SECONDS, Attitude, Pose, Sticks, Stream
+from sitl.setpoints import STALE_SECONDS, Attitude, Pose, Sticks, Stream, turned
 
 LEVEL_SECONDS = 2.0  # without set-points the vehicle is kept level for so long, and lands
 MAX_ARM_TILT = math.radians(15.0)
@@ -45,6 +45,10 @@ class Severity(Enum):
 
 class Refused(Exception):  # noqa: N818 - an answer, not an error
     """The vehicle does not do that now: the message says why."""
+
+
+class Denied(Refused):
+    """Neither now nor later."""
 
 
 class Demand(NamedTuple):
@@ -96,6 +100,11 @@ class Vehicle:
         self._stale = False
         self._tilted = 0.0
 
+    @property
+    def in_trouble(self) -> bool:
+        """Whether it flies otherwise than it was told."""
+        return self._stale
+
     def say(self, severity: Severity, text: str) -> None:
         """Tell the pilot."""
         self.said.append((severity, text))
@@ -107,10 +116,10 @@ class Vehicle:
         found = list(self.obstacles.values())
         if found or self.armed:
             return found
-        tilt = math.degrees(max(abs(self.estimate.roll), abs(self.estimate.pitch)))
-        if not tilt <= math.degrees(MAX_ARM_TILT):
+        if not self._upright(MAX_ARM_TILT):
+            tilt = math.degrees(max(abs(self.estimate.roll), abs(self.estimate.pitch)))
             found.append(f"not level: tilted by {tilt:.0f} degrees, at most {math.degrees(MAX_ARM_TILT):.0f}")
-        if not max(map(abs, self.estimate.rates)) <= MAX_ARM_RATE:
+        if not all(abs(rate) <= MAX_ARM_RATE for rate in self.estimate.rates):
             found.append("it turns")
         if not self.lift.landed:
             found.append("not on the ground, or it moves")
@@ -162,7 +171,7 @@ class Vehicle:
             With the reason.
         """
         if not MIN_HEIGHT <= height <= MAX_HEIGHT:
-            raise Refused(f"no take-off to {height:g} m: expected {MIN_HEIGHT:g} to {MAX_HEIGHT:g} m")
+            raise Denied(f"no take-off to {height:g} m: expected {MIN_HEIGHT:g} to {MAX_HEIGHT:g} m")
         if not self.armed:
             raise Refused("no take-off: not armed")
         if not self.lift.landed:
@@ -179,7 +188,7 @@ class Vehicle:
             With the reason.
         """
         if mode is Mode.TAKEOFF:
-            raise Refused("take-off is a command, with a height: NAV_TAKEOFF")
+            raise Denied("take-off is a command, with a height: NAV_TAKEOFF")
         if mode is Mode.LAND and not self.armed:
             raise Refused("no landing: not armed")
         if self._unsteered(mode):
@@ -246,11 +255,14 @@ class Vehicle:
 
     def _watch(self, dt: float) -> None:
         """Stop the rotors of a vehicle that is lost."""
-        upright = max(abs(self.estimate.roll), abs(self.estimate.pitch)) <= MAX_TILT
-        self._tilted = 0.0 if upright else self._tilted + dt
+        self._tilted = 0.0 if self._upright(MAX_TILT) else self._tilted + dt
         if self._tilted >= LOST_SECONDS:
             self.say(Severity.EMERGENCY, "lost: tilted too far for too long, rotors stopped")
             self.disarm(force=True)
+
+    def _upright(self, limit: float) -> bool:
+        """Whether it tilts by no more than a limit, rad; what is not finite does."""
+        return abs(self.estimate.roll) <= limit and abs(self.estimate.pitch) <= limit
 
     def _steer(self, dt: float) -> tuple[Attitude, float]:
         """Attitude set-point of the mode, and the speed to climb with where it gives no thrust."""
@@ -298,8 +310,8 @@ class Vehicle:
             return 0.0, 0.0
         pose, estimate = self.pose.value, self.estimate
         self._place = self._place or (pose.x, pose.y)
-        x, y = _turned(self._place[0] - pose.x, self._place[1] - pose.y, pose.yaw)
-        u, v = _turned(estimate.north, estimate.east, estimate.yaw)
+        x, y = turned(self._place[0] - pose.x, self._place[1] - pose.y, pose.yaw)
+        u, v = turned(estimate.north, estimate.east, estimate.yaw)
         # 1 rad/s, critically damped, as the altitude is held.
         ahead, right = x - 2.0 * u, y - 2.0 * v
 
@@ -307,9 +319,3 @@ class Vehicle:
             return min(max(acceleration / GRAVITY, -HOLD_TILT), HOLD_TILT)
 
         return lean(right), -lean(ahead)
-
-
-def _turned(north: float, east: float, yaw: float) -> tuple[float, float]:
-    """A level vector seen from the vehicle: ahead and to the right."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    return c * north + s * east, c * east - s * north

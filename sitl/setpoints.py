@@ -51,3 +51,9 @@ class Stream(Generic[T]):
     def fresh(self, now: float) -> bool:
         """Whether it still counts."""
         return now - self.time <= STALE_SECONDS
+
+
+def turned(north: float, east: float, yaw: float) -> tuple[float, float]:
+    """A level vector seen from the vehicle: ahead and to the right."""
+    c, s = math.cos(yaw), math.sin(yaw)
+    return c * north + s * east, c * east - s * north
