@@ -64,6 +64,7 @@ class Host:
         self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
         self.lateness = Lateness()
         self.measurement = np.zeros(SIZE)
+        euler_angles(*self.measurement[:4])  # compiled now, not in flight
         self.stamp = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
         self.heard = 0.0

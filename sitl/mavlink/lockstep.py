@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.errors import SitlError
@@ -61,7 +60,7 @@ def _exchange(autopilot: Autopilot, plant: socket.socket, record: NDArray[Any]) 
         if not data:
             break
         for message in codec.parse(data):
-            if message.get_id() != mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION or count == len(record):
+            if message.get_type() != "HIL_STATE_QUATERNION" or count == len(record):
                 continue
             if message.time_usec > stamp:
                 stamp = message.time_usec
