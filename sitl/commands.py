@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -180,13 +181,18 @@ def plant(
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port to listen on; 0: any free one.")] = 4560,
     rate: Annotated[float, typer.Option(help="Frames a second (the autopilot's control rate), Hz.")] = 250.0,
     speed: Annotated[str, typer.Option(help="Times real time, or max.")] = "1",
+    altitude: Annotated[
+        float, typer.Option(min=0, max=1000, help="Where it starts hovering, m; 0: on the ground, rotors standing.")
+    ] = 0.0,
     seed: SeedOption = 0,
+    child: Annotated[bool, typer.Option("--child", help="End when standard input is closed.")] = False,
 ) -> None:
-    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot."""
+    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot after another."""
     from sitl.airframe import load_airframe
     from sitl.errors import SitlError
     from sitl.mavlink.link import LOOPBACK, listen
-    from sitl.mavlink.simulator import PlantServer
+    from sitl.mavlink.plant_server import PlantServer
+    from sitl.mavlink.simulator import SimulatedVehicle
 
     try:
         times = None if speed == "max" else float(speed)
@@ -196,12 +202,14 @@ def plant(
         raise SitlError(
             f"--rate {rate}, --speed {speed}: expected 1 to 10000 Hz, and a number above 0 or max"
         ) from None
-    server = PlantServer(load_airframe(airframe).airframe, round(1 / rate, 9), seed, times)
+
+    def tell(text: str) -> None:
+        print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
+
+    vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell)
     with listen(LOOPBACK, port) as socket:
         print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
         try:
-            connection, _ = socket.accept()
-            with connection:
-                server.serve(connection)
+            PlantServer(vehicle, socket, times, child).serve()
         except KeyboardInterrupt:
             pass

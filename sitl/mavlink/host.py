@@ -37,6 +37,7 @@ def plant_process(airframe: str, port: int, Ts: float, seed: int, speed: float |
     """
     command = [sys.executable, "-m", "mimopilot", "plant", airframe, "--port", str(port), "--seed", str(seed)]
     command += ["--rate", repr(1 / Ts), "--speed", "max" if speed is None else repr(speed)]
+    command += ["--altitude", "10"]
     child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert child.stdout is not None and child.stderr is not None
     try:
