@@ -46,8 +46,13 @@ class PlantServer:
         Times real time; None: as fast as the autopilot answers.
     """
 
-    def __init__(self, airframe: Airframe, Ts: float, seed: int, speed: float | None = 1.0) -> None:
-        self.simulator = Simulator(airframe, Ts, seed)
+    def __init__(
+        self, airframe: Airframe, Ts: float, seed: int, speed: float | None = 1.0, altitude: float = 10.0
+    ) -> None:
+        self.simulator = Simulator(airframe, Ts, seed, altitude=altitude)
+        if altitude == 0:
+            self.simulator.state[13:] = 0
+            self.simulator.history[:] = 0
         self.Ts, self.speed = Ts, speed
         self.rotors = len(airframe.rotors)
         self.codec = Codec(system=1, component=mavlink.MAV_COMP_ID_USER1)
@@ -81,6 +86,13 @@ class PlantServer:
             except (StopIteration, OSError):
                 return count
             self.simulator.advance(np.array(answer.controls, np.float32))
+            state = self.simulator.state
+            if state[2] >= 0:
+                state[2] = 0
+                state[5] = min(state[5], 0)
+                state[3:5] = 0
+                state[10:13] = 0
+                state[7:9] = 0
             count += 1
             if self.speed is not None:
                 ahead = begin + count * self.Ts / self.speed - time.monotonic()
