@@ -175,6 +175,11 @@ def sitl(
         int, typer.Option(min=1, max=65535, help="UDP port where the ground station listens.")
     ] = 14550,
     vehicle_port: Annotated[int, typer.Option(min=0, max=65535, help="Local UDP port of the vehicle.")] = 18570,
+    tcp_port: Annotated[int, typer.Option(min=0, max=65535, help="Local TCP port of the vehicle; 0: any.")] = 5760,
+    bind: Annotated[str, typer.Option(help="Local address of both.")] = "127.0.0.1",
+    signing_key: Annotated[
+        Path | None, typer.Option(help="File of 32 bytes: everything is signed, nothing unsigned is heard.")
+    ] = None,
     speed: SpeedOption = "1",
     seed: SeedOption = 0,
     log: Annotated[
@@ -189,6 +194,8 @@ def sitl(
     from sitl.mavlink.parameter_server import ParameterServer
     from sitl.mavlink.plant_link import PlantLink
     from sitl.mavlink.plant_process import PlantProcess
+    from sitl.mavlink.signing import Signer, read_key
+    from sitl.mavlink.stations import Stations
     from sitl.mavlink.telemetry import Telemetry
     from sitl.mavlink.vehicle_commands import VehicleCommands
 
@@ -200,7 +207,14 @@ def sitl(
     host = Host(autopilot, link, FlightLog(log, body, controller.Ts) if log else None)
     telemetry = Telemetry(host.situation)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
-    ground = Ground(ParameterServer(autopilot.controller, controller), commands, telemetry, ground_port, vehicle_port)
+    signer = Signer(read_key(signing_key)) if signing_key else None
+    parameters = ParameterServer(autopilot.controller, controller)
+    ground = Ground(
+        parameters,
+        commands,
+        telemetry,
+        lambda wanted: Stations(ground_port, vehicle_port, tcp_port, bind, signer, wanted),
+    )
     try:
         link.wait_for_child()
         print(f"{body.name}: ground station on UDP {ground_port}, plant {link.place}; Ctrl-C ends", flush=True)

@@ -73,7 +73,7 @@ class VehicleCommands:
     vehicle : Vehicle
     telemetry : Telemetry
     reboot : callable
-        Puts a new body in place of the old one; may raise `Refused`.
+        Puts the vehicle back at its start; may raise `Refused`.
 
     Attributes
     ----------
