@@ -187,6 +187,8 @@ def sitl(
     ] = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
+    import signal
+
     from sitl.autopilot import Autopilot
     from sitl.mavlink.flight_log import FlightLog
     from sitl.mavlink.ground import Ground
@@ -215,6 +217,7 @@ def sitl(
         telemetry,
         lambda wanted: Stations(ground_port, vehicle_port, tcp_port, bind, signer, wanted),
     )
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # logs are written then, too
     try:
         link.wait_for_child()
         print(f"{body.name}: ground station on UDP {ground_port}, plant {link.place}; Ctrl-C ends", flush=True)
