@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.autopilot import MAX_ROTORS, RECORD, Autopilot, tick
+from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.errors import SitlError
 from sitl.mavlink.ground import Ground
-from sitl.mavlink.link import LOOPBACK, Codec
+from sitl.mavlink.lean import ACTUATORS, STATE, LeanCodec, Message
+from sitl.mavlink.link import COMPONENT, LOOPBACK, SYSTEM
 from sitl.scenario import Scenario
 from sitl.sensors import SIZE
 
@@ -73,7 +73,7 @@ class Host:
 
     def __init__(self, autopilot: Autopilot, rotors: int, port: int) -> None:
         self.autopilot, self.rotors = autopilot, rotors
-        self.codec = Codec()
+        self.codec = LeanCodec(SYSTEM, COMPONENT)
         self.measurement = np.zeros(SIZE)
         self.stamp = -1
         self.row: NDArray[Any] = np.zeros(1, RECORD)
@@ -87,7 +87,7 @@ class Host:
         """Leave the plant."""
         self.plant.close()
 
-    def _frames(self) -> Iterator[Any]:
+    def _frames(self) -> Iterator[Message]:
         """Messages of the plant; ends when it goes away."""
         while True:
             data = self.plant.recv(65536)
@@ -95,18 +95,18 @@ class Host:
                 return
             yield from self.codec.parse(data)
 
-    def _take(self, message: Any) -> bool:
+    def _take(self, message: Message) -> bool:
         """Note a message of the plant; True when a new period is due. A repeated time is answered, not flown."""
-        if message.get_type() != "HIL_STATE_QUATERNION":
+        kind, fields = message
+        if kind is not STATE:
             return False
-        if message.time_usec <= self.stamp:
+        if fields[0] <= self.stamp:
             self._answer(self.row[0])
             return False
-        self.stamp = message.time_usec
-        self.measurement[:4] = message.attitude_quaternion
-        self.measurement[4:7] = message.rollspeed, message.pitchspeed, message.yawspeed
-        self.measurement[7] = message.alt
-        self.measurement[8] = -message.vz
+        self.stamp = fields[0]
+        self.measurement[:7] = fields[1:8]
+        self.measurement[7] = fields[10]
+        self.measurement[8] = -fields[13]
         return True
 
     def _fly_period(self, row: Any) -> None:
@@ -115,9 +115,8 @@ class Host:
         self._answer(row)
 
     def _answer(self, row: Any) -> None:
-        controls = [float(v) for v in row["commands"][: self.rotors]] + [0.0] * (MAX_ROTORS - self.rotors)
-        message = mavlink.MAVLink_hil_actuator_controls_message(self.stamp, controls, ARMED, LOCKSTEP)
-        self.plant.sendall(self.codec.pack(message))
+        controls = row["commands"].tolist()
+        self.plant.sendall(self.codec.pack(ACTUATORS, self.stamp, LOCKSTEP, *controls, ARMED))
 
     def fly(self, scenario: Scenario) -> NDArray[Any]:
         """Fly a scenario from the first frame on.

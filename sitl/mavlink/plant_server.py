@@ -15,15 +15,13 @@ import sys
 import time
 from typing import Any
 
-from sitl.mavlink.lean import ACTUATORS, Message
-from sitl.mavlink.simulator import SimulatedVehicle
+from sitl.mavlink.lean import ACTUATORS, SPIN_S, Message, receive
+from sitl.mavlink.simulator import FORGET_S, SimulatedVehicle
 
 FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is answered
 LOOK_S = 0.2  # between looks at everything but the autopilot
 FROZEN_S = 1.0  # without an answer
 MUTE_S = 10.0  # without the first one
-SPIN_S = 300e-6  # at full speed an answer comes sooner than a sleeping process wakes
-FORGET_S = 0.25  # a simulation that is late by more does not race to catch up
 
 
 class ParentGone(Exception):
@@ -76,15 +74,16 @@ class PlantServer:
 
     def _serve_one(self, connection: socket.socket) -> None:
         vehicle = self.vehicle
-        vehicle.restart()
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             with connection:
                 Lockstep(self, connection).fly()
         except OSError:
+            flown = vehicle.flown * vehicle.Ts
+            vehicle.restart()
             vehicle.tell(
-                f"the autopilot went away at {vehicle.flown * vehicle.Ts:.2f} s of flight; "
-                "the vehicle is back at its start and waits for the next"
+                f"the autopilot went away at {flown:.2f} s of flight; the vehicle is back at its start and waits for "
+                "the next"
             )
 
     def look_around(self, now: float) -> None:
@@ -188,18 +187,14 @@ class Lockstep:
 
     def _receive(self, until: float) -> list[Message]:
         """What came, as soon as something comes; nothing when the time is over."""
-        connection, spin_until = self.connection, time.monotonic() + self.spin
         while True:
-            try:
-                data = connection.recv(65536)
-            except BlockingIOError:
+            data = receive(self.connection, self.spin)
+            if data is None:
                 now = time.monotonic()
                 self.server.look_around(now)
-                if now < spin_until:
-                    continue
                 if now >= until:
                     return []
-                select.select([connection], [], [], min(until - now, LOOK_S))
+                select.select([self.connection], [], [], min(until - now, LOOK_S))
                 continue
             if not data:
                 raise ConnectionResetError

@@ -23,7 +23,8 @@ NOISE_BLOCK = 250
 EPOCH_US = 1_000_000  # the simulated clock starts here: autopilots take zero for no time at all
 INERTIAL, FIELD_AND_AIR = 7 | 56, 448 | 6656  # bits of fields_updated
 FIELD_AND_AIR_PERIOD = 0.02  # s
-HARD_LANDING = 2.0  # m/s
+FORGET_S = 0.25  # a simulation that is late by more does not race to catch up
+HARD_LANDING = 3.0  # m/s, a fall from half a metre
 TIPPED = math.cos(math.radians(60.0))
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
