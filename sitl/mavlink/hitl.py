@@ -100,7 +100,7 @@ class SerialPlant:
                 begin, count = time.monotonic(), 0
 
     def _tell_stale(self, stale: bool) -> None:
-        when = f"at {self.vehicle.flown * self.vehicle.Ts:.2f} s of flight"
+        when = f"at {self.vehicle.seconds:.2f} s of flight"
         if stale:
             self.vehicle.tell(f"no motor commands from the board for {STALE_S:g} s, {when}: the motors stop")
         else:

@@ -24,7 +24,7 @@ FROZEN_S = 1.0  # without an answer
 MUTE_S = 10.0  # without the first one
 
 
-class ParentGone(Exception):
+class ParentGoneError(Exception):
     """The process that started this one has ended."""
 
 
@@ -54,7 +54,7 @@ class PlantServer:
         try:
             while True:
                 self._serve_one(self._accept())
-        except ParentGone:
+        except ParentGoneError:
             return
 
     def _accept(self) -> socket.socket:
@@ -70,7 +70,7 @@ class PlantServer:
     @staticmethod
     def _end_with_parent(ready: list[Any]) -> None:
         if sys.stdin in ready and not os.read(sys.stdin.fileno(), 4096):
-            raise ParentGone
+            raise ParentGoneError
 
     def _serve_one(self, connection: socket.socket) -> None:
         vehicle = self.vehicle
@@ -79,7 +79,7 @@ class PlantServer:
             with connection:
                 Lockstep(self, connection).fly()
         except OSError:
-            flown = vehicle.flown * vehicle.Ts
+            flown = vehicle.seconds
             vehicle.restart()
             vehicle.tell(
                 f"the autopilot went away at {flown:.2f} s of flight; the vehicle is back at its start and waits for "
@@ -91,7 +91,7 @@ class PlantServer:
 
         Raises
         ------
-        ParentGone
+        ParentGoneError
         """
         if now < self.next_look:
             return
@@ -181,8 +181,8 @@ class Lockstep:
             if not frozen and time.monotonic() >= since + FROZEN_S:
                 frozen = True
                 self.vehicle.tell(
-                    f"the autopilot has not answered for {FROZEN_S:g} s, at {self.vehicle.flown * self.vehicle.Ts:.2f} s "
-                    "of flight; time stands still until it does"
+                    f"the autopilot has not answered for {FROZEN_S:g} s, at {self.vehicle.seconds:.2f} s of flight; "
+                    "time stands still until it does"
                 )
 
     def _receive(self, until: float) -> list[Message]:

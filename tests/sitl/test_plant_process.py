@@ -10,6 +10,8 @@ import sys
 import threading
 import time
 import tty
+from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -117,7 +119,7 @@ def test_an_autopilot_that_boots_gets_a_running_clock_and_a_vehicle_that_waits()
         stamps.append(state[0])
         assert state[1:] == first[1:]
         gyro.add(pilot.frames[-2][1][4])
-    moved = [b - a for a, b in zip(stamps, stamps[1:], strict=False) if b > a]
+    moved = [b - a for a, b in pairwise(stamps) if b > a]
     assert set(moved) == {4000}
     assert 0.5 < (stamps[-1] - stamps[0]) / 1e6 < 1.2
     assert len(gyro) > 100  # its sensors are alive
@@ -168,8 +170,7 @@ while True:
 
 def test_a_killed_autopilot_is_noticed_within_a_second_and_the_next_starts_anew():
     bench = Bench(speed=1.0)
-    top = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
-    code = KILLED.format(top=top, port=bench.port)
+    code = KILLED.format(top=str(Path(__file__).resolve().parents[2]), port=bench.port)
     autopilot = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     assert autopilot.stdout.readline() == b"flying\n"
     autopilot.send_signal(signal.SIGKILL)
