@@ -238,10 +238,14 @@ def plant(
     ] = 0.0,
     seed: SeedOption = 0,
     child: Annotated[bool, typer.Option("--child", help="End when standard input is closed.")] = False,
+    serial: Annotated[
+        str | None, typer.Option(help="DEVICE,BAUD of a board in HITL mode, in place of the TCP port; in real time.")
+    ] = None,
 ) -> None:
-    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot after another."""
+    """Serve the plant alone over PX4's simulator API to one autopilot after another, in lockstep over TCP."""
     from sitl.airframe import load_airframe
     from sitl.errors import SitlError
+    from sitl.mavlink.hitl import SerialPlant
     from sitl.mavlink.link import LOOPBACK, listen
     from sitl.mavlink.plant_server import PlantServer
     from sitl.mavlink.simulator import SimulatedVehicle
@@ -253,10 +257,16 @@ def plant(
     def tell(text: str) -> None:
         print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
 
+    if serial and times != 1.0:
+        raise SitlError(f"--speed {speed}: a board on a serial port flies in real time")
     vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell)
-    with listen(LOOPBACK, port) as socket:
-        print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
-        try:
+    try:
+        if serial:
+            board = SerialPlant(vehicle, serial)
+            print(f"plant of {airframe} speaks on {serial}", flush=True)
+            board.serve()
+        with listen(LOOPBACK, port) as socket:
+            print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
             PlantServer(vehicle, socket, times, child).serve()
-        except KeyboardInterrupt:
-            pass
+    except KeyboardInterrupt:
+        pass
