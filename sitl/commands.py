@@ -173,7 +173,22 @@ def sitl(
     ground_port: Annotated[
         int, typer.Option(min=1, max=65535, help="UDP port where the ground station listens.")
     ] = 14550,
-    vehicle_port: Annotated[int, typer.Option(min=0, max=65535, help="Local UDP port of the vehicle.")] = 18570,
+    vehicle_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="UDP port where ground stations may speak first; 0: any.")
+    ] = 18570,
+    tcp_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="TCP port where ground stations connect; 0: any.")
+    ] = 5760,
+    bind: Annotated[
+        str, typer.Option(help="Local address of both; 0.0.0.0: all, and whoever reaches it commands the vehicle.")
+    ] = "127.0.0.1",
+    signing_key: Annotated[
+        Path | None, typer.Option(help="Sign with this key (32 bytes or 64 hexadecimal digits), hear nothing unsigned.")
+    ] = None,
+    parameters: Annotated[
+        Path | None,
+        typer.Option(help="Keep here what ground stations change; at the next start it outranks the gains."),
+    ] = None,
     speed: SpeedOption = "1",
     seed: SeedOption = 0,
     log: Annotated[
@@ -188,6 +203,8 @@ def sitl(
     from sitl.mavlink.parameter_server import ParameterServer
     from sitl.mavlink.plant_link import PlantLink
     from sitl.mavlink.plant_process import PlantProcess
+    from sitl.mavlink.signing import Signer, read_key
+    from sitl.mavlink.stations import Stations
     from sitl.mavlink.telemetry import Telemetry
     from sitl.mavlink.vehicle_commands import VehicleCommands
 
@@ -199,10 +216,12 @@ def sitl(
     host = Host(autopilot, link, FlightLog(log, body, controller.Ts) if log else None)
     telemetry = Telemetry(host.situation)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
-    ground = Ground(ParameterServer(autopilot.controller, controller), commands, telemetry, ground_port, vehicle_port)
+    signer = Signer(read_key(signing_key)) if signing_key else None
+    stations = Stations(ground_port, vehicle_port, tcp_port, bind, signer)
+    ground = Ground(ParameterServer(autopilot.controller, controller), commands, telemetry, stations)
     try:
         link.wait_for_child()
-        print(f"{body.name}: ground station on UDP {ground_port}, plant {link.place}; Ctrl-C ends", flush=True)
+        print(f"{body.name}: {stations}, plant {link.place}; Ctrl-C ends", flush=True)
         host.run(ground)
     except KeyboardInterrupt:
         print(f"ended: {host.lateness}")

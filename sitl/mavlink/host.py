@@ -128,7 +128,7 @@ class Host:
         if plants and select.select(plants, [], [], 0)[0]:
             return True
         begin = time.monotonic()
-        ready = select.select([*plants, ground.socket], [], [], TURN_S)[0]
+        ready = select.select([*plants, *ground.sockets], [], [], TURN_S)[0]
         end = time.monotonic()
         self.lateness.nothing_waits(end - begin, end)
         return self.plant.socket in ready
