@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -197,10 +198,13 @@ def sitl(
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
     from sitl.autopilot import Autopilot
+    from sitl.injector import Injector
+    from sitl.mavlink.excitation import Excitation
     from sitl.mavlink.flight_log import FlightLog
     from sitl.mavlink.ground import Ground
     from sitl.mavlink.host import Host
     from sitl.mavlink.parameter_server import ParameterServer
+    from sitl.mavlink.parameter_store import ParameterStore
     from sitl.mavlink.plant_link import PlantLink
     from sitl.mavlink.plant_process import PlantProcess
     from sitl.mavlink.signing import Signer, read_key
@@ -218,9 +222,15 @@ def sitl(
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
     signer = Signer(read_key(signing_key)) if signing_key else None
     stations = Stations(ground_port, vehicle_port, tcp_port, bind, signer)
-    ground = Ground(ParameterServer(autopilot.controller, controller), commands, telemetry, stations)
+    injector = Injector(controller.Ts)
+    host.excitation = Excitation(injector, host.situation)
+    store = ParameterStore(parameters) if parameters else None
+    server = ParameterServer(autopilot.controller, controller, injector, store)
+    ground = Ground(server, commands, telemetry, stations)
     try:
         link.wait_for_child()
+        if server.summary:
+            print(server.summary)
         print(f"{body.name}: {stations}, plant {link.place}; Ctrl-C ends", flush=True)
         host.run(ground)
     except KeyboardInterrupt:
@@ -234,40 +244,30 @@ def plant(
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port to listen on; 0: any free one.")] = 4560,
     rate: Annotated[float, typer.Option(help="Frames a second (the autopilot's control rate), Hz.")] = 250.0,
     speed: SpeedOption = "1",
+    altitude: Annotated[
+        float, typer.Option(min=0, max=1000, help="Where it starts hovering, m; 0: on the ground, rotors standing.")
+    ] = 0.0,
     seed: SeedOption = 0,
-    altitude: Annotated[float, typer.Option(help="Where it starts, m.")] = 10.0,
-    child: Annotated[bool, typer.Option(hidden=True)] = False,
+    child: Annotated[bool, typer.Option("--child", help="End when standard input is closed.")] = False,
 ) -> None:
-    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot."""
+    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot after another."""
     from sitl.airframe import load_airframe
     from sitl.errors import SitlError
     from sitl.mavlink.link import LOOPBACK, listen
-    from sitl.mavlink.simulator import PlantServer
+    from sitl.mavlink.plant_server import PlantServer
+    from sitl.mavlink.simulator import SimulatedVehicle
 
-    try:
-        times = None if speed == "max" else float(speed)
-        if not 1 <= rate <= 1e4 or not (times is None or 0 < times < 1e6):
-            raise ValueError
-    except ValueError:
-        raise SitlError(
-            f"--rate {rate}, --speed {speed}: expected 1 to 10000 Hz, and a number above 0 or max"
-        ) from None
-    server = PlantServer(load_airframe(airframe).airframe, round(1 / rate, 9), seed, times, altitude)
-    if child:
-        import os
-        import sys
-        import threading
+    times = _times(speed)
+    if not 1 <= rate <= 1e4:
+        raise SitlError(f"--rate {rate}: expected 1 to 10000 Hz")
 
-        def watch() -> None:
-            sys.stdin.buffer.read()
-            os._exit(0)
+    def tell(text: str) -> None:
+        print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
 
-        threading.Thread(target=watch, daemon=True).start()
+    vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell)
     with listen(LOOPBACK, port) as socket:
         print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
         try:
-            connection, _ = socket.accept()
-            with connection:
-                server.serve(connection)
+            PlantServer(vehicle, socket, times, child).serve()
         except KeyboardInterrupt:
             pass

@@ -60,9 +60,9 @@ class Conditions(NamedTuple):
 class Injector:
     """Adds a PRBS on roll, on pitch, or on one after the other.
 
-    Setting `AXIS` from 0 to 1, 2 or 3 asks for one run. It begins when the vehicle is ready and in its mode, and ends by
-    itself, or when the vehicle is no longer ready, leaves the mode or tilts too far, or a stick moves; another run needs
-    0 first.
+    Setting `AXIS` from 0 to 1, 2 or 3 asks for one run. It begins when the vehicle is ready and in its mode, and ends
+    by itself, or when the vehicle is no longer ready, leaves the mode or tilts too far, or a stick moves; another run
+    needs 0 first.
 
     Parameters
     ----------

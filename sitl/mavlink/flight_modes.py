@@ -15,6 +15,9 @@ NUMBERS = {
 #: And back; a main mode alone is its plainest mode.
 MODES = {numbers: mode for mode, numbers in NUMBERS.items()} | {(4, 0): Mode.HOLD}
 
+#: Mode -> PX4's nav_state, which MIMO_EX_MODE names.
+NAV_STATES = {Mode.ALTITUDE: 1, Mode.HOLD: 4, Mode.OFFBOARD: 14, Mode.TAKEOFF: 17, Mode.LAND: 18}
+
 
 def custom_mode(mode: Mode) -> int:
     """HEARTBEAT.custom_mode."""

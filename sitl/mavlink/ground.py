@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 from collections.abc import Callable
 from typing import Any
 
@@ -10,11 +9,11 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.mavlink.parameter_server import ParameterServer
 from sitl.mavlink.protocols import PROTOCOLS
-from sitl.mavlink.stations import Station, Stations
+from sitl.mavlink.stations import Stations
 from sitl.mavlink.steering import Steering
 from sitl.mavlink.telemetry import Telemetry, texts
-from sitl.mavlink.vehicle_commands import VehicleCommands
-from sitl.modes import Severity
+from sitl.mavlink.vehicle_commands import Command, VehicleCommands
+from sitl.modes import Denied, Failed, Refused, Severity
 
 GROUND_LOST_S = 5.0
 
@@ -40,6 +39,7 @@ class Ground:
         self, parameters: ParameterServer, commands: VehicleCommands, telemetry: Telemetry, stations: Stations
     ) -> None:
         self.parameters, self.telemetry, self.vehicle, self.stations = parameters, telemetry, commands.vehicle, stations
+        self.now = 0.0
         self.heard: float | None = None
         self._texts = 0
         steering = Steering(self.vehicle)
@@ -53,28 +53,21 @@ class Ground:
             "COMMAND_INT": commands.answer,
             "SET_MODE": commands.set_mode,
             "REQUEST_DATA_STREAM": self._data_stream,
+            "HEARTBEAT": self._heartbeat,
         }
-        stations.hear("HEARTBEAT", *self.answers)
-
-    @property
-    def sockets(self) -> list[socket.socket]:
-        """What becomes readable when a station says something."""
-        return self.stations.sockets
+        stations.hear(*self.answers)
+        commands.handlers[mavlink.MAV_CMD_PREFLIGHT_STORAGE] = self._store
 
     def close(self) -> None:
-        """Release the ports."""
+        """Release the ports, and write what is to be kept."""
         self.stations.close()
+        self.parameters.close()
 
     def receive(self, now: float) -> None:
-        """Take messages that have arrived; `now` is a monotonic time in s."""
+        """Take some of the messages that have arrived; `now` is a monotonic time in s."""
+        self.now = now
         for message, station in self.stations.receive():
-            self._take(message, station, now)
-
-    def _take(self, message: Any, station: Station, now: float) -> None:
-        kind = message.get_type()
-        if kind == "HEARTBEAT":
-            self.heard = now if message.type == mavlink.MAV_TYPE_GCS else self.heard
-        elif not station.busy:
+            kind = message.get_type()
             for answer in self.answers[kind](message):
                 # A new value is of interest to all.
                 for_all = kind == "PARAM_SET" and answer.get_type() == "PARAM_VALUE"
@@ -91,9 +84,27 @@ class Ground:
         if self.heard is not None and now > self.heard + GROUND_LOST_S:
             self.heard = None
             self.vehicle.say(Severity.WARNING, f"no ground station for {GROUND_LOST_S:g} s")
+        complaint = self.parameters.complaint()
+        if complaint:
+            self.vehicle.say(Severity.CRITICAL, complaint)
         for message in self.telemetry.messages(now):
             self.stations.send(message)
         self.stations.deliver()
+
+    def _heartbeat(self, message: Any) -> list[Any]:
+        if message.type == mavlink.MAV_TYPE_GCS:
+            self.heard = self.now
+        return []
+
+    def _store(self, command: Command) -> list[Any]:
+        """Parameters are kept as they change; here it is awaited."""
+        if command.whole(1) not in (0, 1):
+            raise Denied("storage: param1 must be 1, to keep the parameters")
+        if self.vehicle.armed:
+            raise Refused("storage: not while armed; what changes is kept anyway")
+        if not self.parameters.flush():
+            raise Failed(self.parameters.complaint())
+        return []
 
     def _data_stream(self, message: Any) -> list[Any]:
         self.telemetry.set_stream(message.req_stream_id, message.req_message_rate if message.start_stop else 0.0)

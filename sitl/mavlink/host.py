@@ -18,9 +18,10 @@ from sitl.lift import Estimate
 from sitl.mavlink.flight_log import FlightLog
 from sitl.mavlink.ground import Ground
 from sitl.mavlink.lateness import Lateness
-from sitl.mavlink.plant_link import PlantLink, read_state
+from sitl.mavlink.lean import GPS, SENSOR, STATE
+from sitl.mavlink.plant_link import PlantLink, PlantState
 from sitl.mavlink.telemetry import Situation
-from sitl.modes import Refused, Severity, Vehicle
+from sitl.modes import Severity, Vehicle
 from sitl.sensors import SIZE, euler_angles
 
 SILENT_S = 0.9  # a plant that says nothing for so long is said to be silent
@@ -64,6 +65,7 @@ class Host:
         self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
         self.lateness = Lateness()
         self.measurement = np.zeros(SIZE)
+        euler_angles(*self.measurement[:4])  # compiled now, not in flight
         self.stamp = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
         self.heard = 0.0
@@ -72,16 +74,9 @@ class Host:
         self._told: dict[str, float] = {}
 
     def reboot(self) -> None:
-        """Put a new plant in the place of ours.
-
-        Raises
-        ------
-        Refused
-            When it is not ours.
-        """
-        if not self.plant.restart():
-            raise Refused("no reboot: the plant is another program")
-        self._lose("the plant starts again")
+        """Leave the plant and come back as another autopilot: it is put back at its start."""
+        self.plant.drop()
+        self._lose("the vehicle starts again")
 
     def run(self, ground: Ground) -> None:
         """Fly and serve ground stations, for ever; the plant comes first, and is found again when it goes away."""
@@ -114,7 +109,7 @@ class Host:
         self.heard = now
         self.stamp = -1
         self._periods = 0
-        self.situation.home = self.situation.state = None
+        self.situation.home = self.situation.imu = self.situation.fix = ()
         self.vehicle.plant_back()
 
     def _lose(self, why: str) -> None:
@@ -128,7 +123,7 @@ class Host:
         if plants and select.select(plants, [], [], 0)[0]:
             return True
         begin = time.monotonic()
-        ready = select.select([*plants, *ground.sockets], [], [], TURN_S)[0]
+        ready = select.select([*plants, *ground.stations.sockets], [], [], TURN_S)[0]
         end = time.monotonic()
         self.lateness.nothing_waits(end - begin, end)
         return self.plant.socket in ready
@@ -136,38 +131,38 @@ class Host:
     def _fly(self) -> None:
         """Answer what the plant says."""
         try:
-            for message in self.plant.receive():
-                kind = message.get_type()
-                if kind == "HIL_STATE_QUATERNION":
-                    self._period(message)
-                elif kind == "HIL_SENSOR":
-                    self.situation.imu = message
+            for kind, fields in self.plant.receive():
+                if kind is STATE:
+                    self._period(PlantState(*fields))
+                elif kind is SENSOR:
+                    self.situation.imu = fields
+                elif kind is GPS:
+                    self.situation.fix = fields
         except ConnectionError as error:
             self._lose(f"the plant is gone: {error}")
 
-    def _period(self, message: Any) -> None:
+    def _period(self, state: PlantState) -> None:
         """One control period; a repeated time is answered, not flown."""
         self.heard = time.monotonic()
-        if message.time_usec < self.stamp - CLOCK_BACK_US:
+        if state.stamp < self.stamp - CLOCK_BACK_US:
             self.vehicle.plant_lost("the plant has started anew")
             self._begin(self.heard)
         elif "plant" in self.vehicle.obstacles:
             del self.vehicle.obstacles["plant"]
             self.vehicle.say(Severity.INFO, "the plant is heard again")
-        if message.time_usec > self.stamp:
-            self.stamp = message.time_usec
-            self._compute(message)
+        if state.stamp > self.stamp:
+            self.stamp = state.stamp
+            self._compute(state)
         self.plant.answer(self.stamp, self.situation.row["commands"], self.vehicle.armed)
         self.lateness.answered()
 
-    def _compute(self, message: Any) -> None:
-        read_state(message, self.measurement)
+    def _compute(self, state: PlantState) -> None:
+        state.measure(self.measurement)
         now = 1e-6 * self.stamp
         autopilot, m = self.autopilot, self.measurement
         roll, pitch, yaw = euler_angles(m[0], m[1], m[2], m[3])
-        rates = (message.rollspeed, message.pitchspeed, message.yawspeed)
-        velocity = (-message.vz / 100, message.vx / 100, message.vy / 100)
-        estimate = Estimate(roll, pitch, yaw, rates, message.alt / 1000, *velocity)
+        velocity = (-state.vz / 100, state.vx / 100, state.vy / 100)
+        estimate = Estimate(roll, pitch, yaw, (state.p, state.q, state.r), state.alt / 1000, *velocity)
         demand = self.vehicle.step(now, estimate)
         self._note_arming()
         row = self.rows[0] if self.log is None else self.log.row(self.vehicle)
@@ -176,8 +171,8 @@ class Host:
         autopilot.controls["landed"] = self.vehicle.lift.landed
         tick(*autopilot.arguments()[:5], demand.collective, demand.altitude, m, row)
         situation = self.situation
-        situation.stamp, situation.row, situation.state = self.stamp, row, message
-        situation.home = situation.home or (message.lat, message.lon, message.alt)
+        situation.stamp, situation.row, situation.state = self.stamp, row, state
+        situation.home = situation.home or (state.lat, state.lon, state.alt)
         if self._periods % EXAMINED == 0 or row["fault"]:
             self._examine(int(row["fault"]))
         self._periods += 1

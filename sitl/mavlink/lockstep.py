@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.errors import SitlError
-from sitl.mavlink.link import LOOPBACK, Codec
-from sitl.mavlink.plant_link import actuator_controls, read_state
+from sitl.mavlink.lean import STATE, LeanCodec
+from sitl.mavlink.link import COMPONENT, LOOPBACK, SYSTEM
+from sitl.mavlink.plant_link import PlantState, actuator_controls
 from sitl.scenario import Scenario
 from sitl.sensors import SIZE
 
@@ -54,20 +54,21 @@ def fly(autopilot: Autopilot, scenario: Scenario, port: int) -> NDArray[Any]:
 
 def _exchange(autopilot: Autopilot, plant: socket.socket, record: NDArray[Any]) -> int:
     """Answer frames until the record is full; how many periods were flown. A repeated frame is answered, not flown."""
-    codec, measurement = Codec(), np.zeros(SIZE)
+    codec, measurement = LeanCodec(SYSTEM, COMPONENT), np.zeros(SIZE)
     count, stamp, answer = 0, -1, b""
     while count < len(record):
         data = plant.recv(65536)
         if not data:
             break
-        for message in codec.parse(data):
-            if message.get_id() != mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION or count == len(record):
+        for kind, fields in codec.parse(data):
+            if kind is not STATE or count == len(record):
                 continue
-            if message.time_usec > stamp:
-                stamp = message.time_usec
-                read_state(message, measurement)
+            state = PlantState(*fields)
+            if state.stamp > stamp:
+                stamp = state.stamp
+                state.measure(measurement)
                 tick(*autopilot.arguments(), measurement, record[count])
-                answer = codec.pack(actuator_controls(stamp, record[count]["commands"], True))
+                answer = actuator_controls(codec, stamp, record[count]["commands"], True)
                 count += 1
             plant.sendall(answer)
     return count

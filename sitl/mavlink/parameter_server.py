@@ -169,6 +169,19 @@ class ParameterServer:
             self.store.keep(self.kept)
         return None
 
+    def flush(self) -> bool:
+        """Write what was not kept yet; False: it failed."""
+        return self.store is None or self.store.flush()
+
+    def complaint(self) -> str:
+        """Why something could not be kept, told once; empty: all is well."""
+        return self.store.complaint() if self.store else ""
+
+    def close(self) -> None:
+        """Keep what was not kept yet."""
+        if self.store is not None:
+            self.store.close()
+
     @property
     def kept(self) -> dict[str, float]:
         """What a file holds: whose parameters they are, and what was changed."""

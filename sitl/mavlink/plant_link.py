@@ -5,15 +5,14 @@ from __future__ import annotations
 import errno
 import select
 import socket
-from collections.abc import Iterator
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.errors import SitlError
-from sitl.mavlink.link import LOOPBACK, Codec
+from sitl.mavlink.lean import ACTUATORS, LeanCodec, Message
+from sitl.mavlink.link import COMPONENT, LOOPBACK, SYSTEM
 from sitl.mavlink.plant_process import PlantProcess
 
 RETRY_S = 0.2  # between tries to connect
@@ -22,17 +21,38 @@ ARMED = 128
 LOCKSTEP = 1
 
 
-def read_state(message: Any, measurement: NDArray[np.float64]) -> None:
-    """HIL_STATE_QUATERNION as the measurement of `sitl.sensors`, (9,)."""
-    measurement[:4] = message.attitude_quaternion
-    measurement[4:7] = message.rollspeed, message.pitchspeed, message.yawspeed
-    measurement[7] = message.alt
-    measurement[8] = -message.vz
+class PlantState(NamedTuple):
+    """HIL_STATE_QUATERNION: us, rad/s, 1e-7 deg, mm, cm/s, cm/s, mG."""
+
+    stamp: int
+    qw: float
+    qx: float
+    qy: float
+    qz: float
+    p: float
+    q: float
+    r: float
+    lat: int
+    lon: int
+    alt: int
+    vx: int
+    vy: int
+    vz: int
+    indicated_airspeed: int
+    true_airspeed: int
+    ax: int
+    ay: int
+    az: int
+
+    def measure(self, out: NDArray[np.float64]) -> None:
+        """Fill a measurement as `sitl.sensors` has it, (9,)."""
+        out[:7] = self[1:8]
+        out[7], out[8] = self.alt, -self.vz
 
 
-def actuator_controls(stamp: int, commands: NDArray[np.float32], armed: bool) -> Any:
+def actuator_controls(codec: LeanCodec, stamp: int, commands: NDArray[np.float32], armed: bool) -> bytes:
     """HIL_ACTUATOR_CONTROLS: motor commands, (16,) thrust fractions, for the frame of a time (us)."""
-    return mavlink.MAVLink_hil_actuator_controls_message(stamp, commands.tolist(), ARMED if armed else 0, LOCKSTEP)
+    return codec.pack(ACTUATORS, stamp, LOCKSTEP, *commands.tolist(), ARMED if armed else 0)
 
 
 class PlantLink:
@@ -53,7 +73,7 @@ class PlantLink:
         self.child = plant if isinstance(plant, PlantProcess) else None
         self.address = None if isinstance(plant, PlantProcess) else plant
         self.socket: socket.socket | None = None
-        self.codec = Codec()
+        self.codec = LeanCodec(SYSTEM, COMPONENT)
         self._connecting: socket.socket | None = None
         self._next = 0.0
 
@@ -132,11 +152,11 @@ class PlantLink:
             if self.child is not None and not self.child.alive:
                 self.child.end()  # so that it is started again
             return False
-        self.codec = Codec()
+        self.codec = LeanCodec(SYSTEM, COMPONENT)
         self.socket = link
         return True
 
-    def receive(self) -> Iterator[Any]:
+    def receive(self) -> list[Message]:
         """Messages that have arrived.
 
         Raises
@@ -148,7 +168,7 @@ class PlantLink:
         try:
             data = self.socket.recv(65536)
         except BlockingIOError:
-            return iter(())
+            return []
         except OSError as error:
             self.drop()
             raise ConnectionError(str(error)) from error
@@ -161,11 +181,8 @@ class PlantLink:
         """Motor commands for the frame of a time; a plant that is gone is noticed when its next frame is awaited."""
         if self.socket is None:
             return
-        message = mavlink.MAVLink_hil_actuator_controls_message(
-            stamp, commands.tolist(), ARMED if armed else 0, LOCKSTEP
-        )
         try:
-            self.socket.sendall(self.codec.pack(message))
+            self.socket.sendall(actuator_controls(self.codec, stamp, commands, armed))
         except OSError:
             return
 
@@ -174,14 +191,6 @@ class PlantLink:
         if self.socket is not None:
             self.socket.close()
             self.socket = None
-
-    def restart(self) -> bool:
-        """Put a new plant in the place of our child; False: it is not ours."""
-        if self.child is None:
-            return False
-        self.drop()
-        self.child.end()
-        return True
 
     def close(self) -> None:
         """Leave the plant, and end our child."""

@@ -227,7 +227,8 @@ class Stations:
                     continue
                 for message, station in found:
                     station.heard = time.monotonic()
-                    yield message, station
+                    if not station.busy:
+                        yield message, station
                 if time.perf_counter() > end:
                     busy.clear()
                     break

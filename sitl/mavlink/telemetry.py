@@ -12,8 +12,10 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.autopilot import RECORD
 from sitl.mavlink.flight_modes import custom_mode
+from sitl.mavlink.plant_link import PlantState
 from sitl.modes import Mode, Severity, Vehicle
-from sitl.recorder import quaternions
+from sitl.plant import GRAVITY
+from sitl.recorder import EXCITATION_NAME, quaternions
 from sitl.setpoints import turned
 
 MAX_RATE = 250.0  # Hz, of one message
@@ -57,31 +59,31 @@ class Situation:
         The plant's clock at the last period.
     row : one of `sitl.autopilot.RECORD`
         What the autopilot saw and did then.
-    state, imu : HIL_STATE_QUATERNION, HIL_SENSOR or None
-        The plant's last ones.
-    home : (latitude, longitude, altitude) or None, 1e-7 deg, mm
-        Where the vehicle was first seen.
+    state : PlantState
+    imu, fix : tuple
+        Fields of the plant's last HIL_SENSOR and HIL_GPS, in wire order, see `sitl.mavlink.lean`; empty until then.
+    home : (latitude, longitude, altitude), 1e-7 deg, mm
+        Where the vehicle was first seen; empty until then.
     load : float
         Share of the period that is worked.
+    excited : int
+        Axis of the excitation: 0 roll, 1 pitch, 2 between them, -1 none.
     """
 
     vehicle: Vehicle
     stamp: int = -1
     row: Any = field(default_factory=lambda: np.zeros(1, RECORD)[0])
-    state: Any = None
-    imu: Any = None
-    home: tuple[int, int, int] | None = None
+    state: PlantState = PlantState(*[0] * 19)
+    imu: tuple[Any, ...] = ()
+    fix: tuple[Any, ...] = ()
+    home: tuple[int, ...] = ()
     load: float = 0.0
+    excited: int = -1
 
     @property
     def milliseconds(self) -> int:
         """Time since boot as messages carry it."""
         return max(self.stamp, 0) // 1000 % 2**32
-
-    @property
-    def flying(self) -> bool:
-        """Whether a plant has told anything yet."""
-        return self.state is not None and self.home is not None
 
     def local(self) -> tuple[float, ...]:
         """Position (m) and velocity (m/s), down positive: where motion capture sees it, else from home."""
@@ -90,7 +92,7 @@ class Situation:
             pose = vehicle.pose.value
             vx, vy = turned(estimate.north, estimate.east, estimate.yaw - pose.yaw)
             return pose.x, pose.y, pose.z, vx, vy, -estimate.climb
-        latitude, longitude, altitude = self.home or (0, 0, 0)
+        latitude, longitude, altitude = self.home
         metres = 1e-7 * 111_319.5
         east = metres * math.cos(math.radians(latitude * 1e-7))
         return (
@@ -153,17 +155,16 @@ def _local_position(s: Situation) -> Any:
 
 
 def _global_position(s: Situation) -> Any:
-    above = s.state.alt - s.home[2] if s.home else 0
+    above = s.state.alt - s.home[2]
     return mavlink.MAVLink_global_position_int_message(
         s.milliseconds, s.state.lat, s.state.lon, s.state.alt, above, s.state.vx, s.state.vy, s.state.vz, _heading(s)
     )
 
 
 def _gps_raw(s: Situation) -> Any:
-    speed = round(math.hypot(s.state.vx, s.state.vy))
-    course = round(math.degrees(math.atan2(s.state.vy, s.state.vx)) * 100) % 36000
+    stamp, latitude, longitude, altitude, eph, epv, speed, _, _, _, course, kind, satellites, *_ = s.fix
     return mavlink.MAVLink_gps_raw_int_message(
-        s.stamp, mavlink.GPS_FIX_TYPE_3D_FIX, s.state.lat, s.state.lon, s.state.alt, 100, 100, speed, course, 10
+        stamp, kind, latitude, longitude, altitude, eph, epv, speed, course, satellites
     )
 
 
@@ -177,28 +178,21 @@ def _vfr_hud(s: Situation) -> Any:
 
 def _altitude(s: Situation) -> Any:
     altitude, ground = s.vehicle.estimate.altitude, s.vehicle.lift.ground
-    home = s.home[2] / 1000 if s.home else 0.0
+    home = s.home[2] / 1000
     return mavlink.MAVLink_altitude_message(
         s.stamp, altitude, altitude, altitude - home, altitude - home, altitude - ground, altitude - ground
     )
 
 
 def _highres_imu(s: Situation) -> Any:
-    i = s.imu
-    return mavlink.MAVLink_highres_imu_message(
-        s.stamp,
-        *(i.xacc, i.yacc, i.zacc, i.xgyro, i.ygyro, i.zgyro, i.xmag, i.ymag, i.zmag),
-        *(i.abs_pressure, i.diff_pressure, i.pressure_alt, i.temperature, i.fields_updated & 0xFFFF),
-    )
+    return mavlink.MAVLink_highres_imu_message(*s.imu[:14], s.imu[14] & 0xFFFF)
 
 
 def _scaled_imu(s: Situation) -> Any:
-    i = s.imu
-    acceleration = (_int16(v / 9.80665 * 1000) for v in (i.xacc, i.yacc, i.zacc))
-    rates, field = (_int16(v * 1000) for v in (i.xgyro, i.ygyro, i.zgyro)), (i.xmag, i.ymag, i.zmag)
-    return mavlink.MAVLink_scaled_imu_message(
-        s.milliseconds, *acceleration, *rates, *(_int16(v * 1000) for v in field), _int16(i.temperature * 100)
-    )
+    imu = s.imu
+    acceleration = (_int16(value / GRAVITY * 1000) for value in imu[1:4])
+    rates_and_field = (_int16(value * 1000) for value in imu[4:10])
+    return mavlink.MAVLink_scaled_imu_message(s.milliseconds, *acceleration, *rates_and_field, _int16(imu[13] * 100))
 
 
 def _servo_output(s: Situation) -> Any:
@@ -222,7 +216,13 @@ def _battery(s: Situation) -> Any:
 
 
 def _home_position(s: Situation) -> Any:
-    return mavlink.MAVLink_home_position_message(*(s.home or (0, 0, 0)), 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+    return mavlink.MAVLink_home_position_message(*s.home, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
+
+
+def _excitation(s: Situation) -> Any:
+    """What is injected, as the firmware's module publishes it."""
+    roll, pitch, _ = _floats(s.row["excitation"])
+    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, max(s.stamp, 0), roll, pitch, float(s.excited))
 
 
 def _autopilot_version(s: Situation) -> Any:
@@ -234,12 +234,12 @@ Builder = Callable[[Situation], Any]
 
 @dataclass(frozen=True)
 class Topic:
-    """A message: how it is made, how often by default (Hz), and the data stream that it belongs to."""
+    """A message: how it is made, how often by default (Hz), its data stream, and what must be known for it."""
 
     build: Builder
     rate: float
     stream: int
-    needs: str = "state"
+    needs: str = "home"
 
 
 _STATUS, _POSITION = mavlink.MAV_DATA_STREAM_EXTENDED_STATUS, mavlink.MAV_DATA_STREAM_POSITION
@@ -260,10 +260,11 @@ TOPICS = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE_TARGET: Topic(_attitude_target, 5.0, _ATTITUDE),
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Topic(_local_position, 10.0, _POSITION),
     mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Topic(_global_position, 5.0, _POSITION),
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: Topic(_gps_raw, 2.0, _STATUS),
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: Topic(_gps_raw, 2.0, _STATUS, "fix"),
     mavlink.MAVLINK_MSG_ID_VFR_HUD: Topic(_vfr_hud, 5.0, _HUD),
     mavlink.MAVLINK_MSG_ID_ALTITUDE: Topic(_altitude, 5.0, _HUD),
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Topic(_highres_imu, 5.0, _RAW, "imu"),
+    mavlink.MAVLINK_MSG_ID_DEBUG_VECT: Topic(_excitation, 0.0, _OWN),
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: Topic(_scaled_imu, 0.0, _RAW, "imu"),
     mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: Topic(_servo_output, 5.0, _CONTROLLER),
 }
@@ -300,7 +301,7 @@ class Telemetry:
     def build(self, number: int) -> Any:
         """One message now; None when what it tells is not known."""
         topic = TOPICS[number]
-        if topic.needs and (self.situation.home is None or getattr(self.situation, topic.needs) is None):
+        if topic.needs and not getattr(self.situation, topic.needs):
             return None
         return topic.build(self.situation)
 
