@@ -65,15 +65,54 @@ def _load(airframe: str, gains: Path | None) -> tuple[Any, Any]:
 
 
 def experiment(
-    airframe: AirframeArgument,
-    out: Annotated[Path, typer.Option(help="Log to write (ULog, .ulg).")],
+    airframe: Annotated[str | None, typer.Argument(help="Airframe to simulate; or give --connect.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Log to write (ULog, .ulg); of a simulated flight.")] = None,
+    connect: Annotated[
+        str | None, typer.Option(help="Link to a vehicle that hovers under our controller; see upload.")
+    ] = None,
     gains: GainsOption = None,
+    axis: Annotated[str, typer.Option(help="roll, pitch, or both, one after the other.")] = "both",
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
     amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
     bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,
     seed: SeedOption = 0,
+    mode: Annotated[
+        str, typer.Option(help="Flight mode to excite in: hold, position, altitude, offboard; with --connect.")
+    ] = "hold",
+    tilt_deg: Annotated[float, typer.Option(help="Stop beyond this roll or pitch, degrees; with --connect.")] = 28.0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    timeout: Annotated[float, typer.Option(min=0.5, max=600, help="Silence of the vehicle that ends all, s.")] = 12.0,
+    signing_key: Annotated[Path | None, typer.Option(help="Key of the link; see upload.")] = None,
+    system: Annotated[int, typer.Option(min=0, max=255, help="The vehicle's system number; see upload.")] = 0,
+    as_json: JsonOption = False,
 ) -> None:
-    """Fly with a pseudo-random moment injected on roll, then on pitch, and log it."""
+    """Fly with a pseudo-random moment injected on roll, then on pitch, and log it.
+
+    Simulated in process; or with --connect on a vehicle in the air, whose own injector does it. That one is watched on
+    the way: tilt, flight mode, link and Ctrl-C end it, and its parameters are put back.
+    """
+    from sitl.errors import SitlError
+
+    if (airframe is None) == (connect is None):
+        raise SitlError("give either an airframe to simulate, or --connect to a vehicle")
+    if airframe is not None:
+        if out is None:
+            raise SitlError("--out: name the log to write, FILE.ulg")
+        _simulated_experiment(airframe, out, gains, seconds_per_axis, amplitude, bandwidth, seed)
+        return
+    if out is not None or gains is not None:
+        raise SitlError("--out, --gains: are of a simulated flight; a vehicle has its gains and writes its own log")
+    from sitl.mavlink.experiment_console import Choice
+    from sitl.mavlink.experiment_console import experiment as fly_experiment
+    from sitl.mavlink.session import Options
+
+    options = Options(connect or "", system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json)
+    fly_experiment(options, Choice(axis, seconds_per_axis, amplitude, bandwidth, seed, mode, tilt_deg))
+
+
+def _simulated_experiment(
+    airframe: str, out: Path, gains: Path | None, seconds: float, amplitude: float, bandwidth: float, seed: int
+) -> None:
     import numpy as np
 
     from sitl.autopilot import Autopilot
@@ -83,7 +122,7 @@ def experiment(
     from sitl.scenario import excitation_flight
 
     body, controller = _load(airframe, gains)
-    scenario = excitation_flight(seconds_per_axis, amplitude, bandwidth, controller.Ts, np.random.default_rng(seed))
+    scenario = excitation_flight(seconds, amplitude, bandwidth, controller.Ts, np.random.default_rng(seed))
     flight = fly_scenario(body, Autopilot(body, controller), scenario, seed)
     save_flight(out, flight, body, controller)
     tilt = np.degrees(np.abs(flight.truth["attitude"][:, :2]).max(axis=0))
