@@ -15,7 +15,7 @@ from sitl.mavlink.flight_modes import custom_mode
 from sitl.mavlink.plant_link import PlantState
 from sitl.modes import Mode, Severity, Vehicle
 from sitl.plant import GRAVITY
-from sitl.recorder import quaternions
+from sitl.recorder import EXCITATION_NAME, quaternions
 from sitl.setpoints import turned
 
 MAX_RATE = 250.0  # Hz, of one message
@@ -48,6 +48,9 @@ MODE_FLAGS = {
 }
 
 
+NOWHERE = PlantState(*[0] * 19)
+
+
 @dataclass
 class Situation:
     """All that telemetry is made from.
@@ -66,16 +69,19 @@ class Situation:
         Where the vehicle was first seen; empty until then.
     load : float
         Share of the period that is worked.
+    excited : int
+        Axis of the excitation: 0 roll, 1 pitch, 2 between them, -1 none.
     """
 
     vehicle: Vehicle
     stamp: int = -1
     row: Any = field(default_factory=lambda: np.zeros(1, RECORD)[0])
-    state: PlantState = PlantState(*[0] * 19)
+    state: PlantState = NOWHERE
     imu: tuple[Any, ...] = ()
     fix: tuple[Any, ...] = ()
     home: tuple[int, ...] = ()
     load: float = 0.0
+    excited: int = -1
 
     @property
     def milliseconds(self) -> int:
@@ -216,6 +222,12 @@ def _home_position(s: Situation) -> Any:
     return mavlink.MAVLink_home_position_message(*s.home, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
 
 
+def _excitation(s: Situation) -> Any:
+    """What is injected, as the firmware's module publishes it."""
+    roll, pitch, _ = _floats(s.row["excitation"])
+    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, max(s.stamp, 0), roll, pitch, float(s.excited))
+
+
 def _autopilot_version(s: Situation) -> Any:
     return mavlink.MAVLink_autopilot_version_message(CAPABILITIES, 0, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, 0)
 
@@ -255,6 +267,7 @@ TOPICS = {
     mavlink.MAVLINK_MSG_ID_VFR_HUD: Topic(_vfr_hud, 5.0, _HUD),
     mavlink.MAVLINK_MSG_ID_ALTITUDE: Topic(_altitude, 5.0, _HUD),
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Topic(_highres_imu, 5.0, _RAW, "imu"),
+    mavlink.MAVLINK_MSG_ID_DEBUG_VECT: Topic(_excitation, 0.0, _OWN),
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: Topic(_scaled_imu, 0.0, _RAW, "imu"),
     mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: Topic(_servo_output, 5.0, _CONTROLLER),
 }
