@@ -20,7 +20,7 @@ from sitl.mavlink.ground import Ground
 from sitl.mavlink.lateness import Lateness
 from sitl.mavlink.lean import GPS, SENSOR, STATE
 from sitl.mavlink.plant_link import PlantLink, PlantState
-from sitl.mavlink.telemetry import Situation
+from sitl.mavlink.situation import Situation
 from sitl.modes import Severity, Vehicle
 from sitl.sensors import SIZE, euler_angles
 

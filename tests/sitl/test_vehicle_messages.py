@@ -14,8 +14,10 @@ from sitl.mavlink.flight_modes import custom_mode
 from sitl.mavlink.link import Codec
 from sitl.mavlink.plant_link import PlantState
 from sitl.mavlink.protocols import PROTOCOLS
+from sitl.mavlink.situation import Situation
 from sitl.mavlink.steering import Steering
-from sitl.mavlink.telemetry import TOPICS, Situation, Telemetry, texts
+from sitl.mavlink.telemetry import Telemetry, texts
+from sitl.mavlink.topics import TOPICS
 from sitl.mavlink.vehicle_commands import VehicleCommands
 from sitl.modes import Mode, Refused, Severity, Vehicle
 from sitl.setpoints import Pose
