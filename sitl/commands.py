@@ -236,49 +236,12 @@ def sitl(
     ] = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
-    import signal
-
-    from sitl.autopilot import Autopilot
-    from sitl.injector import Injector
-    from sitl.mavlink.excitation import Excitation
-    from sitl.mavlink.flight_log import FlightLog
-    from sitl.mavlink.ground import Ground
-    from sitl.mavlink.host import Host
-    from sitl.mavlink.parameter_server import ParameterServer
-    from sitl.mavlink.parameter_store import ParameterStore
-    from sitl.mavlink.plant_link import PlantLink
-    from sitl.mavlink.plant_process import PlantProcess
-    from sitl.mavlink.signing import Signer, read_key
-    from sitl.mavlink.stations import Stations
-    from sitl.mavlink.telemetry import Telemetry
-    from sitl.mavlink.vehicle_commands import VehicleCommands
+    from sitl.mavlink.sitl_console import Options, run
 
     body, controller = _load(airframe, gains)
-    times = _times(speed)
-    link = PlantLink(_address(plant) if plant else PlantProcess(airframe, port, controller.Ts, seed, times))
-    autopilot = Autopilot(body, controller)
-    autopilot.warm_up()
-    host = Host(autopilot, link, FlightLog(log, body, controller.Ts) if log else None)
-    telemetry = Telemetry(host.situation)
-    commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
-    signer = Signer(read_key(signing_key)) if signing_key else None
-    stations = Stations(ground_port, vehicle_port, tcp_port, bind, signer)
-    injector = Injector(controller.Ts)
-    host.excitation = Excitation(injector, host.situation)
-    store = ParameterStore(parameters) if parameters else None
-    server = ParameterServer(autopilot.controller, controller, injector, store)
-    ground = Ground(server, commands, telemetry, stations)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # logs are written then, too
-    try:
-        link.wait_for_child()
-        if server.summary:
-            print(server.summary)
-        print(f"{body.name}: {stations}, plant {link.place}; Ctrl-C ends", flush=True)
-        host.run(ground)
-    except KeyboardInterrupt:
-        print(f"ended: {host.lateness}")
-    finally:
-        host.close(ground)
+    address = _address(plant) if plant else None
+    links = (ground_port, vehicle_port, tcp_port, bind, signing_key)
+    run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log))
 
 
 def plant(

@@ -232,8 +232,6 @@ class Host:
         if len(self._told) > 100:
             self._told.clear()
 
-    def close(self, ground: Ground) -> Path | None:
-        """Leave the plant and the ground stations; the log that was written, if any."""
-        self.plant.close()
-        ground.close()
+    def leave(self) -> Path | None:
+        """Nobody flies any more: the log that was written, if any."""
         return None if self.log is None else self.log.save()
