@@ -22,6 +22,7 @@ from sitl.mavlink.lean import GPS, SENSOR, STATE
 from sitl.mavlink.plant_link import PlantLink, PlantState
 from sitl.mavlink.situation import Situation
 from sitl.modes import Severity, Vehicle
+from sitl.scripted_pilot import ScriptedPilot
 from sitl.sensors import SIZE, euler_angles
 
 SILENT_S = 0.9  # a plant that says nothing for so long is said to be silent
@@ -54,6 +55,8 @@ class Host:
         What telemetry shows.
     excitation : callable
         May be replaced.
+    pilot : ScriptedPilot or None
+        Flies in place of a ground station.
     lateness : Lateness
         How long frames of the plant wait.
     """
@@ -64,6 +67,7 @@ class Host:
         self.vehicle.obstacles["plant"] = "no plant is connected"
         self.situation = Situation(self.vehicle)
         self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
+        self.pilot: ScriptedPilot | None = None
         self.lateness = Lateness()
         self.measurement = np.zeros(SIZE)
         euler_angles(*self.measurement[:4])  # compiled now, not in flight
@@ -80,8 +84,11 @@ class Host:
         self._lose("the vehicle starts again")
 
     def run(self, ground: Ground) -> None:
-        """Fly and serve ground stations, for ever; the plant comes first, and is found again when it goes away."""
-        while True:
+        """Fly and serve ground stations, for ever or until `pilot` is done.
+
+        The plant comes first, and is found again when it goes away.
+        """
+        while self.pilot is None or not self.pilot.done:
             now = time.monotonic()
             self._connect(now)
             if self._wait(ground):
@@ -172,6 +179,8 @@ class Host:
         roll, pitch, yaw = euler_angles(m[0], m[1], m[2], m[3])
         velocity = (-state.vz / 100, state.vx / 100, state.vy / 100)
         estimate = Estimate(roll, pitch, yaw, (state.p, state.q, state.r), state.alt / 1000, *velocity)
+        if self.pilot is not None:
+            self.pilot.steer(self.vehicle)
         demand = self.vehicle.step(now, estimate)
         self._note_arming()
         row = self.rows[0] if self.log is None else self.log.row(self.vehicle)
