@@ -73,6 +73,7 @@ class Host:
         euler_angles(*self.measurement[:4])  # compiled now, not in flight
         self.stamp = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
+        self.fixed = autopilot.arguments()[:5]
         self.heard = self._news = 0.0
         self._connected = False
         self._periods = self._first = 0
@@ -91,14 +92,15 @@ class Host:
         while self.pilot is None or not self.pilot.done:
             now = time.monotonic()
             self._connect(now)
-            if self._wait(ground):
+            plant_speaks, ground_speaks = self._wait(ground)
+            if plant_speaks:
                 self._fly()
             elif self._connected and now > self.heard + SILENT_S and "plant" not in self.vehicle.obstacles:
                 self.vehicle.obstacles["plant"] = f"the plant has been silent for {SILENT_S:g} s"
                 self.vehicle.say(Severity.CRITICAL, self.vehicle.obstacles["plant"])
+            if ground_speaks:
+                ground.receive(now)
             self._pass_on(now)
-            ground.receive(now)
-            self.situation.load = self.lateness.load
             self._tell(ground, now)
             ground.send(now)
 
@@ -130,19 +132,22 @@ class Host:
 
     def _lose(self, why: str) -> None:
         self._connected = False
+        self.situation.home = ()  # what was known of it holds no more
         self.vehicle.plant_lost(why)
         self._note_arming()
 
-    def _wait(self, ground: Ground) -> bool:
-        """Wait for anything; True when the plant has something to say."""
-        plants = [self.plant.socket] if self.plant.socket is not None else []
-        if plants and select.select(plants, [], [], 0)[0]:
-            return True
-        begin = time.monotonic()
-        ready = select.select([*plants, *ground.stations.sockets], [], [], TURN_S)[0]
-        end = time.monotonic()
-        self.lateness.nothing_waits(end - begin, end)
-        return self.plant.socket in ready
+    def _wait(self, ground: Ground) -> tuple[bool, bool]:
+        """Wait for anything; whether the plant and whether ground stations have something to say."""
+        plant = self.plant.socket
+        everybody = [*ground.stations.sockets, *([] if plant is None else [plant])]
+        ready = select.select(everybody, [], [], 0)[0]
+        if not ready:
+            begin = time.monotonic()
+            ready = select.select(everybody, [], [], TURN_S)[0]
+            end = time.monotonic()
+            self.lateness.nothing_waits(end - begin, end)
+        speaks = plant in ready
+        return speaks, len(ready) > speaks
 
     def _fly(self) -> None:
         """Answer what the plant says."""
@@ -171,6 +176,7 @@ class Host:
             self._compute(state)
         self.plant.answer(self.stamp, self.situation.row["commands"], self.vehicle.armed)
         self.lateness.answered()
+        self.situation.load = self.lateness.load
 
     def _compute(self, state: PlantState) -> None:
         state.measure(self.measurement)
@@ -187,7 +193,7 @@ class Host:
         row["setpoint"] = demand[:3]
         row["excitation"] = self.excitation(now)
         autopilot.controls["landed"] = self.vehicle.lift.landed
-        tick(*autopilot.arguments()[:5], demand.collective, demand.altitude, m, row)
+        tick(*self.fixed, demand.collective, demand.altitude, m, row)
         situation = self.situation
         situation.stamp, situation.row, situation.state = self.stamp, row, state
         situation.home = situation.home or (state.lat, state.lon, state.alt)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import signal
 import time
 from contextlib import ExitStack
@@ -85,6 +86,8 @@ def run(options: Options) -> None:
     with ExitStack() as leaving:
         host, ground = _assemble(options, leaving)
         print(f"{options.airframe.name}: {ground.stations}, plant {host.plant.place}; Ctrl-C ends", flush=True)
+        gc.collect()
+        gc.freeze()  # what is there stays: collecting it again and again would hold up the loop
         begin = time.monotonic()
         try:
             host.run(ground)
@@ -107,7 +110,8 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
         link.child.start()  # it comes up while we compile
     autopilot = Autopilot(options.airframe, gains)
     autopilot.warm_up()
-    host = Host(autopilot, link, FlightLog(options.log, options.airframe, gains.Ts) if options.log else None)
+    log = FlightLog(options.log, options.airframe, gains.Ts) if options.log else None
+    host = Host(autopilot, link, log)
     telemetry = Telemetry(host.situation)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
     injector = Injector(gains.Ts)
