@@ -102,7 +102,10 @@ class Pilot:
         """One message, if there is one."""
         message = self.link.recv_match(blocking=True, timeout=timeout)
         if message is not None and message.get_type() == "STATUSTEXT":
-            self.texts.append(message.text)
+            if message.chunk_seq and self.texts:  # the rest of a long one
+                self.texts[-1] += message.text
+            else:
+                self.texts.append(message.text)
         if message is not None and message.get_type() == "HEARTBEAT":
             self.beat = message
             self.beats += 1
