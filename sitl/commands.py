@@ -236,6 +236,8 @@ def sitl(
     ] = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
+    import signal
+
     from sitl.autopilot import Autopilot
     from sitl.injector import Injector
     from sitl.mavlink.excitation import Excitation
@@ -266,6 +268,7 @@ def sitl(
     store = ParameterStore(parameters) if parameters else None
     server = ParameterServer(autopilot.controller, controller, injector, store)
     ground = Ground(server, commands, telemetry, stations)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # logs are written then, too
     try:
         link.wait_for_child()
         if server.summary:
@@ -288,10 +291,14 @@ def plant(
     ] = 0.0,
     seed: SeedOption = 0,
     child: Annotated[bool, typer.Option("--child", help="End when standard input is closed.")] = False,
+    serial: Annotated[
+        str | None, typer.Option(help="DEVICE,BAUD of a board in HITL mode, in place of the TCP port; in real time.")
+    ] = None,
 ) -> None:
-    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot after another."""
+    """Serve the plant alone over PX4's simulator API to one autopilot after another, in lockstep over TCP."""
     from sitl.airframe import load_airframe
     from sitl.errors import SitlError
+    from sitl.mavlink.hitl import SerialPlant
     from sitl.mavlink.link import LOOPBACK, listen
     from sitl.mavlink.plant_server import PlantServer
     from sitl.mavlink.simulator import SimulatedVehicle
@@ -303,10 +310,16 @@ def plant(
     def tell(text: str) -> None:
         print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
 
+    if serial and times != 1.0:
+        raise SitlError(f"--speed {speed}: a board on a serial port flies in real time")
     vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell)
-    with listen(LOOPBACK, port) as socket:
-        print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
-        try:
+    try:
+        if serial:
+            board = SerialPlant(vehicle, serial)
+            print(f"plant of {airframe} speaks on {serial}", flush=True)
+            board.serve()
+        with listen(LOOPBACK, port) as socket:
+            print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
             PlantServer(vehicle, socket, times, child).serve()
-        except KeyboardInterrupt:
-            pass
+    except KeyboardInterrupt:
+        pass

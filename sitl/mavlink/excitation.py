@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sitl.injector import Conditions, Injector, Moment
 from sitl.mavlink.flight_modes import NAV_STATES
-from sitl.mavlink.telemetry import Situation
+from sitl.mavlink.situation import Situation
 from sitl.modes import Severity
 from sitl.setpoints import Sticks
 

@@ -20,11 +20,12 @@ from sitl.mavlink.ground import Ground
 from sitl.mavlink.lateness import Lateness
 from sitl.mavlink.lean import GPS, SENSOR, STATE
 from sitl.mavlink.plant_link import PlantLink, PlantState
-from sitl.mavlink.telemetry import Situation
+from sitl.mavlink.situation import Situation
 from sitl.modes import Severity, Vehicle
 from sitl.sensors import SIZE, euler_angles
 
 SILENT_S = 0.9  # a plant that says nothing for so long is said to be silent
+NEWS_S = 0.2  # between looks at what our own plant tells
 TURN_S = 0.01  # longest wait for anything
 CLOCK_BACK_US = 1_000_000  # a plant whose time goes back by more has started anew
 EXAMINED = 250  # periods between examinations of what forbids arming
@@ -68,7 +69,7 @@ class Host:
         euler_angles(*self.measurement[:4])  # compiled now, not in flight
         self.stamp = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
-        self.heard = 0.0
+        self.heard = self._news = 0.0
         self._connected = False
         self._periods = self._first = 0
         self._told: dict[str, float] = {}
@@ -88,10 +89,18 @@ class Host:
             elif self._connected and now > self.heard + SILENT_S and "plant" not in self.vehicle.obstacles:
                 self.vehicle.obstacles["plant"] = f"the plant has been silent for {SILENT_S:g} s"
                 self.vehicle.say(Severity.CRITICAL, self.vehicle.obstacles["plant"])
+            self._pass_on(now)
             ground.receive(now)
             self.situation.load = self.lateness.load
             self._tell(ground, now)
             ground.send(now)
+
+    def _pass_on(self, now: float) -> None:
+        """What our own plant tells, such as a crash."""
+        if self.plant.child is not None and now >= self._news:
+            self._news = now + NEWS_S
+            for text in self.plant.child.news():
+                self.vehicle.say(Severity.WARNING, text)
 
     def _connect(self, now: float) -> None:
         if self._connected:

@@ -10,7 +10,8 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.mavlink.flight_modes import mode_of, mode_of_pair
-from sitl.mavlink.telemetry import TOPICS, Telemetry
+from sitl.mavlink.telemetry import Telemetry
+from sitl.mavlink.topics import TOPICS
 from sitl.modes import Denied, Failed, Mode, Refused, Severity, Vehicle
 
 FORCE = 21196  # param2 of arm and disarm: override
