@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import select
 import time
 from collections.abc import Callable, Sequence
@@ -81,6 +82,8 @@ class Host:
 
     def run(self, ground: Ground) -> None:
         """Fly and serve ground stations, for ever; the plant comes first, and is found again when it goes away."""
+        gc.collect()
+        gc.freeze()  # or looking through all that was imported would take 70 ms of a flight, now and then
         while True:
             now = time.monotonic()
             self._connect(now)
