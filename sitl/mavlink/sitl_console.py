@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import signal
 import time
 from contextlib import ExitStack
@@ -86,8 +85,6 @@ def run(options: Options) -> None:
     with ExitStack() as leaving:
         host, ground = _assemble(options, leaving)
         print(f"{options.airframe.name}: {ground.stations}, plant {host.plant.place}; Ctrl-C ends", flush=True)
-        gc.collect()
-        gc.freeze()  # what is there stays: collecting it again and again would hold up the loop
         begin = time.monotonic()
         try:
             host.run(ground)

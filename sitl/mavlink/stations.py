@@ -16,8 +16,9 @@ from sitl.mavlink.link import COMPONENT, KINDS, LOOPBACK, SYSTEM, Codec, listen,
 from sitl.mavlink.signing import Signer
 
 TCP_PORT = 5760
-#: Time that one call of `Stations.receive` may take, and one of `Stations.deliver`, s: an eighth of a control period.
-BUDGET_S = 0.0005
+#: Time that one call of `Stations.receive` may take, and one of `Stations.deliver`, s: an eighth of a control period;
+#: and the time from one reading to the next, whatever the simulation's speed.
+BUDGET_S, PACE_S = 0.0005, 0.002
 #: Answers that a station is sent in one call, and how many may wait: what it asks then is not heard.
 SHARE, MAX_ANSWERS = 8, 100
 #: Most stations of one kind, and the silence (s) after which one of them gives way to another.
@@ -164,6 +165,7 @@ class Stations:
         self.by_address: dict[Address, UdpStation] = {self.first: UdpStation(self._codec(), self.udp, self.first)}
         self.connected: list[TcpStation] = []
         self.from_udp = self._read_udp()
+        self.next = 0.0
 
     def _codec(self) -> Codec:
         return Codec(signer=self.signer, wanted=self.wanted)
@@ -173,11 +175,6 @@ class Stations:
         host, udp = self.udp.getsockname()
         others = f"others on {host}, UDP {udp} and TCP {self.tcp.getsockname()[1]}"
         return f"ground station on UDP {self.first[1]}, {others}{', signed' if self.signer else ''}"
-
-    @property
-    def sockets(self) -> list[socket.socket]:
-        """What becomes readable when there is something to receive."""
-        return [self.udp, self.tcp, *(station.link for station in self.connected)]
 
     def close(self) -> None:
         """Release the ports."""
@@ -216,7 +213,10 @@ class Stations:
 
     def receive(self) -> Iterator[Heard]:
         """What stations say to this vehicle, one message of each in turn, until nothing is left or the time is up."""
-        end = time.perf_counter() + BUDGET_S
+        now = time.perf_counter()
+        if now < self.next:
+            return
+        self.next, end = now + PACE_S, now + BUDGET_S
         self._admit()
         busy = [self.from_udp, *(station.reader for station in self.connected)]
         while busy:
