@@ -139,9 +139,11 @@ class Pilot:
     def ready(self):
         """Wait until the vehicle can be armed."""
         self.wait(
-            lambda: (m := self.take()) is not None
-            and m.get_type() == "SYS_STATUS"
-            and m.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK
+            lambda: (
+                (m := self.take()) is not None
+                and m.get_type() == "SYS_STATUS"
+                and m.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK
+            )
         )
 
     def flies(self, mode, seconds=60.0):

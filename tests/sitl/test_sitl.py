@@ -210,4 +210,3 @@ def test_real_time_is_kept():
             last = pilot.asks("ATTITUDE").time_boot_ms
         assert (last - first) / 1000 / (time.monotonic() - begin) == pytest.approx(1.0, abs=0.1)
         pilot.close()
-
