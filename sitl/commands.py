@@ -65,15 +65,54 @@ def _load(airframe: str, gains: Path | None) -> tuple[Any, Any]:
 
 
 def experiment(
-    airframe: AirframeArgument,
-    out: Annotated[Path, typer.Option(help="Log to write (ULog, .ulg).")],
+    airframe: Annotated[str | None, typer.Argument(help="Airframe to simulate; or give --connect.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Log to write (ULog, .ulg); of a simulated flight.")] = None,
+    connect: Annotated[
+        str | None, typer.Option(help="Link to a vehicle that hovers under our controller; see upload.")
+    ] = None,
     gains: GainsOption = None,
+    axis: Annotated[str, typer.Option(help="roll, pitch, or both, one after the other.")] = "both",
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
     amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
     bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,
     seed: SeedOption = 0,
+    mode: Annotated[
+        str, typer.Option(help="Flight mode to excite in: hold, position, altitude, offboard; with --connect.")
+    ] = "hold",
+    tilt_deg: Annotated[float, typer.Option(help="Stop beyond this roll or pitch, degrees; with --connect.")] = 28.0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    timeout: Annotated[float, typer.Option(min=0.5, max=600, help="Silence of the vehicle that ends all, s.")] = 12.0,
+    signing_key: Annotated[Path | None, typer.Option(help="Key of the link; see upload.")] = None,
+    system: Annotated[int, typer.Option(min=0, max=255, help="The vehicle's system number; see upload.")] = 0,
+    as_json: JsonOption = False,
 ) -> None:
-    """Fly with a pseudo-random moment injected on roll, then on pitch, and log it."""
+    """Fly with a pseudo-random moment injected on roll, then on pitch, and log it.
+
+    Simulated in process; or with --connect on a vehicle in the air, whose own injector does it. That one is watched on
+    the way: tilt, flight mode, link and Ctrl-C end it, and its parameters are put back.
+    """
+    from sitl.errors import SitlError
+
+    if (airframe is None) == (connect is None):
+        raise SitlError("give either an airframe to simulate, or --connect to a vehicle")
+    if airframe is not None:
+        if out is None:
+            raise SitlError("--out: name the log to write, FILE.ulg")
+        _simulated_experiment(airframe, out, gains, seconds_per_axis, amplitude, bandwidth, seed)
+        return
+    if out is not None or gains is not None:
+        raise SitlError("--out, --gains: are of a simulated flight; a vehicle has its gains and writes its own log")
+    from sitl.mavlink.experiment_console import Choice
+    from sitl.mavlink.experiment_console import experiment as fly_experiment
+    from sitl.mavlink.session import Options
+
+    options = Options(connect or "", system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json)
+    fly_experiment(options, Choice(axis, seconds_per_axis, amplitude, bandwidth, seed, mode, tilt_deg))
+
+
+def _simulated_experiment(
+    airframe: str, out: Path, gains: Path | None, seconds: float, amplitude: float, bandwidth: float, seed: int
+) -> None:
     import numpy as np
 
     from sitl.autopilot import Autopilot
@@ -83,7 +122,7 @@ def experiment(
     from sitl.scenario import excitation_flight
 
     body, controller = _load(airframe, gains)
-    scenario = excitation_flight(seconds_per_axis, amplitude, bandwidth, controller.Ts, np.random.default_rng(seed))
+    scenario = excitation_flight(seconds, amplitude, bandwidth, controller.Ts, np.random.default_rng(seed))
     flight = fly_scenario(body, Autopilot(body, controller), scenario, seed)
     save_flight(out, flight, body, controller)
     tilt = np.degrees(np.abs(flight.truth["attitude"][:, :2]).max(axis=0))
@@ -174,11 +213,21 @@ def sitl(
     ground_port: Annotated[
         int, typer.Option(min=1, max=65535, help="UDP port where the ground station listens.")
     ] = 14550,
-    vehicle_port: Annotated[int, typer.Option(min=0, max=65535, help="Local UDP port of the vehicle.")] = 18570,
-    tcp_port: Annotated[int, typer.Option(min=0, max=65535, help="Local TCP port of the vehicle; 0: any.")] = 5760,
-    bind: Annotated[str, typer.Option(help="Local address of both.")] = "127.0.0.1",
+    vehicle_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="UDP port where ground stations may speak first; 0: any.")
+    ] = 18570,
+    tcp_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="TCP port where ground stations connect; 0: any.")
+    ] = 5760,
+    bind: Annotated[
+        str, typer.Option(help="Local address of both; 0.0.0.0: all, and whoever reaches it commands the vehicle.")
+    ] = "127.0.0.1",
     signing_key: Annotated[
-        Path | None, typer.Option(help="File of 32 bytes: everything is signed, nothing unsigned is heard.")
+        Path | None, typer.Option(help="Sign with this key (32 bytes or 64 hexadecimal digits), hear nothing unsigned.")
+    ] = None,
+    parameters: Annotated[
+        Path | None,
+        typer.Option(help="Keep here what ground stations change; at the next start it outranks the gains."),
     ] = None,
     speed: SpeedOption = "1",
     seed: SeedOption = 0,
@@ -187,45 +236,12 @@ def sitl(
     ] = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
-    import signal
-
-    from sitl.autopilot import Autopilot
-    from sitl.mavlink.flight_log import FlightLog
-    from sitl.mavlink.ground import Ground
-    from sitl.mavlink.host import Host
-    from sitl.mavlink.parameter_server import ParameterServer
-    from sitl.mavlink.plant_link import PlantLink
-    from sitl.mavlink.plant_process import PlantProcess
-    from sitl.mavlink.signing import Signer, read_key
-    from sitl.mavlink.stations import Stations
-    from sitl.mavlink.telemetry import Telemetry
-    from sitl.mavlink.vehicle_commands import VehicleCommands
+    from sitl.mavlink.sitl_console import Options, run
 
     body, controller = _load(airframe, gains)
-    times = _times(speed)
-    link = PlantLink(_address(plant) if plant else PlantProcess(airframe, port, controller.Ts, seed, times))
-    autopilot = Autopilot(body, controller)
-    autopilot.warm_up()
-    host = Host(autopilot, link, FlightLog(log, body, controller.Ts) if log else None)
-    telemetry = Telemetry(host.situation)
-    commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
-    signer = Signer(read_key(signing_key)) if signing_key else None
-    parameters = ParameterServer(autopilot.controller, controller)
-    ground = Ground(
-        parameters,
-        commands,
-        telemetry,
-        lambda wanted: Stations(ground_port, vehicle_port, tcp_port, bind, signer, wanted),
-    )
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # logs are written then, too
-    try:
-        link.wait_for_child()
-        print(f"{body.name}: ground station on UDP {ground_port}, plant {link.place}; Ctrl-C ends", flush=True)
-        host.run(ground)
-    except KeyboardInterrupt:
-        print(f"ended: {host.lateness}")
-    finally:
-        host.close(ground)
+    address = _address(plant) if plant else None
+    links = (ground_port, vehicle_port, tcp_port, bind, signing_key)
+    run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log))
 
 
 def plant(

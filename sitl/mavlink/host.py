@@ -20,7 +20,7 @@ from sitl.mavlink.ground import Ground
 from sitl.mavlink.lateness import Lateness
 from sitl.mavlink.lean import GPS, SENSOR, STATE
 from sitl.mavlink.plant_link import PlantLink, PlantState
-from sitl.mavlink.telemetry import Situation
+from sitl.mavlink.situation import Situation
 from sitl.modes import Severity, Vehicle
 from sitl.sensors import SIZE, euler_angles
 
@@ -232,8 +232,6 @@ class Host:
         if len(self._told) > 100:
             self._told.clear()
 
-    def close(self, ground: Ground) -> Path | None:
-        """Leave the plant and the ground stations; the log that was written, if any."""
-        self.plant.close()
-        ground.close()
+    def leave(self) -> Path | None:
+        """Nobody flies any more: the log that was written, if any."""
         return None if self.log is None else self.log.save()

@@ -79,7 +79,7 @@ def running_sitl(*extra, **keywords):
     program = mimopilot("sitl", "adam0", *ports, *extra, **keywords)
     program.udp, program.tcp = udp, tcp
     try:
-        program.until("Ctrl-C ends")
+        program.until("Ctrl-C ends", 120)  # a first start compiles
         yield program
     finally:
         program.end()

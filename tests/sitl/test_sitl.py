@@ -13,6 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from pyulog import ULog
 
+from codegen.parameters import EXCITATION, IDENTITY, PARAMETERS
 from sitl.mavlink.flight_modes import custom_mode
 from sitl.modes import Mode
 from tests.sitl.running import Pilot, Program, free_port, mimopilot, running_sitl
@@ -43,7 +44,7 @@ class Sender:
 
 
 def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logged(tmp_path):
-    with running_sitl("--speed", "2", "--log", tmp_path / "flight.ulg") as sitl:
+    with running_sitl("--speed", "4", "--log", tmp_path / "flight.ulg") as sitl:
         pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
         assert not pilot.armed()
         pilot.ready()
@@ -57,14 +58,14 @@ def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logg
         pilot.flies(Mode.HOLD)
         assert pilot.armed()
         assert pilot.command(ARM, 0) == TEMPORARILY_REJECTED  # in the air
-        sender = Sender(pilot, 0.02)
+        sender = Sender(pilot, 0.01)
         time.sleep(0.1)
         assert pilot.command(SET_MODE, 1, 6) == ACCEPTED
         rolls = []
         pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, 10_000)
         for roll in (0.3, -0.3, 0.0):
             sender.roll = roll
-            end = time.monotonic() + 0.4
+            end = time.monotonic() + 0.2
             while time.monotonic() < end:
                 message = pilot.take()
                 if message is not None and message.get_type() == "ATTITUDE":
@@ -178,12 +179,12 @@ def test_somebody_elses_plant_is_waited_for_and_found_again():
 
 @pytest.mark.parametrize("way", ["udp", "tcp"])
 def test_mavproxy_connects_without_an_error_sets_parameters_and_flies(tmp_path, way):
-    with running_sitl("--speed", "3") as sitl:
+    with running_sitl("--speed", "5") as sitl:
         address = f"udp:127.0.0.1:{sitl.udp}" if way == "udp" else f"tcp:127.0.0.1:{sitl.tcp}"
         modules = "--default-modules=param,link,arm,mode,cmdlong"
         proxy = Program(sys.executable, "-m", "MAVProxy.mavproxy", f"--master={address}", modules, cwd=tmp_path)
         try:
-            proxy.until("Received 39 parameters")
+            proxy.until(f"Received {len(PARAMETERS + IDENTITY + EXCITATION)} parameters")
             for word in ("rror", "imeout", "raceback"):
                 assert word not in proxy.output.replace("no tty", "")
             proxy.say("param set MIMO_RP_RR 0.12")
