@@ -135,7 +135,7 @@ class SimulatedVehicle:
             f"tilted by {tilt:.0f} deg (at most 60); it lies there with stopped motors until an autopilot connects anew"
         )
 
-    def messages(self, truth: bool = True) -> bytes:
+    def messages(self, estimate: bool = True) -> bytes:
         """HIL_SENSOR, HIL_GPS when it is due and, if wanted, HIL_STATE_QUATERNION of now."""
         stamp, state = self.stamp, self.simulator.state
         readings = self.instruments.read(state)
@@ -145,7 +145,7 @@ class SimulatedVehicle:
             fix = self.instruments.fix(state)
             said = (fix.speed, fix.north, fix.east, fix.down, fix.course, FIX_3D, SATELLITES, 0, 0)
             data += self.codec.pack(GPS, stamp, *fix.place, GPS_EPH, GPS_EPV, *said)
-        if truth:
+        if estimate:
             seen = self.simulator.seen.tolist()
             x, y, z, vx, vy = state[:5].tolist()
             latitude, longitude, _ = place(x, y, z)
