@@ -58,11 +58,6 @@ class Ground:
         stations.hear(*self.answers)
         commands.handlers[mavlink.MAV_CMD_PREFLIGHT_STORAGE] = self._store
 
-    def close(self) -> None:
-        """Release the ports, and write what is to be kept."""
-        self.stations.close()
-        self.parameters.close()
-
     def receive(self, now: float) -> None:
         """Take some of the messages that have arrived; `now` is a monotonic time in s."""
         self.now = now

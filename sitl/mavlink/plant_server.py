@@ -22,6 +22,7 @@ FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is
 LOOK_S = 0.2  # between looks at everything but the autopilot
 FROZEN_S = 1.0  # without an answer
 MUTE_S = 10.0  # without the first one
+LOCKSTEP = 1  # flag of HIL_ACTUATOR_CONTROLS
 
 
 class ParentGoneError(Exception):
@@ -112,7 +113,7 @@ class Lockstep:
     def __init__(self, server: PlantServer, connection: socket.socket) -> None:
         self.server, self.vehicle, self.connection = server, server.vehicle, connection
         self.spin = SPIN_S if server.speed is None else 0.0
-        self.garbage = False
+        self.told: set[str] = set()
         connection.setblocking(False)
 
     def fly(self) -> None:
@@ -143,7 +144,7 @@ class Lockstep:
         """Offer the start until it is answered."""
         vehicle = self.vehicle
         begin = time.monotonic()
-        booting, told = False, False
+        booting = False
         frame = vehicle.messages()
         self.connection.sendall(frame)
         pace = vehicle.Ts / (self.server.speed or 1.0)
@@ -152,12 +153,13 @@ class Lockstep:
             for kind, fields in self._receive(due):
                 if kind is not ACTUATORS:
                     booting = True
+                elif not fields[1] & LOCKSTEP:
+                    self._tell_once("motor commands came without the lockstep flag: the autopilot must keep lockstep")
                 elif fields[0] >= vehicle.stamp:
                     return fields
             now = time.monotonic()
-            if now > begin + MUTE_S and not told:
-                told = True
-                vehicle.tell(f"no HIL_ACTUATOR_CONTROLS in {MUTE_S:g} s: is that an autopilot in simulation?")
+            if now > begin + MUTE_S:
+                self._tell_once(f"no HIL_ACTUATOR_CONTROLS in {MUTE_S:g} s: is that an autopilot in simulation?")
             if now >= due:
                 if booting:
                     vehicle.stand()
@@ -188,10 +190,10 @@ class Lockstep:
     def _receive(self, until: float) -> list[Message]:
         """What came, as soon as something comes; nothing when the time is over."""
         while True:
+            now = time.monotonic()
+            self.server.look_around(now)
             data = receive(self.connection, self.spin)
             if data is None:
-                now = time.monotonic()
-                self.server.look_around(now)
                 if now >= until:
                     return []
                 select.select([self.connection], [], [], min(until - now, LOOK_S))
@@ -199,7 +201,11 @@ class Lockstep:
             if not data:
                 raise ConnectionResetError
             messages = self.vehicle.codec.parse(data)
-            if self.vehicle.codec.skipped and not self.garbage:
-                self.garbage = True
-                self.vehicle.tell("bytes that are no MAVLink came from the autopilot and are passed over")
+            if self.vehicle.codec.skipped:
+                self._tell_once("bytes that are no MAVLink came from the autopilot and are passed over")
             return messages
+
+    def _tell_once(self, text: str) -> None:
+        if text not in self.told:
+            self.told.add(text)
+            self.vehicle.tell(text)

@@ -205,10 +205,10 @@ class Stations:
         """Send some of what waits, to each station in turn."""
         end = time.perf_counter() + BUDGET_S
         for _ in range(SHARE):
-            for station in self._all:
-                if station.answers:
-                    station.send(station.answers.popleft())
-            if time.perf_counter() > end:
+            waiting = [station for station in self._all if station.answers]
+            for station in waiting:
+                station.send(station.answers.popleft())
+            if not waiting or time.perf_counter() > end:
                 return
 
     def receive(self) -> Iterator[Heard]:

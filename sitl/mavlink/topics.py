@@ -138,6 +138,11 @@ def _servo_output(s: Situation) -> Any:
     return mavlink.MAVLink_servo_output_raw_message(max(s.stamp, 0) % 2**32, 0, *pulses[:8])
 
 
+def _actuators(s: Situation) -> Any:
+    commands = _floats(s.row["commands"])
+    return mavlink.MAVLink_actuator_output_status_message(max(s.stamp, 0), len(commands), commands + [0.0] * 16)
+
+
 def _extended_state(s: Situation) -> Any:
     vehicle = s.vehicle
     state = mavlink.MAV_LANDED_STATE_ON_GROUND if vehicle.lift.landed else mavlink.MAV_LANDED_STATE_IN_AIR
@@ -202,6 +207,7 @@ TOPICS = {
     mavlink.MAVLINK_MSG_ID_DEBUG_VECT: Topic(_excitation, 0.0, OF_NO_STREAM),
     mavlink.MAVLINK_MSG_ID_SCALED_IMU: Topic(_scaled_imu, 0.0, _RAW, "imu"),
     mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: Topic(_servo_output, 5.0, _CONTROLLER),
+    mavlink.MAVLINK_MSG_ID_ACTUATOR_OUTPUT_STATUS: Topic(_actuators, 0.0, OF_NO_STREAM),
 }
 
 

@@ -17,7 +17,13 @@ from sitl.modes import Denied, Failed, Mode, Refused, Severity, Vehicle
 FORCE = 21196  # param2 of arm and disarm: override
 TAKEOFF_HEIGHT = 2.5  # m, when none is given
 
+
+class Unsupported(Refused):
+    """Asked of many vehicles, and not known to this one: no news for the pilot."""
+
+
 RESULTS = {
+    Unsupported: mavlink.MAV_RESULT_UNSUPPORTED,
     Refused: mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
     Denied: mavlink.MAV_RESULT_DENIED,
     Failed: mavlink.MAV_RESULT_FAILED,
@@ -116,7 +122,8 @@ class VehicleCommands:
         try:
             more = handler(Command.of(message))
         except Refused as refusal:
-            self.vehicle.say(Severity.WARNING, str(refusal))
+            if not isinstance(refusal, Unsupported):
+                self.vehicle.say(Severity.WARNING, str(refusal))
             return [acknowledge(RESULTS[type(refusal)])]
         return [acknowledge(mavlink.MAV_RESULT_ACCEPTED), *more]
 
@@ -160,7 +167,7 @@ class VehicleCommands:
     def _topic(self, command: Command) -> int:
         number = command.whole(1)
         if number not in TOPICS:
-            raise Denied(f"there is no message {number} here")
+            raise Unsupported(f"there is no message {number} here")
         return number
 
     def _set_interval(self, command: Command) -> list[Any]:

@@ -68,7 +68,7 @@ class InTheAir:
         self.rebooted = True
 
     def close(self):
-        self.ground.close()
+        self.stations.close()
         self.attacker.close()
         self.tcp.close()
 

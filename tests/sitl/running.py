@@ -79,7 +79,7 @@ def running_sitl(*extra, **keywords):
     program = mimopilot("sitl", "adam0", *ports, *extra, **keywords)
     program.udp, program.tcp = udp, tcp
     try:
-        program.until("Ctrl-C ends")
+        program.until("Ctrl-C ends", 120)  # a first start compiles
         yield program
     finally:
         program.end()
@@ -102,7 +102,10 @@ class Pilot:
         """One message, if there is one."""
         message = self.link.recv_match(blocking=True, timeout=timeout)
         if message is not None and message.get_type() == "STATUSTEXT":
-            self.texts.append(message.text)
+            if message.chunk_seq and self.texts:  # the rest of a long one
+                self.texts[-1] += message.text
+            else:
+                self.texts.append(message.text)
         if message is not None and message.get_type() == "HEARTBEAT":
             self.beat = message
             self.beats += 1

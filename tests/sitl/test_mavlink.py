@@ -8,12 +8,15 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from codegen.native import NativeController, load_native
-from codegen.parameters import IDENTITY, PARAMETERS
+from codegen.parameters import EXCITATION, IDENTITY, PARAMETERS
 from sitl.airframe import load_airframe
+from sitl.injector import Injector
 from sitl.mavlink.link import listen
 from sitl.mavlink.parameter_server import ParameterServer
 from tests.conftest import assert_one_clear_line
 from tests.sitl.running import Pilot, free_port, running_sitl
+
+TABLE = [*PARAMETERS, *IDENTITY, *EXCITATION]
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +27,7 @@ def vehicle():
 @pytest.fixture
 def server(vehicle):
     gains = vehicle.default_gains()
-    return ParameterServer(NativeController(load_native(gains), gains), gains)
+    return ParameterServer(NativeController(load_native(gains), gains), gains, Injector(gains.Ts))
 
 
 def types(answers):
@@ -61,8 +64,8 @@ def test_a_refused_write_says_why_and_changes_nothing(server, name, value, kind,
 
 def test_the_list_holds_the_whole_table_in_order(server):
     listing = list(server.listing())
-    assert [m.param_index for m in listing] == list(range(len(PARAMETERS + IDENTITY)))
-    assert {m.param_count for m in listing} == {len(PARAMETERS + IDENTITY)}
+    assert [m.param_index for m in listing] == list(range(len(TABLE)))
+    assert {m.param_count for m in listing} == {len(TABLE)}
     for i in (0, 20, 38):
         assert server.read("", i)[0].param_value == listing[i].param_value
     assert types(server.read("", 99)) == ["PARAM_ERROR"]
@@ -79,9 +82,9 @@ def test_a_ground_station_sees_the_vehicle_and_changes_its_gains():
 
         mav.param_request_list_send(1, 1)
         names = set()
-        while len(names) < len(PARAMETERS + IDENTITY):
+        while len(names) < len(TABLE):
             names.add(pilot.asks("PARAM_VALUE").param_id)
-        assert names == {p.name for p in PARAMETERS + IDENTITY}
+        assert names == {p.name for p in TABLE}
 
         mav.param_set_send(1, 1, b"MIMO_RP_RR", 0.12, 9)
         assert np.float32(pilot.asks("PARAM_VALUE").param_value) == np.float32(0.12)

@@ -123,10 +123,12 @@ def test_an_autopilot_that_boots_gets_a_running_clock_and_a_vehicle_that_waits()
     assert set(moved) == {4000}
     assert 0.5 < (stamps[-1] - stamps[0]) / 1e6 < 1.2
     assert len(gyro) > 100  # its sensors are alive
-    while pilot.frame()[0] < bench.vehicle.stamp:
-        pass
-    last = pilot.frames[-1][1][0]
-    pilot.answer(last + 4000, 0.9)  # whatever it has on its mind by the time it answers
+    assert bench.vehicle.flown == 0
+    pilot.frames.clear()
+    pilot.fly(200, 0.6)  # now it answers frame by frame, those first that have waited
+    stamps = [fields[0] for kind, fields in pilot.frames if kind is STATE]
+    assert {b - a for a, b in pairwise(stamps)} == {4000}
+    assert 150 < bench.vehicle.flown <= 200
     pilot.close()
 
 
@@ -243,6 +245,16 @@ def test_a_second_autopilot_is_turned_away_and_the_first_flies_on():
     second.close()
 
 
+def test_an_autopilot_that_keeps_its_own_time_is_told_that_it_cannot_fly(bench):
+    pilot = Pilot(bench.port)
+    state = pilot.frame()
+    for _ in range(3):
+        pilot.link.sendall(pilot.codec.pack(ACTUATORS, state[0], 0, *[0.6] * 16, ARMED))
+    bench.until_told("without the lockstep flag", 1)
+    assert len(bench.told) == 1
+    pilot.close()
+
+
 def test_a_peer_that_is_no_autopilot_is_asked_about(bench, monkeypatch):
     monkeypatch.setattr("sitl.mavlink.plant_server.MUTE_S", 0.3)
     pilot = Pilot(bench.port)
@@ -251,19 +263,27 @@ def test_a_peer_that_is_no_autopilot_is_asked_about(bench, monkeypatch):
     pilot.close()
 
 
-@pytest.mark.parametrize("connected", [False, True])
-def test_a_child_ends_with_its_parent(connected):
+def test_a_child_ends_with_its_parent():
     command = [sys.executable, "-m", "mimopilot", "plant", "adam0", "--port", "0", "--child"]
-    child = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    port = int(child.stdout.readline().rsplit(b":", 1)[1])
-    if connected:
-        pilot = Pilot(port)
-        pilot.fly(10)
-    child.stdin.close()  # as the kernel does it when the parent is killed
-    assert child.wait(timeout=1) == 0
-    child.stdout.close()
-    if connected:
-        pilot.close()
+    idle, busy = (subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) for _ in range(2))
+    ports = [int(child.stdout.readline().rsplit(b":", 1)[1]) for child in (idle, busy)]
+    pilot = Pilot(ports[1])
+    pilot.fly(10)
+    pilot.link.settimeout(1)
+    for child in (idle, busy):
+        child.stdin.close()  # as the kernel does it when the parent is killed
+    with pytest.raises(ConnectionResetError):
+        while True:
+            pilot.read()
+    pilot.close()
+    deadline = time.monotonic() + 1
+    with pytest.raises(ConnectionRefusedError):
+        while time.monotonic() < deadline:
+            socket.create_connection((LOOPBACK, ports[0])).close()
+            time.sleep(0.01)
+    for child in (idle, busy):
+        assert child.wait(timeout=20) == 0
+        child.stdout.close()
 
 
 class Board:

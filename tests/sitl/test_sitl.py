@@ -13,6 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from pyulog import ULog
 
+from codegen.parameters import EXCITATION, IDENTITY, PARAMETERS
 from sitl.mavlink.flight_modes import custom_mode
 from sitl.modes import Mode
 from tests.sitl.running import Pilot, Program, free_port, mimopilot, running_sitl
@@ -183,7 +184,7 @@ def test_mavproxy_connects_without_an_error_sets_parameters_and_flies(tmp_path, 
         modules = "--default-modules=param,link,arm,mode,cmdlong"
         proxy = Program(sys.executable, "-m", "MAVProxy.mavproxy", f"--master={address}", modules, cwd=tmp_path)
         try:
-            proxy.until("Received 39 parameters")
+            proxy.until(f"Received {len(PARAMETERS + IDENTITY + EXCITATION)} parameters")
             for word in ("rror", "imeout", "raceback"):
                 assert word not in proxy.output.replace("no tty", "")
             proxy.say("param set MIMO_RP_RR 0.12")
