@@ -54,7 +54,6 @@ def stations():
 def receive(stations, count, seconds=2.0):
     heard, end = [], time.monotonic() + seconds
     while len(heard) < count and time.monotonic() < end:
-        stations.next = 0.0
         heard += [(message.get_type(), station) for message, station in stations.receive()]
     return heard
 
