@@ -17,7 +17,6 @@ from sitl.mavlink.experiment_console import Choice, settings
 from sitl.mavlink.link import Codec
 from sitl.mavlink.words import Value, Write, drive
 from tests.conftest import assert_one_clear_line
-from tests.sitl import running
 from tests.sitl.flying_vehicle import FlyingVehicle
 from tests.sitl.running import Pilot, running_sitl
 from tests.sitl.scripted_vehicle import SimulatedLink
@@ -214,7 +213,7 @@ def test_an_experiment_over_mavlink_gives_a_log_to_tune_from(tmp_path, mimopilot
 def test_ctrl_c_in_the_client_leaves_the_vehicle_hovering_as_it_was():
     with running_sitl() as sitl:
         pilot = in_the_air(sitl)
-        client = running.mimopilot("experiment", "--connect", f"tcp:127.0.0.1:{sitl.tcp}", "--yes")
+        client = start("experiment", "--connect", f"tcp:127.0.0.1:{sitl.tcp}", "--yes")
         pilot.hears("excitation: roll")
         client.process.send_signal(signal.SIGINT)
         pilot.hears("excitation cancelled", 3.0)

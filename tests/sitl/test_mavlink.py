@@ -16,6 +16,7 @@ from sitl.mavlink.parameter_server import ParameterServer
 from tests.conftest import assert_one_clear_line
 from tests.sitl.running import Pilot, free_port, running_sitl
 
+ACCEPTED, UNSUPPORTED = 0, 3
 TABLE = [*PARAMETERS, *IDENTITY, *EXCITATION]
 
 
@@ -92,6 +93,34 @@ def test_a_ground_station_sees_the_vehicle_and_changes_its_gains():
         mav.param_set_send(7, 1, b"MIMO_RP_RR", 0.2, 9)
         mav.param_request_read_send(1, 1, b"MIMO_RP_RR", -1)
         assert np.float32(pilot.asks("PARAM_VALUE").param_value) == np.float32(0.12)
+        pilot.close()
+
+
+def test_qgroundcontrols_start_sequence_is_answered_without_a_wait():
+    """What its InitialConnectStateMachine asks, in its order, then what follows: each answer within a second."""
+    with running_sitl() as sitl:
+        pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
+        mav = pilot.link.mav
+        pilot.ready()
+        mav.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 192, 0, 4)
+        pilot.texts.clear()
+        request = mavlink.MAV_CMD_REQUEST_MESSAGE
+        assert pilot.command(request, mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == ACCEPTED
+        assert pilot.asks("AUTOPILOT_VERSION", 1.0).capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+        for unknown in (435, 397, 395):  # AVAILABLE_MODES, COMPONENT_METADATA, COMPONENT_INFORMATION
+            assert pilot.command(request, unknown) == UNSUPPORTED
+        mav.param_request_list_send(1, 0)
+        found = {pilot.asks("PARAM_VALUE", 1.0).param_index for _ in TABLE}
+        assert found == set(range(len(TABLE)))
+        for kind in (0, 1, 2):  # mission, fence, rally points
+            mav.mission_request_list_send(1, 1, kind)
+            answer = pilot.asks("MISSION_COUNT", 1.0)
+            assert (answer.count, answer.mission_type) == (0, kind)
+        for unknown in (521, 519, 183):
+            assert pilot.command(unknown, 1) == UNSUPPORTED
+        for known in (mavlink.MAV_CMD_GET_HOME_POSITION, mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
+            assert pilot.command(known, 1) == ACCEPTED
+        assert pilot.texts == []  # nothing of this is a complaint
         pilot.close()
 
 
