@@ -78,7 +78,7 @@ def running_sitl(*extra, **keywords):
     udp, local, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM), free_port()
     ports = ("--ground-port", udp, "--vehicle-port", local, "--tcp-port", tcp)
     program = start("sitl", "adam0", *ports, *extra, **keywords)
-    program.udp, program.tcp = udp, tcp
+    program.udp, program.local, program.tcp = udp, local, tcp
     try:
         program.until("Ctrl-C ends", 120)  # a first start compiles
         yield program
