@@ -13,6 +13,9 @@ AirframeArgument = Annotated[
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
+AxisOption = Annotated[str, typer.Option(help="roll or pitch.")]
+AmplitudeOption = Annotated[float, typer.Option(help="Of the doublet or step, degrees.")]
+PeriodOption = Annotated[float, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.")]
 SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast as it goes.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -135,11 +138,9 @@ def fly(
     airframe: AirframeArgument,
     gains: GainsOption = None,
     scenario: Annotated[str, typer.Option(help="doublet, step or hover.")] = "doublet",
-    axis: Annotated[str, typer.Option(help="roll or pitch.")] = "roll",
-    amplitude_deg: Annotated[float, typer.Option(help="Of the doublet or step, degrees.")] = 22.5,
-    period_s: Annotated[
-        float, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.")
-    ] = 0.42,
+    axis: AxisOption = "roll",
+    amplitude_deg: AmplitudeOption = 22.5,
+    period_s: PeriodOption = 0.42,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
     on: Annotated[str, typer.Option(help="native, or cortex-m4: the emulated processor of the vehicle.")] = "native",
@@ -234,14 +235,22 @@ def sitl(
     log: Annotated[
         Path | None, typer.Option(help="Log each flight, arming to disarming, at full rate: FILE.ulg, FILE-2.ulg ...")
     ] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="Take off, fly doublet, step or hover, land and end; the same for equal seeds.")
+    ] = None,
+    axis: AxisOption = "roll",
+    amplitude_deg: AmplitudeOption = 22.5,
+    period_s: PeriodOption = 0.42,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
     from sitl.mavlink.sitl_console import Options, run
+    from sitl.scenario import make_scenario
 
     body, controller = _load(airframe, gains)
+    task = make_scenario(scenario, axis, amplitude_deg, period_s, controller.Ts) if scenario else None
     address = _address(plant) if plant else None
     links = (ground_port, vehicle_port, tcp_port, bind, signing_key)
-    run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log))
+    run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log, task))
 
 
 def plant(

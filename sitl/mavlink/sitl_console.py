@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from sitl.mavlink.signing import Signer, read_key
 from sitl.mavlink.stations import Stations
 from sitl.mavlink.telemetry import Telemetry
 from sitl.mavlink.vehicle_commands import VehicleCommands
+from sitl.scenario import Scenario
+from sitl.scripted_pilot import ScriptedPilot
 from tuning.gains import Gains
 
 
@@ -50,6 +53,8 @@ class Options:
     seed : int
     log : Path or None
         Where the first flight is logged.
+    scenario : Scenario or None
+        Flown at once, in place of waiting for a ground station.
     """
 
     name: str
@@ -66,10 +71,11 @@ class Options:
     speed: float | None
     seed: int
     log: Path | None
+    scenario: Scenario | None
 
 
 def run(options: Options) -> None:
-    """Run the vehicle until Ctrl-C.
+    """Run the vehicle until Ctrl-C, or until its scenario is flown.
 
     Raises
     ------
@@ -79,8 +85,11 @@ def run(options: Options) -> None:
     with ExitStack() as leaving:
         host, ground = _assemble(options, leaving)
         print(f"{options.airframe.name}: {ground.stations}, plant {host.plant.place}; Ctrl-C ends", flush=True)
+        begin = time.monotonic()
         try:
             host.run(ground)
+            pace = host.lateness.periods * options.gains.Ts / (time.monotonic() - begin)
+            print(f"flown at {pace:.3g} times real time")
         except KeyboardInterrupt:
             written = host.leave()
             print(f"ended: {host.lateness}{f'; logged: {written}' if written else ''}")
@@ -98,11 +107,15 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
         link.child.start()  # it comes up while we compile
     autopilot = Autopilot(options.airframe, gains)
     autopilot.warm_up()
-    host = Host(autopilot, link, FlightLog(options.log, options.airframe, gains.Ts) if options.log else None)
+    log = FlightLog(options.log, options.airframe, gains.Ts) if options.log else None
+    host = Host(autopilot, link, log)
     telemetry = Telemetry(host.situation)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
     injector = Injector(gains.Ts)
     host.excitation = Excitation(injector, host.situation)
+    if options.scenario is not None:
+        host.pilot = pilot = ScriptedPilot(options.scenario)
+        host.excitation = lambda now: pilot.moment
     store = ParameterStore(options.parameters) if options.parameters else None
     server = ParameterServer(autopilot.controller, gains, injector, store)
     leaving.callback(server.close)

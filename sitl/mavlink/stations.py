@@ -174,11 +174,6 @@ class Stations:
         others = f"others on {host}, UDP {udp} and TCP {self.tcp.getsockname()[1]}"
         return f"ground station on UDP {self.first[1]}, {others}{', signed' if self.signer else ''}"
 
-    @property
-    def sockets(self) -> list[socket.socket]:
-        """What becomes readable when there is something to receive."""
-        return [self.udp, self.tcp, *(station.link for station in self.connected)]
-
     def close(self) -> None:
         """Release the ports."""
         for station in self.connected:
@@ -208,10 +203,10 @@ class Stations:
         """Send some of what waits, to each station in turn."""
         end = time.perf_counter() + BUDGET_S
         for _ in range(SHARE):
-            for station in self._all:
-                if station.answers:
-                    station.send(station.answers.popleft())
-            if time.perf_counter() > end:
+            waiting = [station for station in self._all if station.answers]
+            for station in waiting:
+                station.send(station.answers.popleft())
+            if not waiting or time.perf_counter() > end:
                 return
 
     def receive(self) -> Iterator[Heard]:

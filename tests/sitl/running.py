@@ -67,7 +67,8 @@ class Program:
         self.process.stdout.close()
 
 
-def mimopilot(*arguments, **keywords):
+def start(*arguments, **keywords):
+    """A command of ours."""
     return Program(sys.executable, "-u", "-m", "mimopilot", *arguments, **keywords)
 
 
@@ -76,8 +77,8 @@ def running_sitl(*extra, **keywords):
     """`mimopilot sitl adam0` on ports of its own; yields the program, with its `ports`."""
     udp, local, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM), free_port()
     ports = ("--ground-port", udp, "--vehicle-port", local, "--tcp-port", tcp)
-    program = mimopilot("sitl", "adam0", *ports, *extra, **keywords)
-    program.udp, program.tcp = udp, tcp
+    program = start("sitl", "adam0", *ports, *extra, **keywords)
+    program.udp, program.local, program.tcp = udp, local, tcp
     try:
         program.until("Ctrl-C ends", 120)  # a first start compiles
         yield program
@@ -102,7 +103,10 @@ class Pilot:
         """One message, if there is one."""
         message = self.link.recv_match(blocking=True, timeout=timeout)
         if message is not None and message.get_type() == "STATUSTEXT":
-            self.texts.append(message.text)
+            if message.chunk_seq and self.texts:  # the rest of a long one
+                self.texts[-1] += message.text
+            else:
+                self.texts.append(message.text)
         if message is not None and message.get_type() == "HEARTBEAT":
             self.beat = message
             self.beats += 1
