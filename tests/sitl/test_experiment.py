@@ -18,7 +18,7 @@ from sitl.mavlink.link import Codec
 from sitl.mavlink.words import Value, Write, drive
 from tests.conftest import assert_one_clear_line
 from tests.sitl.flying_vehicle import FlyingVehicle
-from tests.sitl.running import Pilot, running_sitl
+from tests.sitl.running import Pilot, running_sitl, start
 from tests.sitl.scripted_vehicle import SimulatedLink
 from tuning.logs.reader import read_log
 
