@@ -243,11 +243,14 @@ def sitl(
     period_s: PeriodOption = 0.42,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
+    from sitl.errors import SitlError
     from sitl.mavlink.sitl_console import Options, run
     from sitl.scenario import make_scenario
 
     body, controller = _load(airframe, gains)
     task = make_scenario(scenario, axis, amplitude_deg, period_s, controller.Ts) if scenario else None
+    if plant and (port, speed, seed) != (0, "1", 0):
+        raise SitlError("--port, --speed and --seed belong to the plant: with --plant, say them where it was started")
     address = _address(plant) if plant else None
     links = (ground_port, vehicle_port, tcp_port, bind, signing_key)
     run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log, task))

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 
 from sitl.errors import SitlError
 
-START_SECONDS = 60.0
+START_SECONDS = 120.0  # the first time everything is compiled
 
 
 class PlantProcess:

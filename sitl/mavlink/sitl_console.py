@@ -111,6 +111,7 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
     autopilot.warm_up()
     log = FlightLog(options.log, options.airframe, gains.Ts) if options.log else None
     host = Host(autopilot, link, log)
+    leaving.callback(host.leave)
     telemetry = Telemetry(host.situation)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
     injector = Injector(gains.Ts)
