@@ -100,6 +100,8 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
     signer = Signer(read_key(key)) if key else None
     stations = Stations(options.ground_port, options.vehicle_port, options.tcp_port, options.bind, signer)
     leaving.callback(stations.close)
+    if stations.exposed:
+        print("warning: whoever reaches this address commands the vehicle; give --signing-key to ask for a key")
     link = PlantLink(options.plant or PlantProcess(options.name, options.port, gains.Ts, options.seed, options.speed))
     leaving.callback(link.close)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # what Ctrl-C leaves in order, this does, too
