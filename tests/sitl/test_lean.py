@@ -91,9 +91,10 @@ def test_a_flipped_bit_is_no_message():
 
 
 def test_a_signed_message_is_read():
-    generic = Codec(1, 1)
-    generic.mav.signing.secret_key, generic.mav.signing.sign_outgoing = bytes(32), True
-    data = generic.pack(mavlink.MAVLink_hil_actuator_controls_message(7, [0.25] * 16, 128, 1))
+    signed = mavlink.MAVLink(None, 1, 1)
+    signed.signing.secret_key, signed.signing.sign_outgoing = bytes(32), True
+    data = mavlink.MAVLink_hil_actuator_controls_message(7, [0.25] * 16, 128, 1).pack(signed)
+    assert len(data) > len(LeanCodec(1, 1).pack(ACTUATORS, 7, 1, *[0.25] * 16, 128))
     codec = LeanCodec(1, 1)
     assert codec.parse(data * 2) == [(ACTUATORS, (7, 1, *[0.25] * 16, 128))] * 2
     assert codec.skipped == 0
