@@ -74,7 +74,7 @@ def experiment(
         str | None, typer.Option(help="Link to a vehicle that hovers under our controller; see upload.")
     ] = None,
     gains: GainsOption = None,
-    axis: Annotated[str, typer.Option(help="roll, pitch, or both, one after the other.")] = "both",
+    axis: Annotated[str, typer.Option(help="roll, pitch, or both, one after the other; with --connect.")] = "both",
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
     amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
     bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,

@@ -171,6 +171,8 @@ def excite(talk: Conversation, sights: Sights, wanted: Mapping[str, float]) -> S
         while talk.now < seen:
             yield from talk.turn([], seen)
         old = yield from read(talk, NAMES)
+        if old[AXIS] != 0:
+            raise SitlError(f"{AXIS} cannot be set to 0; nothing else was written", exit_code=1)
     new = {**wanted, AXIS: old[AXIS]}
     outcome = yield from apply(talk, new, old, store=False)
     if outcome.state != "verified":

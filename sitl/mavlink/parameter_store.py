@@ -11,6 +11,7 @@ import threading
 from collections.abc import Mapping
 from pathlib import Path
 
+from sitl.errors import SitlError
 from sitl.mavlink.parameter_files import parameter_text, read_parameters
 from tuning.files import write_atomically
 
@@ -42,25 +43,29 @@ class ParameterStore:
         self.held = read_parameters(path) if path.exists() else {}
         self._wanted: Mapping[str, float] | None = None
         self._complaint = ""
-        self._changed, self._leaving, self._writing = threading.Event(), threading.Event(), threading.Lock()
+        self._changed, self._leaving = threading.Event(), threading.Event()
+        self._writing, self._taking = threading.Lock(), threading.Lock()  # the first is held for long, by writers only
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def keep(self, values: Mapping[str, float]) -> None:
         """Write these soon; returns at once."""
-        self._wanted = dict(values)
+        with self._taking:
+            self._wanted = dict(values)
         self._changed.set()
 
     def flush(self) -> bool:
         """Write now what was not written yet; False when that fails."""
         with self._writing:
-            wanted, self._wanted = self._wanted, None
+            with self._taking:
+                wanted, self._wanted = self._wanted, None
             if wanted is None:
                 return True
             try:
                 write_atomically(self.path, parameter_text("qgc", wanted))
             except OSError as error:
-                self._wanted = self._wanted or wanted
+                with self._taking:
+                    self._wanted = self._wanted or wanted
                 self._complaint = f"parameters not kept: {error.filename}: {error.strerror}"
                 return False
             return True
@@ -71,11 +76,18 @@ class ParameterStore:
         return told
 
     def close(self) -> None:
-        """Write what was not written yet."""
+        """Write what was not written yet.
+
+        Raises
+        ------
+        SitlError
+            When that fails.
+        """
         self._leaving.set()
         self._changed.set()
         self._thread.join()
-        self.flush()
+        if not self.flush():
+            raise SitlError(self.complaint(), exit_code=1)
 
     def _run(self) -> None:
         while not self._leaving.is_set():

@@ -16,7 +16,6 @@ from typing import Any, TypeVar
 from sitl.mavlink.link import COMPONENT, KINDS, LOOPBACK, SYSTEM, Codec, listen, udp_socket
 from sitl.mavlink.signing import Signer
 
-TCP_PORT = 5760
 #: Time that one call of `Stations.receive` may take, and one of `Stations.deliver`, s: an eighth of a control period.
 BUDGET_S = 0.0005
 #: Answers that a station is sent in one call, and how many may wait: what it asks then is not heard.

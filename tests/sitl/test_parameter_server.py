@@ -174,6 +174,7 @@ def test_a_file_that_cannot_be_written_is_told_and_tried_again(tmp_path):
     server.write("MIMO_RP_RR", 0.12, 9)
     assert not server.flush()
     assert "p.params" in server.complaint()
+    with pytest.raises(SitlError, match=r"not kept: .*p\.params"):
+        server.close()
     path.rmdir()
-    assert server.flush()
     assert settle(server)["MIMO_RP_RR"] == np.float32(0.12)

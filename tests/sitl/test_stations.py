@@ -138,7 +138,7 @@ FRAMES = [Codec(255, 190).pack(BEAT), Codec(255, 190).pack(PING)]
 
 
 @given(st.lists(st.one_of(st.binary(max_size=60), st.sampled_from(FRAMES)), max_size=12), st.integers(1, 40))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=80, deadline=None)
 def test_a_stream_is_read_the_same_however_it_is_cut(pieces, size):
     data = b"".join(pieces) + b"".join(FRAMES) * 20
     whole = [m.get_type() for m in Codec().parse(data)]

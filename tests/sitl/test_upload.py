@@ -24,8 +24,8 @@ from sitl.mavlink.profiles import make_plan
 from sitl.mavlink.signing import Signer, read_key
 from sitl.mavlink.words import Beat, Heartbeat, Read, Refusal, Store, Value, Write
 from tests.conftest import assert_one_clear_line
+from tests.sitl.running import Pilot, running_sitl
 from tests.sitl.scripted_vehicle import FAILING, ScriptedVehicle, SerialVehicle, TcpVehicle, UdpVehicle, encode, float32
-from tests.sitl.test_mavlink import running_sitl
 from tuning.gains import load_gains
 
 KEY = bytes(range(32))
@@ -355,8 +355,11 @@ def test_our_own_vehicle_takes_gains_in_flight_only_when_forced(mimopilot, tmp_p
     gains = load_airframe("adam0").default_gains()
     tuned = gains.with_elements({"RP_RR": 0.16, "RP_RP": 0.0123, "RP_PR": -0.004})
     tuned.save(tmp_path / "tuned.gains.toml")
-    with running_sitl() as (_, port):
-        url = f"udpin:127.0.0.1:{port}"
+    with running_sitl() as sitl:
+        pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
+        pilot.ready()
+        assert pilot.command(400, 1) == 0
+        url = f"tcp:127.0.0.1:{sitl.tcp}"
         arguments = ("upload", "tuned.gains.toml", "--connect", url, "--yes", "--uncertified", "--json")
         assert mimopilot(*arguments).returncode == 1
         done = mimopilot(*arguments, "--force-armed")
@@ -370,6 +373,12 @@ def test_our_own_vehicle_takes_gains_in_flight_only_when_forced(mimopilot, tmp_p
         back = mimopilot("restore", found["snapshot"], "--connect", url, "--yes", "--force-armed")
         assert back.returncode == 0
         assert "3 of them written" in back.stdout
+        while pilot.take(0.0) is not None:
+            pass  # what has come meanwhile leaves no room for more
+        assert pilot.command(400, 0) == 0
+        stored = mimopilot(*arguments)
+        assert json.loads(stored.stdout)["storage"] == "acknowledged"
+        pilot.close()
 
 
 def frames():
