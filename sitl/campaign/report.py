@@ -50,8 +50,9 @@ def write_campaign_report(plan: Plan, results: Path, summary: Summary, wanted_ma
         Table("Figures", FIGURE_COLUMNS, figure_rows(summary)),
         Table("Worst flights; the commands are for this folder", WORST_COLUMNS, worst_rows(summary, ".")),
     ]
+    sample = figures.fly_sample(stand)
     envelopes = [
-        svg(figures.envelope_figure(plan, stand, results, index), f"envelope {axis}")
+        svg(figures.envelope_figure(stand, sample, results, index), f"envelope {axis}")
         for index, axis in enumerate(d.axes)
     ]
     sections = [
