@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.errors import SitlError
+from sitl.faults import Fault
 from tuning.excitation import hold_from_bandwidth, prbs
 
 AXES = ("roll", "pitch")
@@ -34,6 +35,8 @@ class Scenario:
         Axis of the manoeuvre: 0 roll, 1 pitch.
     window : (start, stop)
         Samples over which the manoeuvre is judged.
+    faults : tuple of Fault
+        What goes wrong on the way.
     """
 
     name: str
@@ -42,6 +45,7 @@ class Scenario:
     excitation: NDArray[np.float64]
     axis: int
     window: tuple[int, int]
+    faults: tuple[Fault, ...] = ()
 
 
 def _axis_index(axis: str) -> int:
