@@ -21,9 +21,11 @@ UNITS = {
     "J_M_i": "J_M,i [rad^2/s^2]",
     "J_r_o": "J_r,o [rad^2]",
     "J_r_i": "J_r,i [rad^2/s^2]",
+    "peak_deg": "peak [deg]",
     "offaxis_peak_deg": "off-axis peak [deg]",
     "offaxis_rms_deg": "off-axis RMS [deg]",
     "effort_rms": "effort, RMS of u [-]",
+    "saturated": "saturated samples",
     "crashed_at_s": "lost at [s]",
 }
 

@@ -44,7 +44,7 @@ class Injection:
     airframe : Airframe
         The vehicle.
     simulator : Simulator
-        Its plant, as it is now, is the sound one.
+        Its plant, sensors and delay, as they are now, are the sound ones; they are replaced, never written into.
     Ts : float, s
         Control period.
     seed : int or sequence of int
@@ -77,8 +77,7 @@ class Injection:
         self.generators = [
             np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(DRAWS, i))) for i in range(len(faults))
         ]
-        self.sound, self.delay = simulator.plant, simulator.delay
-        self.rate_deviation, self.bias = simulator.sensors.rate_deviation, simulator.sensors.bias.copy()
+        self.sound, self.sensors, self.delay = simulator.plant, simulator.sensors, simulator.delay
         self.centre = airframe.geometry()[0][0] - self.sound.rotors[0]
         self.gains = np.full(len(PARAMETERS), np.nan, np.float32)
         if autopilot is not None:
@@ -135,9 +134,8 @@ class Injection:
         yield end
 
     def _apply(self, k: int) -> None:
-        sensors = self.simulator.sensors
-        bias, stuck, failed = self.bias.copy(), np.zeros(3, np.bool_), np.zeros(3, np.bool_)
-        rate_deviation = self.rate_deviation
+        bias, stuck, failed = self.sensors.bias.copy(), self.sensors.stuck.copy(), self.sensors.failed.copy()
+        rate_deviation = self.sensors.rate_deviation
         effectiveness = self.sound.effectiveness.copy()
         loads: list[Fault] = []
         factors = np.ones(len(PARAMETERS), np.float32)
@@ -159,8 +157,9 @@ class Injection:
                     failed[fault.axes] = True
                 case "gain":
                     factors[_elements(fault)] *= fault.magnitude
-        sensors.bias[:], sensors.stuck[:], sensors.failed[:] = bias, stuck, failed
-        self.simulator.sensors = sensors._replace(rate_deviation=rate_deviation)
+        self.simulator.sensors = self.sensors._replace(
+            rate_deviation=rate_deviation, bias=bias, stuck=stuck, failed=failed
+        )
         self.simulator.plant = self.simulator.plant._replace(effectiveness=effectiveness)
         if any(fault.kind == "mass" for fault in self.faults):
             self._load(loads)

@@ -12,7 +12,7 @@ from sitl.airframe import Airframe
 from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.compiled import compiled
 from sitl.injection import Injection
-from sitl.plant import HISTORY, STEP, advance, hover_state
+from sitl.plant import HISTORY, ROTORS, STEP, advance, hover_state
 from sitl.scenario import Scenario
 from sitl.sensors import NOISES, SIZE, Sensors, euler_angles, low_pass, measure
 
@@ -47,22 +47,35 @@ class Flight:
     @property
     def crashed_at(self) -> float | None:
         """Time (s) of the loss: more than 60 degrees for 0.3 s, the ground, or a value that is not finite."""
-        samples = max(1, round(CRASH_SECONDS / self.scenario.Ts))
-        first = _first_loss(self.truth, self.record, samples)
+        first = first_loss(self.truth, self.record, self.scenario.Ts)
         return None if first < 0 else float(first * self.scenario.Ts)
 
 
+def first_loss(truth: NDArray[Any], record: NDArray[Any], Ts: float) -> int:
+    """Sample at which the vehicle counts as lost, see `Flight.crashed_at`; -1: it is not.
+
+    Parameters
+    ----------
+    truth, record : (N,) arrays of `TRUTH` and of `sitl.autopilot.RECORD`
+        What the plant and what the autopilot did.
+    Ts : float, s
+        Control period.
+    """
+    samples = max(1, round(CRASH_SECONDS / Ts))
+    return int(_first_loss(truth["attitude"], truth["position"], record["moment"], samples))
+
+
 @compiled
-def _first_loss(truth, record, samples):  # type: ignore[no-untyped-def]
+def _first_loss(attitude, position, moment, samples):  # type: ignore[no-untyped-def]
     run = 0
-    for k in range(truth.shape[0]):
-        roll, pitch = truth[k].attitude[0], truth[k].attitude[1]
+    for k in range(attitude.shape[0]):
+        roll, pitch = attitude[k, 0], attitude[k, 1]
         tilted = not (abs(roll) <= CRASH_ANGLE and abs(pitch) <= CRASH_ANGLE)
         finite = np.isfinite(roll) and np.isfinite(pitch)
         for i in range(3):
-            finite = finite and np.isfinite(record[k].moment[i])
+            finite = finite and np.isfinite(moment[k, i])
         run = run + 1 if tilted else 0
-        if run >= samples or not finite or truth[k].position[2] > 0.0:
+        if run >= samples or not finite or position[k, 2] > 0.0:
             return k
     return -1
 
@@ -135,19 +148,24 @@ class Simulator:
         self, airframe: Airframe, Ts: float, seed: int | list[int], noise: bool = True, altitude: float = 10.0
     ) -> None:
         self.plant = airframe.plant()
-        self.state = hover_state(self.plant, altitude)
         self.steps = max(1, int(np.ceil(Ts / STEP - 1e-9)))
         self.step = Ts / self.steps
         self.delay = airframe.computing_delay
-        hover = self.state[13] ** 2 * self.plant.thrust_coefficient / self.plant.thrust_max
-        self.history = np.full((HISTORY, RECORD["commands"].shape[0]), hover, np.float32)
-        self.count = 0
+        self.history = np.zeros((HISTORY, RECORD["commands"].shape[0]), np.float32)
         self.generator = np.random.default_rng(seed)
         scale = 1.0 if noise else 0.0
         gyro = low_pass(airframe.gyro_cutoff_hz, Ts)
         self.sensors = Sensors.sound(scale * airframe.noise.angle, scale * airframe.noise.rate, gyro)
         self.seen = np.zeros(SIZE)
         self.before: NDArray[Any] = np.zeros(1, RECORD)
+        self.restart(hover_state(self.plant, altitude))
+
+    def restart(self, state: NDArray[np.float64]) -> None:
+        """Begin a flight in a state (13 + n,), its rotors turning as they were told to; nothing is left of the last."""
+        self.state = state
+        self.history[:] = state[ROTORS] ** 2 * self.plant.thrust_coefficient / self.plant.thrust_max
+        self.count = 0
+        self.seen[:], self.before[:], self.sensors.memory[:] = 0, np.zeros(1, RECORD), 0
 
     def noise(self, samples: int) -> NDArray[np.float64]:
         """The next standard normal numbers of the noise, (samples, 6); the same whatever the block size."""
