@@ -145,7 +145,7 @@ class Fault(BaseModel):
             if getattr(self, target) is not None and target != kind.target:
                 raise ValueError(f"{self.kind} takes no {target}")
         if kind.needs_target and self.target is None:
-            raise ValueError(f"{self.kind} needs a {kind.target}")
+            raise ValueError(f"{self.kind} does not say which {kind.target}")
         if not kind.lasts and self.duration is not None:
             raise ValueError(f"{self.kind} takes no duration: its size says how long it lasts")
         return self
@@ -213,12 +213,15 @@ def make_fault(table: dict[str, Any], where: str) -> Fault:
     try:
         return Fault.model_validate(table)
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        raise SitlError(
-            f"{where}: " + (f"{field}: {message}, got {first.get('input')!r}" if field else message)
-        ) from error
+        raise SitlError(f"{where}: {complaint(error)}") from error
+
+
+def complaint(error: ValidationError) -> str:
+    """The first thing that pydantic found wrong, in one line."""
+    first = error.errors()[0]
+    field = ".".join(str(part) for part in first["loc"])
+    message = first["msg"].removeprefix("Value error, ")
+    return f"{field}: {message}, got {first.get('input')!r}" if field else message
 
 
 def parse_fault(text: str) -> Fault:

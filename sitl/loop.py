@@ -35,14 +35,14 @@ class Flight:
         What the autopilot saw and did.
     truth : (N,) array of `TRUTH`
         What the plant did.
-    runs : (N,) array
-        How often the autopilot ran in each period.
+    runs : (N,) array, optional
+        How often the autopilot ran in each period; by default once.
     """
 
     scenario: Scenario
     record: NDArray[Any]
     truth: NDArray[Any]
-    runs: NDArray[np.int64]
+    runs: NDArray[np.int64] | None = None
 
     @property
     def crashed_at(self) -> float | None:

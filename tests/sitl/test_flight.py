@@ -164,7 +164,7 @@ def synthetic_flight(response, rate):
     record["rates"][:, 0] = rate
     record["moment"][:, :2] = [0.3, 0.4]
     truth["attitude"][:, 1] = np.radians(2.0)
-    return Flight(scenario, record, truth, np.ones(len(record), np.int64))
+    return Flight(scenario, record, truth)
 
 
 def test_the_figures_of_a_perfect_response_are_zero_and_the_others_those_of_their_definitions():
