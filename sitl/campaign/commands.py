@@ -1,0 +1,129 @@
+"""The commands of campaigns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sitl.commands import UNITS, AirframeArgument, JsonOption, SeedOption
+
+
+def register(app: typer.Typer) -> None:
+    """Add the campaigns' commands to the front door."""
+    app.command(
+        epilog="Example: mimopilot campaign adam0 --gains siso.gains.toml mimo.gains.toml --runs 10000 "
+        "--vary spec.toml --out campaign"
+    )(campaign)
+    app.command(epilog="Example: mimopilot replay campaign --run 4711 --out worst.ulg")(replay)
+
+
+def campaign(
+    airframe: AirframeArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the results; holds what is done when it is interrupted.")],
+    more_gains: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
+    gains: Annotated[
+        list[Path] | None, typer.Option(help="Gains files: --gains FILE [FILE...]; by default the airframe's own.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, help="How many; each is flown with every gain set on every axis.")] = 1000,
+    vary: Annotated[Path | None, typer.Option(help="What varies (TOML), see README; by default the noise.")] = None,
+    scenario: Annotated[str, typer.Option(help="doublet, step or hover.")] = "doublet",
+    axis: Annotated[str, typer.Option(help="roll, pitch or both.")] = "both",
+    amplitude_deg: Annotated[float, typer.Option(help="Of the doublet or step, degrees.")] = 22.5,
+    period_s: Annotated[float, typer.Option(help="Length of the whole doublet, step or hover, s.")] = 0.42,
+    seed: SeedOption = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT: its workers fly instead.")
+    ] = None,
+    survival_map: Annotated[
+        str | None, typer.Option("--map", help="The two quantities of the survival map: NAME,NAME.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly a vehicle that varies, thousands of times, and say with which gains it survives and how well it follows."""
+    import tomllib
+
+    from sitl.airframe import load_airframe
+    from sitl.campaign.execution import run_campaign
+    from sitl.campaign.plan import make_plan
+    from sitl.campaign.report import INTERVALS, write_campaign_report
+    from sitl.campaign.summary import (
+        FIGURE_COLUMNS,
+        SURVIVAL_COLUMNS,
+        WORST_COLUMNS,
+        figure_rows,
+        summarise,
+        survival_rows,
+        worst_rows,
+    )
+    from sitl.campaign.variation import variation_from_toml
+    from sitl.errors import SitlError
+    from sitl.scenario import AXES
+    from tuning.files import write_atomically
+    from tuning.gains import load_gains
+    from tuning.output import json_text, print_json, print_table
+    from tuning.parallel import cores
+
+    vehicle = load_airframe(airframe)
+    text = vary.read_text() if vary else ""
+    variation_from_toml(text, str(vary))
+    if axis not in (*AXES, "both"):
+        raise SitlError(f"--axis: got {axis!r}, expected roll, pitch or both")
+    files = [*(gains or ()), *(more_gains or ())]
+    names = [path.name.removesuffix(".toml").removesuffix(".gains") for path in files]
+    if len(set(names)) < len(names):
+        raise SitlError(f"--gains: two files have the same name ({', '.join(names)}); rename one")
+    sets = dict(zip(names, map(load_gains, files), strict=True)) or {"default": vehicle.default_gains()}
+    plan = make_plan(
+        vehicle,
+        sets,
+        runs=runs,
+        seed=seed,
+        scenario=scenario,
+        axes=list(AXES) if axis == "both" else [axis],
+        amplitude_deg=amplitude_deg,
+        period_s=period_s,
+        vary=tomllib.loads(text),
+    )
+    results = run_campaign(plan, out, workers or cores(), scheduler)
+    summary = summarise(plan, results)
+    write_atomically(out / "summary.json", json_text(summary.as_json(".")))
+    report = write_campaign_report(plan, results, summary, survival_map)
+    if as_json:
+        print_json({"results": str(results), "report": str(report), **summary.as_json(str(out))})
+        return
+    print(INTERVALS)
+    print_table("Survived", SURVIVAL_COLUMNS, survival_rows(summary))
+    print_table("Figures", FIGURE_COLUMNS, figure_rows(summary))
+    print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))
+    print(f"results {results}\nreport  {report}")
+
+
+def replay(
+    folder: Annotated[Path, typer.Argument(help="Folder of a campaign.")],
+    run: Annotated[int, typer.Option(min=0, help="Which run.")],
+    gains: Annotated[str | None, typer.Option(help="Name of the gain set; by default the first.")] = None,
+    axis: Annotated[str | None, typer.Option(help="roll or pitch; by default the first.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly one run of a campaign again: the same flight, bit for bit. Exit code 1: it is another one here."""
+    from sitl.campaign.replay import fly_again
+    from sitl.recorder import save_flight
+    from tuning.output import print_json, print_table
+
+    again = fly_again(folder, run, gains, axis)
+    if out is not None:
+        save_flight(out, again.flight, again.plan.airframe, again.plan.gains[again.row["gains"]])
+    if as_json:
+        print_json(again.row)
+    else:
+        rows = [[UNITS.get(name, name), _shown(value)] for name, value in again.row.items()]
+        print_table(f"{again.plan.airframe.name}, run {run} of {folder}", ["figure", "value"], rows)
+    again.compare()
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

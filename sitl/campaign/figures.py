@@ -1,0 +1,240 @@
+"""Figures of a campaign: envelopes of the responses, distributions of the figures, a map of survival."""
+
+from __future__ import annotations
+
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from sitl.campaign.flights import Stand
+from sitl.campaign.plan import Plan
+from sitl.campaign.summary import column, worst_runs
+from sitl.commands import UNITS
+from sitl.errors import SitlError
+from sitl.figures import SETPOINT, STYLES
+from sitl.scenario import AXES
+
+ENVELOPE_RUNS = 400  # flown again for the envelopes: the first ones, which are as random as any
+CELLS = 14  # of the map, on each side
+POINTS = 300  # of a distribution's curve
+CROSSES = 300  # lost flights that the map shows one by one
+VERMILLION, GREY = "#D55E00", "#888888"
+
+
+def envelope_figure(plan: Plan, stand: Stand, results: Path, index: int) -> Figure:
+    """Responses of all gain sets on one axis: median, 5 to 95 %, and the worst flight; rows are gain sets.
+
+    Parameters
+    ----------
+    plan, stand : Plan, Stand
+        What is flown, and where.
+    results : Path
+        Knows the worst flights.
+    index : int
+        Of the scenario.
+    """
+    scenario, axis = plan.scenarios[index], plan.scenarios[index].axis
+    time = (np.arange(len(scenario.setpoint)) - scenario.window[0]) * scenario.Ts
+    figure = Figure(figsize=(9, 0.9 + 2.6 * len(plan.gains)), layout="constrained")
+    panels: Any = figure.subplots(len(plan.gains), 2, sharex=True, sharey="col", squeeze=False)
+    for row, (name, (colour, _)) in zip(panels, zip(plan.gains, cycle(STYLES), strict=False), strict=True):
+        angles, survived = _responses(stand, name, index, min(plan.description.runs, ENVELOPE_RUNS))
+        bad = worst_runs(results, name, AXES[axis], 1)[0]
+        worst = np.degrees(stand.fly(stand.draw(bad), name, index).truth["attitude"][:, :2])
+        for panel, shown in zip(row, (axis, 1 - axis), strict=True):
+            if shown == axis:
+                panel.step(time, np.degrees(scenario.setpoint[:, axis]), where="post", label="set-point", **SETPOINT)
+            if survived.any():
+                low, median, high = np.percentile(angles[survived, :, shown], (5, 50, 95), axis=0)
+                band = {"color": colour, "alpha": 0.3, "linewidth": 0, "label": "5 to 95 %"}
+                panel.fill_between(time, low, high, **band)
+                panel.plot(time, median, color=colour, linewidth=1.8, label="median")
+            panel.plot(time, worst[:, shown], color="black", linestyle=":", linewidth=1.2, label=f"worst: run {bad}")
+            panel.grid(alpha=0.3)
+            panel.set_title(f"{name}: {AXES[shown]}{'' if shown == axis else ', off-axis'}", loc="left", fontsize=10)
+            panel.set_ylabel("angle [deg]")
+        row[0].legend(fontsize=8, loc="upper right")
+        row[1].text(
+            0.98,
+            0.05,
+            f"{int(survived.sum())} of {len(survived)} shown, the others were lost" if not survived.all() else "",
+            transform=row[1].transAxes,
+            ha="right",
+            fontsize=8,
+        )
+    _limit(panels)
+    for panel in panels[-1]:
+        panel.set_xlabel("time from the start of the manoeuvre [s]")
+        panel.set_xlim(-0.1, time[-1])
+    figure.suptitle(f"{AXES[axis].capitalize()} {scenario.name}", x=0.02, ha="left")
+    return figure
+
+
+def _responses(stand: Stand, name: str, index: int, runs: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+    """True roll and pitch (runs, N, 2), deg, and which flights survived."""
+    angles = np.empty((runs, len(stand.truth), 2), np.float32)
+    survived = np.empty(runs, np.bool_)
+    for run in range(runs):
+        flight = stand.fly(stand.draw(run), name, index)
+        angles[run] = np.degrees(flight.truth["attitude"][:, :2])
+        survived[run] = flight.crashed_at is None
+    return angles, survived
+
+
+def _limit(panels: Any) -> None:
+    """A vehicle that tumbles must not flatten the other curves."""
+    for panel in panels[0]:
+        low, high = panel.get_ylim()
+        panel.set_ylim(max(low, -75), min(high, 75))
+
+
+def distribution_figure(plan: Plan, results: Path, axis: str) -> Figure:
+    """Share of the flights whose figure is at most x, one curve a gain set; lost flights never are."""
+    names = ("J_M_o", "offaxis_peak_deg", "peak_deg", "effort_rms")
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    panels: Any = figure.subplots(2, 2, sharey=True)
+    for panel, name in zip(panels.flat, names, strict=True):
+        for gains, (colour, style) in zip(plan.gains, cycle(STYLES), strict=False):
+            survived = column(results, "survived", gains, axis)
+            ordered = np.sort(column(results, name, gains, axis)[survived])
+            if not len(ordered):
+                continue
+            at = np.unique(np.linspace(0, len(ordered) - 1, POINTS).astype(int))
+            share = (at + 1) / len(survived)
+            panel.step(ordered[at], share, where="post", color=colour, linestyle=style, linewidth=1.8, label=gains)
+        if name == "J_M_o":
+            panel.set_xscale("log")
+        panel.set_xlabel(UNITS[name])
+        panel.set_ylim(0, 1.02)
+        panel.grid(alpha=0.3, which="both")
+    for row in panels:
+        row[0].set_ylabel("share of flights [-]")
+    if panels[0, 0].lines:
+        panels[0, 0].legend(fontsize=8, loc="lower right")
+    figure.suptitle(f"Distributions, {axis}", x=0.02, ha="left")
+    return figure
+
+
+def varied(results: Path) -> list[str]:
+    """Columns of the results that were drawn, in their order."""
+    names: list[str] = pq.read_schema(results).names
+    return names[names.index("rejected_draws") + 1 :]
+
+
+def choose_map(plan: Plan, results: Path, wanted: str | None) -> tuple[str, str] | None:
+    """The two quantities of the survival map.
+
+    Parameters
+    ----------
+    plan : Plan
+    results : Path
+    wanted : str or None
+        NAME,NAME; None: those that have most to do with survival, or with J_M,o where all survive (by rank).
+
+    Returns
+    -------
+    tuple of str or None
+        None when fewer than two quantities vary.
+
+    Raises
+    ------
+    SitlError
+        When a wanted one does not vary.
+    """
+    known = varied(results)
+    if wanted is not None:
+        names = tuple(wanted.split(","))
+        if len(names) != 2 or not set(names) <= set(known):
+            raise SitlError(f"--map: got {wanted!r}, expected two of those that vary: {', '.join(known) or 'none'}")
+        return names
+    if len(known) < 2:
+        return None
+    strength = dict.fromkeys(known, 0.0)
+    for gains in plan.gains:
+        for axis in plan.description.axes:
+            survived = column(results, "survived", gains, axis)
+            badness = ~survived if not survived.all() else rankdata(column(results, "J_M_o", gains, axis))
+            for name in known:
+                strength[name] = max(strength[name], _correlation(column(results, name, gains, axis), badness))
+    first, second = sorted(known, key=lambda name: -strength[name])[:2]
+    return first, second
+
+
+def _correlation(value: NDArray[Any], other: NDArray[Any]) -> float:
+    """Absolute rank correlation of a quantity, also of its distance from its median."""
+    if np.ptp(value) == 0 or np.ptp(other.astype(float)) == 0:
+        return 0.0
+    both = (rankdata(value), rankdata(np.abs(value - np.median(value))))
+    return max(abs(float(np.corrcoef(one, other)[0, 1])) for one in both)
+
+
+def survival_figure(plan: Plan, results: Path, axis: str, names: tuple[str, str]) -> Figure:
+    """Share of the flights that survived, over two varied quantities; one panel a gain set."""
+    columns = min(len(plan.gains), 3)
+    lines = -(-len(plan.gains) // columns)
+    figure = Figure(figsize=(max(3.2 * columns + 0.8, 5), 3.0 * lines + 0.6), layout="constrained")
+    panels: Any = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+    image: Any = None
+    for panel, gains in zip(panels.flat, plan.gains, strict=False):
+        x, y, survived = (column(results, name, gains, axis) for name in (*names, "survived"))
+        edges = [_edges(x), _edges(y)]
+        all_flights, _, _ = np.histogram2d(x, y, edges)
+        good, _, _ = np.histogram2d(x[survived], y[survived], edges)
+        share = np.divide(good, all_flights, out=np.full_like(good, np.nan), where=all_flights > 0)
+        image = panel.pcolormesh(*edges, share.T, cmap="cividis", vmin=0, vmax=1, rasterized=True)
+        lost = np.flatnonzero(~survived)[:CROSSES]
+        panel.plot(x[lost], y[lost], "x", color=VERMILLION, markersize=4, markeredgewidth=1.0)
+        panel.set_title(f"{gains}: {int(survived.sum())} of {len(survived)} survived", loc="left", fontsize=10)
+        panel.set_facecolor("white")
+    for panel in panels[-1]:
+        panel.set_xlabel(label(names[0]))
+    for row in panels:
+        row[0].set_ylabel(label(names[1]))
+    for panel in list(panels.flat)[len(plan.gains) :]:
+        panel.set_visible(False)
+    figure.colorbar(image, ax=panels, label="share survived [-]  (white: not flown; x: lost)")
+    figure.suptitle(f"Survived, {axis}", x=0.02, ha="left")
+    return figure
+
+
+def _edges(value: NDArray[Any]) -> NDArray[np.float64]:
+    """Cells over a quantity: its own values where they are few."""
+    few = np.unique(value)
+    if len(few) <= CELLS:
+        middle = (few[1:] + few[:-1]) / 2
+        step = np.diff(few).min() if len(few) > 1 else 1.0
+        return np.concatenate([[few[0] - step / 2], middle, [few[-1] + step / 2]])
+    return np.linspace(value.min(), value.max(), CELLS + 1)
+
+
+def label(name: str) -> str:
+    """A varied quantity with its unit."""
+    unit = next((unit for start, unit in QUANTITIES.items() if name.startswith(start)), None)
+    return f"{name} [{unit}]" if unit else name
+
+
+#: Beginning of a column's name -> unit.
+QUANTITIES = {
+    "mass": "kg",
+    "inertia": "kg m^2",
+    "products": "kg m^2",
+    "motors.thrust_max": "N",
+    "motors.time_constant": "s",
+    "motors.torque_ratio": "m",
+    "motors.effectiveness": "-",
+    "rate_damping": "1/s",
+    "drag": "N s/m",
+    "delay": "samples",
+    "noise.angle": "rad",
+    "noise.rate": "rad/s",
+    "wind": "m/s",
+    "attitude_deg": "deg",
+    "rates_deg_s": "deg/s",
+    "amplitude_deg": "deg",
+}
