@@ -274,7 +274,8 @@ def parse_faults(texts: Iterable[str], allowed: tuple[Place, ...], who: str) -> 
 
 def fault_help() -> str:
     """What the command line says of all kinds, one line each."""
-    return "\n".join(_kind_help(name, kind) for name, kind in KINDS.items())
+    lines = ["KIND[:TARGET][=SIZE]@AT[+DURATION], times in s; without a duration it lasts to the end of the flight."]
+    return "\n".join([*lines, *(_kind_help(name, kind) for name, kind in KINDS.items())])
 
 
 def _kind_help(name: str, kind: Kind) -> str:

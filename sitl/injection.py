@@ -164,7 +164,9 @@ class Injection:
         if any(fault.kind == "mass" for fault in self.faults):
             self._load(loads)
         if self.autopilot is not None and any(fault.kind == "gain" for fault in self.faults):
-            self.autopilot.controller.set_gains(self.gains * factors)
+            controller, gains = self.autopilot.controller, self.gains * factors
+            if (controller.state["gains"][0] != gains).any():  # each write seats the integrators anew
+                controller.set_gains(gains)
 
     def _battery(self, fault: Fault, periods: int) -> float:
         """Share of the thrust, so many periods after the sag began."""

@@ -14,18 +14,15 @@ import numpy as np
 from codegen.native import NativeController, NativeLibrary, load_native
 from sitl.airframe import Airframe, load_airframe
 from sitl.autopilot import Autopilot
-from sitl.errors import SitlError
 from sitl.faults import Fault, parse_fault
 from sitl.intervals import wilson
 from sitl.loop import Flight, fly
 from sitl.recovery import Recovery, recovery
 from sitl.scenario import Scenario, make_scenario
-from tuning.gains import Gains, load_gains
 from tuning.output import print_table, progress_console
 from tuning.parallel import processes, run_all
 
 AT = 1.1  # s: a tenth of a second into the manoeuvre
-OWN = "own"  # name of the airframe's own gains in tables
 COLUMNS = (
     *("fault", "gains", "survived", "95 %", "peak [deg]", "worst", "RMS", "recovered [s]"),
     *("saturated", "detected [s]", "by", "non-finite"),
@@ -41,7 +38,7 @@ class Request:
     airframe : str
         Name or path.
     gains : tuple of Path
-        Files; empty: the airframe's own.
+        See `sitl.airframe.Vehicle.gain_sets`.
     axis : str
     amplitude_deg, period_s : float
         Of the doublet.
@@ -167,10 +164,7 @@ class Bench:
     def __init__(self, request: Request) -> None:
         vehicle = load_airframe(request.airframe)
         self.airframe: Airframe = vehicle.airframe
-        self.gains: dict[str, Gains] = {path.name.split(".")[0]: load_gains(path) for path in request.gains}
-        if len(self.gains) < len(request.gains):
-            raise SitlError("--gains: two files have the same name, up to its first dot; rename one")
-        self.gains = self.gains or {OWN: vehicle.default_gains()}
+        self.gains = vehicle.gain_sets(request.gains)
         self.libraries: dict[str, NativeLibrary] = {name: load_native(gains) for name, gains in self.gains.items()}
         self.tasks: dict[str, Scenario] = {
             name: make_scenario("doublet", request.axis, request.amplitude_deg, request.period_s, gains.Ts)
