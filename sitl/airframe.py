@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -188,6 +189,19 @@ class Vehicle:
         """The gains that the airframe's file names: a file beside it, else one that comes with mimopilot."""
         beside, shipped = self.path.parent / self.airframe.gains, FOLDER / self.airframe.gains
         return load_gains(shipped if shipped.is_file() and not beside.is_file() else beside)
+
+    def gain_sets(self, files: Sequence[Path]) -> dict[str, Gains]:
+        """Gains files by their names, without the ending; `default_gains` when there are none.
+
+        Raises
+        ------
+        SitlError
+            When two have the same name.
+        """
+        names = [path.name.removesuffix(".toml").removesuffix(".gains") for path in files]
+        if len(set(names)) < len(names):
+            raise SitlError(f"--gains: two files have the same name ({', '.join(names)}); rename one")
+        return dict(zip(names, map(load_gains, files), strict=True)) or {"default": self.default_gains()}
 
 
 def known_airframes() -> list[str]:

@@ -11,6 +11,15 @@ AirframeArgument = Annotated[
     str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file.")
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
+FaultOption = Annotated[
+    list[str] | None,
+    typer.Option("--fault", help="KIND[:TARGET][=SIZE]@AT[+DURATION], seconds; see mimopilot faults --kinds."),
+]
+AxisOption = Annotated[str | None, typer.Option(help="roll or pitch.", show_default="roll")]
+AmplitudeOption = Annotated[float | None, typer.Option(help="Of the doublet or step, degrees.", show_default="22.5")]
+PeriodOption = Annotated[
+    float | None, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.", show_default="0.42")
+]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -27,6 +36,13 @@ UNITS = {
     "effort_rms": "effort, RMS of u [-]",
     "saturated": "saturated samples",
     "crashed_at_s": "lost at [s]",
+    "deviation_peak_deg": "peak, from the flight without faults [deg]",
+    "deviation_rms_deg": "RMS, from the same [deg]",
+    "saturated_since": "saturated samples since the fault",
+    "recovery_s": "recovered after [s]",
+    "detected_s": "detected after [s]",
+    "detected_by": "detected by",
+    "nonfinite": "non-finite outputs",
 }
 
 
@@ -64,6 +80,11 @@ def _load(airframe: str, gains: Path | None) -> tuple[Any, Any]:
     return vehicle.airframe, load_gains(gains) if gains else vehicle.default_gains()
 
 
+def _text(value: Any) -> str:
+    """A figure in a table."""
+    return "-" if value in (None, "") else value if isinstance(value, str) else f"{value:.5g}"
+
+
 def experiment(
     airframe: AirframeArgument,
     out: Annotated[Path, typer.Option(help="Log to write (ULog, .ulg).")],
@@ -92,22 +113,46 @@ def experiment(
         raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s; lower --amplitude", exit_code=1)
 
 
+def scenario_of(
+    name: str,
+    axis: str | None,
+    amplitude_deg: float | None,
+    period_s: float | None,
+    faults: list[str] | None,
+    Ts: float,
+) -> Any:
+    """The scenario that the options of a command ask for, with its faults."""
+    from dataclasses import replace
+
+    from sitl.errors import SitlError
+    from sitl.faults import parse_fault
+    from sitl.scenario import AMPLITUDE_DEG, PERIOD_S, load_scenario, make_scenario
+
+    if name.endswith(".toml"):
+        if (axis, amplitude_deg, period_s) != (None, None, None):
+            raise SitlError(f"--axis, --amplitude-deg, --period-s: {name} says them; change them there")
+        task = load_scenario(Path(name), Ts)
+    else:
+        amplitude = AMPLITUDE_DEG if amplitude_deg is None else amplitude_deg
+        task = make_scenario(name, axis or "roll", amplitude, PERIOD_S if period_s is None else period_s, Ts)
+    return replace(task, faults=(*task.faults, *map(parse_fault, faults or ())))
+
+
 def fly(
     airframe: AirframeArgument,
     gains: GainsOption = None,
-    scenario: Annotated[str, typer.Option(help="doublet, step or hover.")] = "doublet",
-    axis: Annotated[str, typer.Option(help="roll or pitch.")] = "roll",
-    amplitude_deg: Annotated[float, typer.Option(help="Of the doublet or step, degrees.")] = 22.5,
-    period_s: Annotated[
-        float, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.")
-    ] = 0.42,
+    scenario: Annotated[str, typer.Option(help="doublet, step, hover, or a scenario file (TOML).")] = "doublet",
+    axis: AxisOption = None,
+    amplitude_deg: AmplitudeOption = None,
+    period_s: PeriodOption = None,
+    fault: FaultOption = None,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
     on: Annotated[str, typer.Option(help="native, or cortex-m4: the emulated processor of the vehicle.")] = "native",
     as_json: JsonOption = False,
 ) -> None:
-    """Fly the generated C++ in process and print how well it followed."""
-    from dataclasses import asdict
+    """Fly the generated C++ in process and print how well it followed; with faults also what they did."""
+    from dataclasses import asdict, replace
 
     from codegen.cortex_m4 import load_emulated
     from sitl.autopilot import Autopilot
@@ -116,25 +161,31 @@ def fly(
     from sitl.metrics import performance
     from sitl.models import reference_models
     from sitl.recorder import save_flight
-    from sitl.scenario import make_scenario
+    from sitl.recovery import recovery
+    from sitl.scenario import AXES
     from tuning.output import print_json, print_table
 
     body, controller = _load(airframe, gains)
-    task = make_scenario(scenario, axis, amplitude_deg, period_s, controller.Ts)
+    task = scenario_of(scenario, axis, amplitude_deg, period_s, fault, controller.Ts)
     if on not in ("native", "cortex-m4"):
         raise SitlError(f"--on: got {on!r}, expected native or cortex-m4")
     processor = load_emulated(controller) if on == "cortex-m4" else None
     flight = fly_scenario(body, Autopilot(body, controller, processor), task, seed)
     inner, outer = reference_models(controller, task.axis)
     figures: dict[str, Any] = {**asdict(performance(flight, inner, outer)), "crashed_at_s": flight.crashed_at}
+    if task.faults:
+        sound = fly_scenario(body, Autopilot(body, controller), replace(task, faults=()), seed)
+        figures |= {"faults": list(map(str, task.faults)), **asdict(recovery(flight, sound))}
     if out is not None:
         save_flight(out, flight, body, controller)
     if as_json:
-        print_json({"airframe": body.name, "scenario": scenario, "axis": axis, "seed": seed, **figures})
+        print_json({"airframe": body.name, "scenario": task.name, "axis": AXES[task.axis], "seed": seed, **figures})
     else:
-        rows = [[UNITS.get(name, name), "-" if value is None else f"{value:.5g}"] for name, value in figures.items()]
-        title = f"{body.name}, {scenario} on {axis}, against {inner.label} (inner) and {outer.label} (outer)"
-        print_table(title, ["figure", "value"], rows)
+        rows = [[UNITS[name], _text(value)] for name, value in figures.items() if name in UNITS]
+        title = (
+            f"{body.name}, {task.name} on {AXES[task.axis]}, against {inner.label} (inner) and {outer.label} (outer)"
+        )
+        print_table(", ".join([title, *map(str, task.faults)]), ["figure", "value"], rows)
     if flight.crashed_at is not None:
         raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s", exit_code=1)
     if flight.record["fault"].any():

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from sitl.airframe import Airframe
 from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.compiled import compiled
-from sitl.plant import ROTORS, STEP, advance, hover_state
+from sitl.injection import Injection
+from sitl.plant import HISTORY, ROTORS, STEP, advance, hover_state
 from sitl.scenario import Scenario
 from sitl.sensors import NOISES, SIZE, Sensors, euler_angles, low_pass, measure
 
 CRASH_ANGLE = np.radians(60.0)
 CRASH_SECONDS = 0.3
-HISTORY = 256  # control periods that a command can be late, at most
 
 #: The true state at each sample.
 TRUTH = np.dtype([("position", "f8", 3), ("velocity", "f8", 3), ("attitude", "f8", 3), ("rates", "f8", 3)])
@@ -35,11 +35,14 @@ class Flight:
         What the autopilot saw and did.
     truth : (N,) array of `TRUTH`
         What the plant did.
+    runs : (N,) array, optional
+        How often the autopilot ran in each period; by default once.
     """
 
     scenario: Scenario
     record: NDArray[Any]
     truth: NDArray[Any]
+    runs: NDArray[np.int64] | None = None
 
     @property
     def crashed_at(self) -> float | None:
@@ -232,7 +235,7 @@ class Simulator:
 
 
 def fly(airframe: Airframe, autopilot: Autopilot, scenario: Scenario, seed: int = 0, noise: bool = True) -> Flight:
-    """Fly a scenario, starting from hover.
+    """Fly a scenario with its faults, starting from hover.
 
     Parameters
     ----------
@@ -246,10 +249,19 @@ def fly(airframe: Airframe, autopilot: Autopilot, scenario: Scenario, seed: int 
         Of the measurement noise.
     noise : bool
         False: exact measurements.
+
+    Raises
+    ------
+    SitlError
+        When a fault is not possible on this vehicle or in this flight.
     """
+    samples = len(scenario.setpoint)
     simulator = Simulator(airframe, scenario.Ts, seed, noise, autopilot.altitude)
-    record = np.zeros(len(scenario.setpoint), RECORD)
-    record["setpoint"], record["excitation"] = scenario.setpoint, scenario.excitation
-    truth = np.zeros(len(record), TRUTH)
-    simulator.fly(autopilot, simulator.noise(len(record)), record, truth)
-    return Flight(scenario, record, truth)
+    injection = Injection(scenario.faults, airframe, simulator, scenario.Ts, seed, autopilot, samples * scenario.Ts)
+    record, truth, runs = np.zeros(samples, RECORD), np.zeros(samples, TRUTH), np.ones(samples, np.int64)
+    record["setpoint"], record["excitation"] = injection.setpoints(scenario.setpoint), scenario.excitation
+    draws = simulator.noise(samples)
+    for piece, ran, delays in injection.stretches(0, samples):
+        simulator.fly(autopilot, draws[piece], record[piece], truth[piece], ran, delays)
+        runs[piece] = 1 if ran is None else ran
+    return Flight(scenario, record, truth, runs)

@@ -16,6 +16,7 @@ from sitl.errors import SitlError
 
 GRAVITY = 9.80665  # m/s^2, standard gravity
 STEP = 1e-3  # s, of the Runge-Kutta scheme
+HISTORY = 256  # control periods that a command can be late, at most
 
 POSITION, QUATERNION, ROTORS = 0, 6, 13
 

@@ -1,18 +1,38 @@
-"""What a flight is asked to do: attitude set-points and injected moments over time."""
+"""What a flight is asked to do, and what goes wrong on the way: set-points, injected moments and faults over time.
+
+A scenario file names a manoeuvre and its faults:
+
+    manoeuvre = "doublet"       # doublet, step or hover
+    axis = "roll"
+    amplitude_deg = 15
+    period_s = 0.42
+
+    [[fault]]
+    kind = "motor"
+    motor = 3
+    size = 0.7
+    at = 1.2
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from sitl.errors import SitlError
+from sitl.faults import Fault, complaint, make_fault
 from tuning.excitation import hold_from_bandwidth, prbs
 
 AXES = ("roll", "pitch")
 LEAD = 1.0  # s of hover before a manoeuvre
 MAX_ANGLE = np.radians(60.0)  # a vehicle that tilts further counts as lost
+AMPLITUDE_DEG, PERIOD_S = 22.5, 0.42  # of a manoeuvre that says nothing else
 MIN_SAMPLES, MAX_SECONDS = 10, 3600.0
 
 
@@ -34,6 +54,8 @@ class Scenario:
         Axis of the manoeuvre: 0 roll, 1 pitch.
     window : (start, stop)
         Samples over which the manoeuvre is judged.
+    faults : tuple of Fault
+        What goes wrong on the way.
     """
 
     name: str
@@ -42,6 +64,7 @@ class Scenario:
     excitation: NDArray[np.float64]
     axis: int
     window: tuple[int, int]
+    faults: tuple[Fault, ...] = ()
 
 
 def _axis_index(axis: str) -> int:
@@ -114,6 +137,51 @@ def make_scenario(name: str, axis: str, amplitude_deg: float, period: float, Ts:
     if name == "hover":
         return hover(axis, period, Ts)
     raise SitlError(f"scenario: got {name!r}, expected doublet, step or hover")
+
+
+class _Task(BaseModel):
+    """The manoeuvre of a scenario file; arguments of `make_scenario`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    manoeuvre: Literal["doublet", "step", "hover"]
+    axis: Literal["roll", "pitch"] = "roll"
+    amplitude_deg: float = AMPLITUDE_DEG
+    period_s: float = PERIOD_S
+
+
+def load_scenario(path: Path, Ts: float) -> Scenario:
+    """A scenario from a TOML file.
+
+    Parameters
+    ----------
+    path : Path
+        See the module's text for an example; `sitl.faults.Fault` for the fields of a fault.
+    Ts : float, s
+        Control period.
+
+    Raises
+    ------
+    SitlError
+        When the file is not TOML, or an entry is unknown or wrong.
+    """
+    try:
+        table = tomllib.loads(path.read_text())
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SitlError(f"{path}: not a TOML file: {error}") from error
+    faults = table.pop("fault", [])
+    if not (isinstance(faults, list) and all(isinstance(fault, dict) for fault in faults)):
+        raise SitlError(f"{path}: fault: expected [[fault]] tables")
+    try:
+        task = _Task.model_validate(table)
+    except ValidationError as error:
+        raise SitlError(f"{path}: {complaint(error)}") from error
+    try:
+        scenario = make_scenario(task.manoeuvre, task.axis, task.amplitude_deg, task.period_s, Ts)
+    except SitlError as error:
+        raise SitlError(f"{path}: {error}") from error
+    made = (make_fault(fault, f"{path}: fault {i + 1}") for i, fault in enumerate(faults))
+    return replace(scenario, faults=tuple(made))
 
 
 def excitation_flight(
