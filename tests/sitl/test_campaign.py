@@ -29,6 +29,7 @@ from sitl.errors import SitlError
 from sitl.intervals import quantile, wilson
 from sitl.loop import fly
 from sitl.plant import GRAVITY, checked_inertia
+from sitl.scenario import doublet
 from tests.conftest import assert_one_clear_line
 
 VARY = """
@@ -58,7 +59,7 @@ def vehicle():
 def plan_of(vehicle, gains=None, vary=VARY, **entries):
     import tomllib
 
-    given = {"runs": 2 * CHUNK + 5, "seed": 3, "scenario": "doublet", "axes": ["roll", "pitch"]}
+    given = {"runs": 2 * CHUNK + 5, "seed": 3, "manoeuvre": "doublet", "axes": ["roll", "pitch"]}
     given |= {"amplitude_deg": 22.5, "period_s": 0.42, "vary": tomllib.loads(vary)}
     return make_plan(vehicle, gains or {"default": vehicle.default_gains()}, **(given | entries))
 
@@ -68,7 +69,7 @@ def unstable(gains):
 
 
 def drawn(vehicle, vary, runs=2000):
-    variator = Variator(vehicle.airframe, variation_from_toml(vary, "spec"), np.radians(22.5))
+    variator = Variator(vehicle.airframe, variation_from_toml(vary, "spec"), doublet("roll", 0.4, 0.42, 0.004))
     return [variator.draw(5, run) for run in range(runs)]
 
 
@@ -150,6 +151,35 @@ def test_a_wrong_specification_is_refused_by_the_name_of_its_entry(text, words):
     with pytest.raises(SitlError) as error:
         variation_from_toml(text, "spec.toml")
     assert words in str(error.value)
+
+
+def test_faults_are_those_of_the_scenario_and_those_drawn_and_nothing_of_them_is_left_for_the_next_run(vehicle):
+    vary = """
+[[fault]]
+kind = "motor"
+motor = { uniform = [0.5, 4.5] }
+size = { uniform = [0.7, 0.9] }
+at = { uniform = [1.0, 1.4] }
+[[fault]]
+kind = "gain"
+matrix = "Kp_i"
+size = 0.9
+at = 1.2
+"""
+    plan = plan_of(vehicle, vary=vary, faults=["gyro-stuck:roll@1.1+0.02", "loss=0.2@0.5"], axes=["roll"])
+    stand = Stand(plan)
+    motors = set()
+    for run in (5, *range(30)):
+        draw = stand.draw(run)
+        assert [fault.kind for fault in draw.faults] == ["gyro-stuck", "loss", "motor", "gain"]
+        assert draw.faults[2].size == draw.values["fault.1.size"]
+        motors.add(draw.faults[2].motor)
+        flight = stand.fly(draw, "default", 0)
+        scenario = replace(plan.scenarios[0], faults=draw.faults)
+        alone = fly(vehicle.airframe, Autopilot(vehicle.airframe, vehicle.default_gains()), scenario, [3, run, 1])
+        assert flight.record.tobytes() == alone.record.tobytes()
+        assert (flight.runs == alone.runs).all()
+    assert motors == {1, 2, 3, 4}
 
 
 def test_every_gain_set_flies_the_same_vehicles_and_an_unstable_one_survives_never(vehicle, tmp_path):
