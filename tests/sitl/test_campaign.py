@@ -19,12 +19,13 @@ from scipy.stats import binom
 
 from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
+from sitl.campaign.draws import Variator
 from sitl.campaign.execution import run_campaign
 from sitl.campaign.flights import CHUNK, Stand
 from sitl.campaign.plan import make_plan
 from sitl.campaign.replay import fly_again
 from sitl.campaign.summary import summarise
-from sitl.campaign.variation import Variator, variation_from_toml
+from sitl.campaign.variation import variation_from_toml
 from sitl.errors import SitlError
 from sitl.intervals import quantile, wilson
 from sitl.loop import fly
