@@ -1,6 +1,7 @@
 """Campaigns: the same runs whatever flies them, begun again without loss, each flown again bit for bit."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -344,3 +345,10 @@ def test_intervals_of_quantiles_cover_at_least_what_they_say(n, p):
     assert binom.pmf(np.arange(first, last + 1), n, p).sum() >= 0.95
     inside = binom.pmf(np.arange(first + 1, last), n, p).sum()
     assert inside < 0.95
+
+
+def test_the_specification_in_the_readme_can_be_drawn_from(vehicle):
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    (example,) = (block for block in re.findall(r"```toml\n(.*?)```", readme, re.DOTALL) if "[[fault]]" in block)
+    names = drawn(vehicle, example, 1)[0].values
+    assert {"mass", "delay", "inertia.xx", "motors.effectiveness.4", "fault.1.motor", "amplitude_deg"} <= set(names)
