@@ -62,8 +62,8 @@ def campaign(
         FIGURE_COLUMNS,
         SURVIVAL_COLUMNS,
         WORST_COLUMNS,
+        Results,
         figure_rows,
-        summarise,
         survival_rows,
         worst_rows,
     )
@@ -83,18 +83,18 @@ def campaign(
         **_task(scenario, axis, amplitude_deg, period_s, fault),
         vary=tomllib.loads(text),
     )
-    results = run_campaign(plan, out, workers or cores(), scheduler)
-    summary = summarise(plan, results)
+    results = Results(plan, run_campaign(plan, out, workers or cores(), scheduler))
+    summary = results.summarise()
     write_atomically(out / "summary.json", json_text(summary.as_json(".")))
-    report = write_campaign_report(plan, results, summary, survival_map)
+    report = write_campaign_report(results, summary, survival_map)
     if as_json:
-        print_json({"results": str(results), "report": str(report), **summary.as_json(str(out))})
+        print_json({"results": str(results.path), "report": str(report), **summary.as_json(str(out))})
         return
     print(INTERVALS)
     print_table("Survived", SURVIVAL_COLUMNS, survival_rows(summary))
     print_table("Figures", FIGURE_COLUMNS, figure_rows(summary))
     print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))
-    print(f"results {results}\nreport  {report}")
+    print(f"results {results.path}\nreport  {report}")
 
 
 def _task(

@@ -23,7 +23,7 @@ from tuning.output import progress_console
 from tuning.parallel import processes, run_all
 
 RESULTS, PARTS = "results.parquet", "parts"
-ROW_GROUP = 1 << 16  # rows
+ROW_GROUP = 1 << 14  # rows: what is in memory at a time
 AGAIN = "give the same command again to go on"
 
 

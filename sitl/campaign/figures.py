@@ -4,28 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import cycle
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from sitl.campaign.flights import Stand
 from sitl.campaign.plan import Plan
-from sitl.campaign.summary import column, worst_runs
+from sitl.campaign.summary import Results
 from sitl.campaign.variation import UNITS
 from sitl.commands import UNITS as FIGURES
 from sitl.errors import SitlError
+from sitl.faults import KINDS
 from sitl.figures import SETPOINT, STYLES
 from sitl.scenario import AXES
 
 ENVELOPE_RUNS = 400  # flown again for the envelopes: the first ones, which are as random as any
-CELLS = 14  # of the map, on each side
+CELLS, A_CELL = 16, 8  # of the map: at most so many on each side, with so many flights in each on average
 POINTS = 300  # of a distribution's curve
-CROSSES = 300  # lost flights that the map shows one by one
+CROSSES = 200  # lost flights that the map shows one by one
 LARGEST = 75.0  # deg, that the envelopes show
 VERMILLION = "#D55E00"
 
@@ -61,7 +60,7 @@ def fly_sample(stand: Stand) -> Sample:
     return Sample(angles, survived)
 
 
-def envelope_figure(stand: Stand, sample: Sample, results: Path, index: int) -> Figure:
+def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) -> Figure:
     """Responses of all gain sets on one axis: median, 5 to 95 %, and the worst flight; rows are gain sets.
 
     Parameters
@@ -70,7 +69,7 @@ def envelope_figure(stand: Stand, sample: Sample, results: Path, index: int) -> 
         Flies the worst again.
     sample : Sample
         From `fly_sample`.
-    results : Path
+    results : Results
         Knows the worst flights.
     index : int
         Of the scenario.
@@ -82,7 +81,7 @@ def envelope_figure(stand: Stand, sample: Sample, results: Path, index: int) -> 
     panels: Any = figure.subplots(len(plan.gains), 2, sharex=True, sharey="col", squeeze=False)
     for row, name, (colour, _) in zip(panels, plan.gains, cycle(STYLES), strict=False):
         angles, survived = sample.angles[name, index], sample.survived[name, index]
-        bad = worst_runs(results, name, AXES[axis], 1)[0]
+        bad = results.worst(name, AXES[axis], 1)[0].run
         worst = np.degrees(stand.fly(stand.draw(bad), name, index).truth["attitude"][:, :2])
         for panel, shown in zip(row, (axis, 1 - axis), strict=True):
             if shown == axis:
@@ -109,15 +108,15 @@ def envelope_figure(stand: Stand, sample: Sample, results: Path, index: int) -> 
     return figure
 
 
-def distribution_figure(plan: Plan, results: Path, axis: str) -> Figure:
+def distribution_figure(results: Results, axis: str) -> Figure:
     """Share of the flights whose figure is at most x, one curve a gain set; lost flights never are."""
-    names = ("J_M_o", "offaxis_peak_deg", "peak_deg", "effort_rms")
+    plan, names = results.plan, ("J_M_o", "offaxis_peak_deg", "peak_deg", "effort_rms")
     figure = Figure(figsize=(9, 6), layout="constrained")
     panels: Any = figure.subplots(2, 2, sharey=True)
     for panel, name in zip(panels.flat, names, strict=True):
         for gains, (colour, style) in zip(plan.gains, cycle(STYLES), strict=False):
-            survived = column(results, "survived", gains, axis)
-            ordered = np.sort(column(results, name, gains, axis)[survived])
+            survived = results.column("survived", gains, axis)
+            ordered = np.sort(results.column(name, gains, axis)[survived])
             if not len(ordered):
                 continue
             at = np.unique(np.linspace(0, len(ordered) - 1, POINTS).astype(int))
@@ -136,19 +135,12 @@ def distribution_figure(plan: Plan, results: Path, axis: str) -> Figure:
     return figure
 
 
-def varied(results: Path) -> list[str]:
-    """Columns of the results that were drawn, in their order."""
-    names: list[str] = pq.read_schema(results).names
-    return names[names.index("rejected_draws") + 1 :]
-
-
-def choose_map(plan: Plan, results: Path, wanted: str | None) -> tuple[str, str] | None:
+def choose_map(results: Results, wanted: str | None) -> tuple[str, str] | None:
     """The two quantities of the survival map.
 
     Parameters
     ----------
-    plan : Plan
-    results : Path
+    results : Results
     wanted : str or None
         NAME,NAME; None: those that have most to do with survival, or with J_M,o where all survive (by rank).
 
@@ -162,7 +154,7 @@ def choose_map(plan: Plan, results: Path, wanted: str | None) -> tuple[str, str]
     SitlError
         When a wanted one does not vary.
     """
-    known = varied(results)
+    known, plan = results.varied(), results.plan
     if wanted is not None:
         names = tuple(wanted.split(","))
         if len(names) != 2 or not set(names) <= set(known):
@@ -173,10 +165,10 @@ def choose_map(plan: Plan, results: Path, wanted: str | None) -> tuple[str, str]
     strength = dict.fromkeys(known, 0.0)
     for gains in plan.gains:
         for axis in plan.description.axes:
-            survived = column(results, "survived", gains, axis)
-            badness = ~survived if not survived.all() else rankdata(column(results, "J_M_o", gains, axis))
+            survived = results.column("survived", gains, axis)
+            badness = ~survived if not survived.all() else rankdata(results.column("J_M_o", gains, axis))
             for name in known:
-                strength[name] = max(strength[name], _correlation(column(results, name, gains, axis), badness))
+                strength[name] = max(strength[name], _correlation(results.column(name, gains, axis), badness))
     first, second = sorted(known, key=lambda name: -strength[name])[:2]
     return first, second
 
@@ -189,28 +181,30 @@ def _correlation(value: NDArray[Any], other: NDArray[Any]) -> float:
     return max(abs(float(np.corrcoef(one, other)[0, 1])) for one in both)
 
 
-def survival_figure(plan: Plan, results: Path, axis: str, names: tuple[str, str]) -> Figure:
+def survival_figure(results: Results, axis: str, names: tuple[str, str]) -> Figure:
     """Share of the flights that survived, over two varied quantities; one panel a gain set."""
+    plan = results.plan
     columns = min(len(plan.gains), 3)
     lines = -(-len(plan.gains) // columns)
     figure = Figure(figsize=(max(3.2 * columns + 0.8, 5), 3.0 * lines + 0.6), layout="constrained")
     panels: Any = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
     image: Any = None
     for panel, gains in zip(panels.flat, plan.gains, strict=False):
-        x, y, survived = (column(results, name, gains, axis) for name in (*names, "survived"))
-        edges = [_edges(x), _edges(y)]
+        x, y, survived = (results.column(name, gains, axis) for name in (*names, "survived"))
+        cells = int(np.clip(np.sqrt(len(x) / A_CELL), 4, CELLS))
+        edges = [_edges(x, cells), _edges(y, cells)]
         all_flights, _, _ = np.histogram2d(x, y, edges)
         good, _, _ = np.histogram2d(x[survived], y[survived], edges)
         share = np.divide(good, all_flights, out=np.full_like(good, np.nan), where=all_flights > 0)
         image = panel.pcolormesh(*edges, share.T, cmap="cividis", vmin=0, vmax=1, rasterized=True)
         lost = np.flatnonzero(~survived)[:CROSSES]
-        panel.plot(x[lost], y[lost], "x", color=VERMILLION, markersize=4, markeredgewidth=1.0)
+        panel.plot(x[lost], y[lost], "x", color=VERMILLION, markersize=3, markeredgewidth=0.8)
         panel.set_title(f"{gains}: {int(survived.sum())} of {len(survived)} survived", loc="left", fontsize=10)
         panel.set_facecolor("white")
     for panel in panels[-1]:
-        panel.set_xlabel(label(names[0]))
+        panel.set_xlabel(label(plan, names[0]))
     for row in panels:
-        row[0].set_ylabel(label(names[1]))
+        row[0].set_ylabel(label(plan, names[1]))
     for panel in list(panels.flat)[len(plan.gains) :]:
         panel.set_visible(False)
     figure.colorbar(image, ax=panels, label="share survived [-]  (white: not flown; x: lost)")
@@ -218,17 +212,21 @@ def survival_figure(plan: Plan, results: Path, axis: str, names: tuple[str, str]
     return figure
 
 
-def _edges(value: NDArray[Any]) -> NDArray[np.float64]:
+def _edges(value: NDArray[Any], cells: int) -> NDArray[np.float64]:
     """Cells over a quantity: its own values where they are few."""
     few = np.unique(value)
     if len(few) <= CELLS:
         middle = (few[1:] + few[:-1]) / 2
         step = np.diff(few).min() if len(few) > 1 else 1.0
         return np.concatenate([[few[0] - step / 2], middle, [few[-1] + step / 2]])
-    return np.linspace(value.min(), value.max(), CELLS + 1)
+    return np.linspace(value.min(), value.max(), cells + 1)
 
 
-def label(name: str) -> str:
+def label(plan: Plan, name: str) -> str:
     """A varied quantity with its unit."""
-    unit = next((unit for start, unit in UNITS.items() if name.startswith(start)), None)
-    return f"{name} [{unit}]" if unit else name
+    if name.startswith("fault."):
+        _, number, field = name.split(".")
+        kind = plan.description.vary.fault[int(number) - 1].kind
+        unit = {"size": KINDS[kind].unit, "motor": "-"}.get(field, "s")
+        return f"{kind}: {field} [{unit}]"
+    return f"{name} [{next(unit for start, unit in UNITS.items() if name.startswith(start))}]"

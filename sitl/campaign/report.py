@@ -6,11 +6,12 @@ from pathlib import Path
 
 from sitl.campaign import figures
 from sitl.campaign.flights import stand_of
-from sitl.campaign.plan import SPEC, Plan
+from sitl.campaign.plan import SPEC
 from sitl.campaign.summary import (
     FIGURE_COLUMNS,
     SURVIVAL_COLUMNS,
     WORST_COLUMNS,
+    Results,
     Summary,
     figure_rows,
     survival_rows,
@@ -25,20 +26,19 @@ INTERVALS = (
 )
 
 
-def write_campaign_report(plan: Plan, results: Path, summary: Summary, wanted_map: str | None = None) -> Path:
+def write_campaign_report(results: Results, summary: Summary, wanted_map: str | None = None) -> Path:
     """Write `report.html` beside the results.
 
     Parameters
     ----------
-    plan : Plan
-        What was flown.
-    results : Path
-        Parquet file.
+    results : Results
+        What was flown, and the table.
     summary : Summary
         Of it.
     wanted_map : str, optional
         See `sitl.campaign.figures.choose_map`.
     """
+    plan = results.plan
     d, stand = plan.description, stand_of(tuple(plan.files.items()))
     what = [f"{d.amplitude_deg:g} degrees", f"{d.period_s:g} s", *d.faults]
     lead = (
@@ -67,16 +67,16 @@ def write_campaign_report(plan: Plan, results: Path, summary: Summary, wanted_ma
             "Distributions",
             "Share of all flights whose figure is at most that of the abscissa: left is better, and a curve that ends "
             "below 1 has lost the rest.",
-            figures=[svg(figures.distribution_figure(plan, results, axis), f"distribution {axis}") for axis in d.axes],
+            figures=[svg(figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes],
         ),
     ]
-    names = figures.choose_map(plan, results, wanted_map)
+    names = figures.choose_map(results, wanted_map)
     if names:
-        maps = [svg(figures.survival_figure(plan, results, axis, names), f"map {axis}") for axis in d.axes]
+        maps = [svg(figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
         sections.append(Section("Survival", "Over two of the quantities that vary.", figures=maps))
     sections.append(
         Section("What was flown", "", tables=[Table(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])])
     )
-    path = results.with_name("report.html")
+    path = results.path.with_name("report.html")
     write_report(path, f"mimopilot campaign: {plan.airframe.name}", lead, sections)
     return path

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from sitl.campaign.plan import Plan
 from sitl.commands import UNITS
@@ -18,6 +18,7 @@ from sitl.intervals import quantile, wilson
 SHOWN = ("J_M_o", "peak_deg", "offaxis_peak_deg", "effort_rms", "saturated")
 QUANTILES = (0.5, 0.95)
 WORST = 3
+BATCH = 1 << 14  # rows
 
 
 @dataclass(frozen=True)
@@ -77,53 +78,59 @@ def replay_command(folder: str, run: int, gains: str, axis: str) -> str:
     return f"mimopilot replay {folder} --run {run} --gains {gains} --axis {axis}"
 
 
-def summarise(plan: Plan, results: Path) -> Summary:
-    """Sum up the results; one column of one group is in memory at a time, 8 bytes a flight.
+class Results:
+    """The table of a campaign, column by column: 8 bytes a flight are in memory at a time.
 
     Parameters
     ----------
     plan : Plan
-        What was flown.
-    results : Path
+        What was flown: rows stand by run, gain set and axis.
+    path : Path
         Parquet file.
     """
-    groups = [_group(results, gains, axis) for gains in plan.gains for axis in plan.description.axes]
-    first = (next(iter(plan.gains)), plan.description.axes[0])
-    return Summary(plan.description.runs, int(column(results, "rejected_draws", *first).sum()), tuple(groups))
 
+    def __init__(self, plan: Plan, path: Path) -> None:
+        self.plan, self.path = plan, path
 
-def column(results: Path, name: str, gains: str, axis: str) -> np.ndarray[Any, Any]:
-    """One column of the flights of a gain set on an axis, by run; (runs,)."""
-    chosen = (pc.field("gains") == gains) & (pc.field("axis") == axis)
-    return pq.read_table(results, columns=[name], filters=chosen)[name].to_numpy()  # type: ignore[no-any-return]
+    def column(self, name: str, gains: str, axis: str) -> NDArray[Any]:
+        """One column of the flights of a gain set on an axis, (runs,)."""
+        axes = self.plan.description.axes
+        stride = len(self.plan.gains) * len(axes)
+        offset = list(self.plan.gains).index(gains) * len(axes) + axes.index(axis)
+        parts, start = [], 0
+        with pq.ParquetFile(self.path) as table:
+            for batch in table.iter_batches(BATCH, columns=[name]):
+                values = batch.column(0).to_numpy(zero_copy_only=False)
+                parts.append(values[(offset - start) % stride :: stride].copy())
+                start += len(values)
+        return np.concatenate(parts)
 
+    def worst(self, gains: str, axis: str, count: int) -> list[Worst]:
+        """The worst flights of a group: lost ones first, by time; then by J_M,o."""
+        badness, lost_at = self.column("J_M_o", gains, axis), self.column("lost_at_s", gains, axis)
+        lost = np.isfinite(lost_at)
+        order = np.lexsort((-np.where(lost, 0.0, badness), np.where(lost, lost_at, np.inf)))[:count]
+        return [Worst(int(i), float(lost_at[i]) if lost[i] else None, float(badness[i])) for i in order]
 
-def worst_runs(results: Path, gains: str, axis: str, count: int) -> list[int]:
-    """The worst flights of a group: lost ones first, by time; then by J_M,o."""
-    badness = column(results, "J_M_o", gains, axis)
-    lost_at = column(results, "lost_at_s", gains, axis)
-    lost = np.isfinite(lost_at)
-    order = np.lexsort((-np.where(lost, 0.0, badness), np.where(lost, lost_at, np.inf)))
-    return [int(run) for run in order[:count]]
+    def varied(self) -> list[str]:
+        """Columns that were drawn, in their order."""
+        names: list[str] = pq.read_schema(self.path).names
+        return names[names.index("rejected_draws") + 1 :]
 
+    def summarise(self) -> Summary:
+        """Sum up all groups."""
+        d = self.plan.description
+        groups = tuple(self._group(gains, axis) for gains in d.gains for axis in d.axes)
+        return Summary(d.runs, int(self.column("rejected_draws", d.gains[0], d.axes[0]).sum()), groups)
 
-def _group(results: Path, gains: str, axis: str) -> Group:
-    survived = column(results, "survived", gains, axis)
-    n, k = len(survived), int(survived.sum())
-    quantiles = {}
-    for name in SHOWN:
-        ordered = np.sort(np.where(survived, column(results, name, gains, axis), np.inf))
-        quantiles[name] = {f"{p:g}": quantile(ordered, p) for p in QUANTILES}
-    lost_at, J_M_o = (column(results, name, gains, axis) for name in ("lost_at_s", "J_M_o"))
-    worst = tuple(
-        Worst(
-            run,
-            float(lost_at[run]) if np.isfinite(lost_at[run]) else None,
-            float(J_M_o[run]),
-        )
-        for run in worst_runs(results, gains, axis, WORST)
-    )
-    return Group(gains, axis, n, k, wilson(k, n), quantiles, worst)
+    def _group(self, gains: str, axis: str) -> Group:
+        survived = self.column("survived", gains, axis)
+        n, k = len(survived), int(survived.sum())
+        quantiles = {}
+        for name in SHOWN:
+            ordered = np.sort(np.where(survived, self.column(name, gains, axis), np.inf))
+            quantiles[name] = {f"{p:g}": quantile(ordered, p) for p in QUANTILES}
+        return Group(gains, axis, n, k, wilson(k, n), quantiles, tuple(self.worst(gains, axis, WORST)))
 
 
 SURVIVAL_COLUMNS = ("gains, axis", "survived", "95 % interval")

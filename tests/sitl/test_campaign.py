@@ -25,7 +25,7 @@ from sitl.campaign.execution import run_campaign
 from sitl.campaign.flights import CHUNK, Stand
 from sitl.campaign.plan import make_plan
 from sitl.campaign.replay import fly_again
-from sitl.campaign.summary import summarise
+from sitl.campaign.summary import Results
 from sitl.campaign.variation import variation_from_toml
 from sitl.errors import SitlError
 from sitl.intervals import quantile, wilson
@@ -194,16 +194,18 @@ def test_every_gain_set_flies_the_same_vehicles_and_an_unstable_one_survives_nev
     assert good_rows["run"].to_pylist() == bad_rows["run"].to_pylist() == list(range(n))
     for name in table.column_names[table.column_names.index("rejected_draws") :]:
         assert good_rows[name].equals(bad_rows[name]), name
-    survived = {group.gains: (group.survived, group.survived_share) for group in summarise(plan, results).groups}
+    survived = {
+        group.gains: (group.survived, group.survived_share) for group in Results(plan, results).summarise().groups
+    }
     assert survived == {"good": (n, wilson(n, n)), "bad": (0, wilson(0, n))}
-    worst = summarise(plan, results).groups[1].worst[0]
+    worst = Results(plan, results).summarise().groups[1].worst[0]
     assert worst.lost_at_s == min(bad_rows["lost_at_s"].to_pylist())
 
 
 def test_the_summary_is_that_of_the_table(vehicle, tmp_path):
     plan = plan_of(vehicle, axes=["roll"])
     results = run_campaign(plan, tmp_path, 1)
-    (group,) = summarise(plan, results).groups
+    (group,) = Results(plan, results).summarise().groups
     figures = np.sort(pq.read_table(results)["J_M_o"].to_numpy())
     value, low, high = group.quantiles["J_M_o"]["0.5"]
     assert value == figures[(len(figures) - 1) // 2]
