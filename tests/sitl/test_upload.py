@@ -278,10 +278,13 @@ def test_an_older_snapshot_is_never_overwritten(mimopilot, certified, old, new, 
         link.vehicle.values["MIMO_RP_RR"] = 0.5
         assert mimopilot(*arguments).returncode == 0
         assert mimopilot(*arguments).returncode == 0  # nothing to change, nothing to save
+        assert not (tmp_path / "my.before-3.params").exists()
+        restored = mimopilot("restore", "my.before-1.params", "--connect", link.url, "--yes")
+        assert restored.returncode == 0
+        assert read_parameters(tmp_path / "my.before-3.params") == named(new, new)
     assert read_parameters(tmp_path / "mine.params") == named(old, new)
     assert read_parameters(tmp_path / "my.before-1.params") == named(old, new)
     assert read_parameters(tmp_path / "my.before-2.params") == named(new, new) | {"MIMO_RP_RR": 0.5}
-    assert not (tmp_path / "my.before-3.params").exists()
 
 
 URLS = ["udpin:127.0.0.1", "udpin:127.0.0.1:0", "tcp::1", "udpout:127.0.0.1:70000", "", "x", "/dev/null,fast"]
