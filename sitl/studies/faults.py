@@ -65,7 +65,7 @@ class Row:
     survival_interval : (low, high)
         Wilson's, 95 %.
     peak_deg, worst_peak_deg, rms_deg : float, deg
-        From the flight without faults, see `sitl.recovery.Recovery`.
+        From the flight without faults, see `sitl.recovery.Recovery`; the worst is that of `worst_seed`.
     recovered : int
     recovery_s : float or None, s
         Of those that recovered.
@@ -259,7 +259,7 @@ def _row(
         survived=survived,
         survival_interval=wilson(survived, len(found)),
         peak_deg=float(np.median([one.deviation_peak_deg for one in found])),
-        worst_peak_deg=max(one.deviation_peak_deg for one in found),
+        worst_peak_deg=found[worst].deviation_peak_deg,
         rms_deg=float(np.median([one.deviation_rms_deg for one in found])),
         recovered=sum(one.recovery_s is not None for one in found),
         recovery_s=_median([one.recovery_s for one in found]),

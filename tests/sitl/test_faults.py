@@ -16,8 +16,12 @@ from sitl.faults import KINDS, fault_help, parse_fault, parse_faults
 from sitl.injection import STALE_SETPOINT_S, Injection
 from sitl.loop import Simulator, fly
 from sitl.plant import GRAVITY
-from sitl.scenario import doublet, hover, load_scenario
+from sitl.recorder import save_flight
+from sitl.scenario import doublet, excitation_flight, hover, load_scenario, step
 from tests.conftest import assert_one_clear_line
+from tuning.cascade import tune
+from tuning.logs.reader import read_log
+from tuning.spec import load_spec
 
 TS = 0.004
 
@@ -340,6 +344,28 @@ def test_a_delay_makes_every_command_so_late_and_none_acts_before_its_time(vehic
     assert runs is None
     # Sample 10 is the first that is 5 periods late: until it arrives the command of sample 9 - 1 acts on, and 9 itself.
     assert ages.tolist() == [1] * 10 + [1, 2, 3, 4, 5] + [5] * 5 + [5, 1] + [1] * 18
+
+
+def test_the_limit_cycle_starts_at_the_delay_margin_that_the_certificate_gives(vehicle, library, tmp_path):
+    own = vehicle.default_gains()
+    scenario = excitation_flight(20.0, 0.15, 50.0, TS, np.random.default_rng(0))
+    experiment = fly(vehicle.airframe, Autopilot(vehicle.airframe, own, NativeController(library, own)), scenario, 0)
+    save_flight(tmp_path / "a.ulg", experiment, vehicle.airframe, own)
+    gains = tune(read_log(tmp_path / "a.ulg"), load_spec(method="mimo"))
+    assert gains.certificate is not None
+    margin = min(gains.certificate["figures"]["delay_margin_ms"].values()) / 1e3
+    allowed = int(vehicle.airframe.computing_delay + margin / TS)  # whole periods, the vehicle's own among them
+
+    def growth(periods):
+        faults = (parse_fault(f"delay={periods * TS}@0.5"),)
+        task = replace(step("roll", np.radians(2.0), 15.0, TS), faults=faults)
+        flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), task, 0, noise=False)
+        rates = np.abs(flight.truth["rates"][:, 0])
+        return rates[-500:].max() / rates[500:1000].max()
+
+    assert 4 < allowed < 12
+    assert growth(allowed) < 0.1
+    assert growth(allowed + 1) > 3
 
 
 def test_jitter_delivers_the_newest_command_that_has_arrived(vehicle):
