@@ -118,6 +118,7 @@ def scenario_of(
     axis: str | None,
     amplitude_deg: float | None,
     period_s: float | None,
+    tail_s: float | None,
     faults: list[str] | None,
     Ts: float,
 ) -> Any:
@@ -126,15 +127,16 @@ def scenario_of(
 
     from sitl.errors import SitlError
     from sitl.faults import parse_fault
-    from sitl.scenario import AMPLITUDE_DEG, PERIOD_S, load_scenario, make_scenario
+    from sitl.scenario import AMPLITUDE_DEG, PERIOD_S, TAIL_S, load_scenario, make_scenario
 
     if name.endswith(".toml"):
-        if (axis, amplitude_deg, period_s) != (None, None, None):
-            raise SitlError(f"--axis, --amplitude-deg, --period-s: {name} says them; change them there")
+        if (axis, amplitude_deg, period_s, tail_s) != (None,) * 4:
+            raise SitlError(f"--axis, --amplitude-deg, --period-s, --tail-s: {name} says them; change them there")
         task = load_scenario(Path(name), Ts)
     else:
-        amplitude = AMPLITUDE_DEG if amplitude_deg is None else amplitude_deg
-        task = make_scenario(name, axis or "roll", amplitude, PERIOD_S if period_s is None else period_s, Ts)
+        values = zip((amplitude_deg, period_s, tail_s), (AMPLITUDE_DEG, PERIOD_S, TAIL_S), strict=True)
+        amplitude, period, tail = (default if value is None else value for value, default in values)
+        task = make_scenario(name, axis or "roll", amplitude, period, Ts, tail)
     return replace(task, faults=(*task.faults, *map(parse_fault, faults or ())))
 
 
@@ -145,6 +147,7 @@ def fly(
     axis: AxisOption = None,
     amplitude_deg: AmplitudeOption = None,
     period_s: PeriodOption = None,
+    tail_s: Annotated[float | None, typer.Option(help="Level flight after a doublet, s.", show_default="1.5")] = None,
     fault: FaultOption = None,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
@@ -166,7 +169,7 @@ def fly(
     from tuning.output import print_json, print_table
 
     body, controller = _load(airframe, gains)
-    task = scenario_of(scenario, axis, amplitude_deg, period_s, fault, controller.Ts)
+    task = scenario_of(scenario, axis, amplitude_deg, period_s, tail_s, fault, controller.Ts)
     if on not in ("native", "cortex-m4"):
         raise SitlError(f"--on: got {on!r}, expected native or cortex-m4")
     processor = load_emulated(controller) if on == "cortex-m4" else None

@@ -68,6 +68,8 @@ def tell(flight, how):
         record["rates"][140:, 1] = 140.0
     elif how == "motors":
         record["unallocated"][150:, 0] = -1
+    elif how == "altitude":
+        flight.truth["position"][140:, 2] = -7.9
     elif how == "attitude":
         record["attitude"][150:, 1] = -1.1
     return flight
@@ -76,7 +78,15 @@ def tell(flight, how):
 @pytest.mark.parametrize(
     ("how", "sample"),
     # The tick after the gap; the 25th repetition; the 25th sample without authority; 0.3 s beyond 60 degrees.
-    [("input", 160), ("clock", 130), ("stuck", 165), ("motors", 174), ("attitude", 224), ("set-point", 225)],
+    [
+        ("input", 160),
+        ("clock", 130),
+        ("stuck", 165),
+        ("motors", 174),
+        ("altitude", 140),
+        ("attitude", 224),
+        ("set-point", 225),
+    ],
 )
 def test_each_sign_that_the_autopilot_could_see_is_told_when_it_could_be(how, sample):
     fault = "stale@0.4" if how == "set-point" else "gyro-noise=1@0.4"
@@ -92,6 +102,7 @@ def test_short_signs_are_no_detection():
     flight.record["unallocated"][174:190, 1] = 1
     flight.record["rates"][200:225, 2] = 7
     flight.record["attitude"][300:374, 0] = 1.1
+    flight.truth["position"][300:374, 2] = -8.1
     found = recovery(flight, quiet())
     assert (found.detected_s, found.detected_by) == (None, "")
 
