@@ -87,26 +87,43 @@ def _text(value: Any) -> str:
 
 def experiment(
     airframe: AirframeArgument,
-    out: Annotated[Path, typer.Option(help="Log to write (ULog, .ulg).")],
+    out: Annotated[Path, typer.Option(help="Log to write (ULog, .ulg); a folder for --runs.")],
     gains: GainsOption = None,
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
     amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
     bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,
     seed: SeedOption = 0,
+    runs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Fly it so many times, seed by seed: flight-SEED.ulg, for tune --campaign."),
+    ] = None,
+    excitation_seed: Annotated[
+        int | None, typer.Option(min=0, help="Inject the same moment in every run; by default each has its own.")
+    ] = None,
 ) -> None:
     """Fly with a pseudo-random moment injected on roll, then on pitch, and log it."""
     import numpy as np
 
-    from sitl.autopilot import Autopilot
     from sitl.errors import SitlError
-    from sitl.loop import fly as fly_scenario
-    from sitl.recorder import save_flight
-    from sitl.scenario import excitation_flight
+    from sitl.experiments import ExperimentPlan, repeat_experiment
 
     body, controller = _load(airframe, gains)
-    scenario = excitation_flight(seconds_per_axis, amplitude, bandwidth, controller.Ts, np.random.default_rng(seed))
-    flight = fly_scenario(body, Autopilot(body, controller), scenario, seed)
-    save_flight(out, flight, body, controller)
+    plan = ExperimentPlan(body, controller, seconds_per_axis, amplitude, bandwidth, excitation_seed)
+    if runs is not None:
+        from rich.progress import Progress
+
+        from tuning.output import progress_console
+        from tuning.parallel import cores
+
+        with Progress(console=progress_console(), transient=True) as bar:
+            task = bar.add_task("flying", total=runs)
+            lost = repeat_experiment(plan, out, range(seed, seed + runs), cores(), lambda: bar.advance(task))
+        print(f"{out}: {runs} logs of {2 * seconds_per_axis:.1f} s")
+        if lost:
+            names = ", ".join(f"{one} at {when:.2f} s" for one, when in list(lost.items())[:5])
+            raise SitlError(f"{len(lost)} of {runs} vehicles were lost (seed {names}); lower --amplitude", exit_code=1)
+        return
+    flight = plan.record(out, seed)
     tilt = np.degrees(np.abs(flight.truth["attitude"][:, :2]).max(axis=0))
     print(f"{out}: {len(flight.record) * controller.Ts:.1f} s, largest roll {tilt[0]:.1f} deg, pitch {tilt[1]:.1f} deg")
     if flight.crashed_at is not None:

@@ -71,7 +71,7 @@ class Injection:
         seconds: float | None = None,
     ) -> None:
         for fault in faults:
-            _check(fault, airframe, Ts, seconds)
+            check_fault(fault, airframe, Ts, seconds)
         self.faults, self.Ts, self.simulator, self.autopilot = tuple(faults), Ts, simulator, autopilot
         self.spans = [_span(fault, Ts) for fault in faults]
         self.generators = [
@@ -271,7 +271,8 @@ def _elements(fault: Fault) -> range:
     return range(first, first + 4)
 
 
-def _check(fault: Fault, airframe: Airframe, Ts: float, seconds: float | None) -> None:
+def check_fault(fault: Fault, airframe: Airframe, Ts: float, seconds: float | None) -> None:
+    """Refuse a fault that this vehicle cannot have, or that comes after the flight; see `Injection`."""
     where, rotors = f"fault {str(fault)!r}", len(airframe.rotors)
     if fault.motor is not None and fault.motor > rotors:
         raise SitlError(f"{where}: {airframe.name} has motors 1 to {rotors}")

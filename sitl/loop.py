@@ -165,7 +165,9 @@ class Simulator:
         self.state = state
         self.history[:] = state[ROTORS] ** 2 * self.plant.thrust_coefficient / self.plant.thrust_max
         self.count = 0
-        self.seen[:], self.before[:], self.sensors.memory[:] = 0, np.zeros(1, RECORD), 0
+        self.seen[:], self.before[:] = 0, np.zeros(1, RECORD)
+        sensors = self.sensors
+        sensors.memory[:], sensors.bias[:], sensors.stuck[:], sensors.failed[:] = 0, 0, False, False
 
     def noise(self, samples: int) -> NDArray[np.float64]:
         """The next standard normal numbers of the noise, (samples, 6); the same whatever the block size."""

@@ -90,7 +90,7 @@ def _figures(signals, models, true_angles, axis, start, stop):  # type: ignore[n
     J_M_o = J_M_i = J_r_o = J_r_i = off_axis = effort = peak = off_axis_peak = 0.0
     saturated = 0
     for k in range(start, stop):
-        angle, rate = float(attitude[k, axis]), float(rates[k, axis])
+        angle, rate = np.float64(attitude[k, axis]), np.float64(rates[k, axis])
         J_M_o += (angle - angle_model[k]) ** 2
         J_M_i += (rate - rate_model[k]) ** 2
         J_r_o += (angle - setpoint[k, axis]) ** 2
@@ -98,7 +98,7 @@ def _figures(signals, models, true_angles, axis, start, stop):  # type: ignore[n
         off_axis += true_angles[k, 1 - axis] ** 2
         off_axis_peak = max(off_axis_peak, abs(true_angles[k, 1 - axis]))
         for i in range(2):
-            effort += float(moment[k, i]) ** 2
+            effort += np.float64(moment[k, i]) ** 2
         if unallocated[k, 0] != 0.0 or unallocated[k, 1] != 0.0:
             saturated += 1
     for k in range(start, true_angles.shape[0]):

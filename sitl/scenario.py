@@ -146,7 +146,7 @@ def make_scenario(
     raise SitlError(f"scenario: got {name!r}, expected doublet, step or hover")
 
 
-class _Task(BaseModel):
+class Task(BaseModel):
     """The manoeuvre of a scenario file; arguments of `make_scenario`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -158,15 +158,13 @@ class _Task(BaseModel):
     tail_s: float = TAIL_S
 
 
-def load_scenario(path: Path, Ts: float) -> Scenario:
-    """A scenario from a TOML file.
+def read_scenario(path: Path) -> tuple[Task, tuple[Fault, ...]]:
+    """What a scenario file says: the manoeuvre and its faults.
 
     Parameters
     ----------
     path : Path
         See the module's text for an example; `sitl.faults.Fault` for the fields of a fault.
-    Ts : float, s
-        Control period.
 
     Raises
     ------
@@ -181,15 +179,26 @@ def load_scenario(path: Path, Ts: float) -> Scenario:
     if not (isinstance(faults, list) and all(isinstance(fault, dict) for fault in faults)):
         raise SitlError(f"{path}: fault: expected [[fault]] tables")
     try:
-        task = _Task.model_validate(table)
+        task = Task.model_validate(table)
     except ValidationError as error:
         raise SitlError(f"{path}: {complaint(error)}") from error
+    return task, tuple(make_fault(fault, f"{path}: fault {i + 1}") for i, fault in enumerate(faults))
+
+
+def load_scenario(path: Path, Ts: float) -> Scenario:
+    """The scenario of a file, see `read_scenario`; its control period in s.
+
+    Raises
+    ------
+    SitlError
+        As `read_scenario` and `make_scenario`.
+    """
+    task, faults = read_scenario(path)
     try:
         scenario = make_scenario(task.manoeuvre, task.axis, task.amplitude_deg, task.period_s, Ts, task.tail_s)
     except SitlError as error:
         raise SitlError(f"{path}: {error}") from error
-    made = (make_fault(fault, f"{path}: fault {i + 1}") for i, fault in enumerate(faults))
-    return replace(scenario, faults=tuple(made))
+    return replace(scenario, faults=faults)
 
 
 def excitation_flight(

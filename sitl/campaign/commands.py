@@ -7,7 +7,15 @@ from typing import Annotated, Any
 
 import typer
 
-from sitl.commands import UNITS, AirframeArgument, JsonOption, SeedOption
+from sitl.commands import (
+    UNITS,
+    AirframeArgument,
+    AmplitudeOption,
+    FaultOption,
+    JsonOption,
+    PeriodOption,
+    SeedOption,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -28,10 +36,11 @@ def campaign(
     ] = None,
     runs: Annotated[int, typer.Option(min=1, help="How many; each is flown with every gain set on every axis.")] = 1000,
     vary: Annotated[Path | None, typer.Option(help="What varies (TOML), see README; by default the noise.")] = None,
-    scenario: Annotated[str, typer.Option(help="doublet, step or hover.")] = "doublet",
-    axis: Annotated[str, typer.Option(help="roll, pitch or both.")] = "both",
-    amplitude_deg: Annotated[float, typer.Option(help="Of the doublet or step, degrees.")] = 22.5,
-    period_s: Annotated[float, typer.Option(help="Length of the whole doublet, step or hover, s.")] = 0.42,
+    scenario: Annotated[str, typer.Option(help="doublet, step, hover, or a scenario file (TOML).")] = "doublet",
+    axis: Annotated[str | None, typer.Option(help="roll, pitch or both.", show_default="both")] = None,
+    amplitude_deg: AmplitudeOption = None,
+    period_s: PeriodOption = None,
+    fault: FaultOption = None,
     seed: SeedOption = 0,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
     scheduler: Annotated[
@@ -59,32 +68,19 @@ def campaign(
         worst_rows,
     )
     from sitl.campaign.variation import variation_from_toml
-    from sitl.errors import SitlError
-    from sitl.scenario import AXES
     from tuning.files import write_atomically
-    from tuning.gains import load_gains
     from tuning.output import json_text, print_json, print_table
     from tuning.parallel import cores
 
     vehicle = load_airframe(airframe)
     text = vary.read_text() if vary else ""
     variation_from_toml(text, str(vary))
-    if axis not in (*AXES, "both"):
-        raise SitlError(f"--axis: got {axis!r}, expected roll, pitch or both")
-    files = [*(gains or ()), *(more_gains or ())]
-    names = [path.name.removesuffix(".toml").removesuffix(".gains") for path in files]
-    if len(set(names)) < len(names):
-        raise SitlError(f"--gains: two files have the same name ({', '.join(names)}); rename one")
-    sets = dict(zip(names, map(load_gains, files), strict=True)) or {"default": vehicle.default_gains()}
     plan = make_plan(
         vehicle,
-        sets,
+        vehicle.gain_sets([*(gains or ()), *(more_gains or ())]),
         runs=runs,
         seed=seed,
-        scenario=scenario,
-        axes=list(AXES) if axis == "both" else [axis],
-        amplitude_deg=amplitude_deg,
-        period_s=period_s,
+        **_task(scenario, axis, amplitude_deg, period_s, fault),
         vary=tomllib.loads(text),
     )
     results = run_campaign(plan, out, workers or cores(), scheduler)
@@ -99,6 +95,32 @@ def campaign(
     print_table("Figures", FIGURE_COLUMNS, figure_rows(summary))
     print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))
     print(f"results {results}\nreport  {report}")
+
+
+def _task(
+    scenario: str, axis: str | None, amplitude_deg: float | None, period_s: float | None, faults: list[str] | None
+) -> dict[str, Any]:
+    """Entries of the plan from the options that say what is flown."""
+    from sitl.errors import SitlError
+    from sitl.faults import parse_fault
+    from sitl.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, read_scenario
+
+    faults = [str(parse_fault(text)) for text in faults or ()]
+    if scenario.endswith(".toml"):
+        if (axis, amplitude_deg, period_s) != (None, None, None):
+            raise SitlError(f"--axis, --amplitude-deg, --period-s: {scenario} says them; change them there")
+        task, own = read_scenario(Path(scenario))
+        scenario, axis, amplitude_deg, period_s = task.manoeuvre, task.axis, task.amplitude_deg, task.period_s
+        faults = [*map(str, own), *faults]
+    if axis not in (*AXES, "both", None):
+        raise SitlError(f"--axis: got {axis!r}, expected roll, pitch or both")
+    return {
+        "manoeuvre": scenario,
+        "axes": [axis] if axis in AXES else list(AXES),
+        "amplitude_deg": AMPLITUDE_DEG if amplitude_deg is None else amplitude_deg,
+        "period_s": PERIOD_S if period_s is None else period_s,
+        "faults": faults,
+    }
 
 
 def replay(

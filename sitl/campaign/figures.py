@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -24,27 +25,62 @@ ENVELOPE_RUNS = 400  # flown again for the envelopes: the first ones, which are 
 CELLS = 14  # of the map, on each side
 POINTS = 300  # of a distribution's curve
 CROSSES = 300  # lost flights that the map shows one by one
-VERMILLION, GREY = "#D55E00", "#888888"
+LARGEST = 75.0  # deg, that the envelopes show
+VERMILLION = "#D55E00"
 
 
-def envelope_figure(plan: Plan, stand: Stand, results: Path, index: int) -> Figure:
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """The first runs of a campaign, flown again; memory does not grow with the campaign.
+
+    Attributes
+    ----------
+    angles : dict
+        (gain set, index of the scenario) -> (runs, N, 2) array: true roll and pitch, deg.
+    survived : dict
+        The same -> (runs,) array.
+    """
+
+    angles: dict[tuple[str, int], NDArray[np.float32]]
+    survived: dict[tuple[str, int], NDArray[np.bool_]]
+
+
+def fly_sample(stand: Stand) -> Sample:
+    """Fly the runs of the envelopes."""
+    plan, runs = stand.plan, min(stand.plan.description.runs, ENVELOPE_RUNS)
+    keys = [(name, index) for name in plan.gains for index in range(len(plan.scenarios))]
+    angles = {key: np.empty((runs, len(stand.truth), 2), np.float32) for key in keys}
+    survived = {key: np.empty(runs, np.bool_) for key in keys}
+    for run in range(runs):
+        draw = stand.draw(run)
+        for key in keys:
+            flight = stand.fly(draw, *key)
+            angles[key][run] = np.degrees(flight.truth["attitude"][:, :2])
+            survived[key][run] = flight.crashed_at is None
+    return Sample(angles, survived)
+
+
+def envelope_figure(stand: Stand, sample: Sample, results: Path, index: int) -> Figure:
     """Responses of all gain sets on one axis: median, 5 to 95 %, and the worst flight; rows are gain sets.
 
     Parameters
     ----------
-    plan, stand : Plan, Stand
-        What is flown, and where.
+    stand : Stand
+        Flies the worst again.
+    sample : Sample
+        From `fly_sample`.
     results : Path
         Knows the worst flights.
     index : int
         Of the scenario.
     """
+    plan = stand.plan
     scenario, axis = plan.scenarios[index], plan.scenarios[index].axis
     time = (np.arange(len(scenario.setpoint)) - scenario.window[0]) * scenario.Ts
     figure = Figure(figsize=(9, 0.9 + 2.6 * len(plan.gains)), layout="constrained")
     panels: Any = figure.subplots(len(plan.gains), 2, sharex=True, sharey="col", squeeze=False)
-    for row, (name, (colour, _)) in zip(panels, zip(plan.gains, cycle(STYLES), strict=False), strict=True):
-        angles, survived = _responses(stand, name, index, min(plan.description.runs, ENVELOPE_RUNS))
+    for row, name, (colour, _) in zip(panels, plan.gains, cycle(STYLES), strict=False):
+        angles, survived = sample.angles[name, index], sample.survived[name, index]
         bad = worst_runs(results, name, AXES[axis], 1)[0]
         worst = np.degrees(stand.fly(stand.draw(bad), name, index).truth["attitude"][:, :2])
         for panel, shown in zip(row, (axis, 1 - axis), strict=True):
@@ -52,46 +88,24 @@ def envelope_figure(plan: Plan, stand: Stand, results: Path, index: int) -> Figu
                 panel.step(time, np.degrees(scenario.setpoint[:, axis]), where="post", label="set-point", **SETPOINT)
             if survived.any():
                 low, median, high = np.percentile(angles[survived, :, shown], (5, 50, 95), axis=0)
-                band = {"color": colour, "alpha": 0.3, "linewidth": 0, "label": "5 to 95 %"}
-                panel.fill_between(time, low, high, **band)
+                panel.fill_between(time, low, high, color=colour, alpha=0.3, linewidth=0, label="5 to 95 %")
                 panel.plot(time, median, color=colour, linewidth=1.8, label="median")
             panel.plot(time, worst[:, shown], color="black", linestyle=":", linewidth=1.2, label=f"worst: run {bad}")
             panel.grid(alpha=0.3)
             panel.set_title(f"{name}: {AXES[shown]}{'' if shown == axis else ', off-axis'}", loc="left", fontsize=10)
             panel.set_ylabel("angle [deg]")
-        row[0].legend(fontsize=8, loc="upper right")
-        row[1].text(
-            0.98,
-            0.05,
-            f"{int(survived.sum())} of {len(survived)} shown, the others were lost" if not survived.all() else "",
-            transform=row[1].transAxes,
-            ha="right",
-            fontsize=8,
-        )
-    _limit(panels)
+        row[0].legend(fontsize=8, loc="upper right", ncols=2)
+        if not survived.all():
+            row[1].set_title(f"{int((~survived).sum())} of {len(survived)} lost: not shown", loc="right", fontsize=8)
+    for panel in panels[0]:  # a vehicle that tumbles must not flatten the other curves; room for the legend
+        low, high = panel.get_ylim()
+        low, high = max(low, -LARGEST), min(high, LARGEST)
+        panel.set_ylim(low, high + 0.3 * (high - low))
     for panel in panels[-1]:
         panel.set_xlabel("time from the start of the manoeuvre [s]")
-        panel.set_xlim(-0.1, time[-1])
+        panel.set_xlim(max(-0.1, time[0]), time[-1])
     figure.suptitle(f"{AXES[axis].capitalize()} {scenario.name}", x=0.02, ha="left")
     return figure
-
-
-def _responses(stand: Stand, name: str, index: int, runs: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-    """True roll and pitch (runs, N, 2), deg, and which flights survived."""
-    angles = np.empty((runs, len(stand.truth), 2), np.float32)
-    survived = np.empty(runs, np.bool_)
-    for run in range(runs):
-        flight = stand.fly(stand.draw(run), name, index)
-        angles[run] = np.degrees(flight.truth["attitude"][:, :2])
-        survived[run] = flight.crashed_at is None
-    return angles, survived
-
-
-def _limit(panels: Any) -> None:
-    """A vehicle that tumbles must not flatten the other curves."""
-    for panel in panels[0]:
-        low, high = panel.get_ylim()
-        panel.set_ylim(max(low, -75), min(high, 75))
 
 
 def distribution_figure(plan: Plan, results: Path, axis: str) -> Figure:

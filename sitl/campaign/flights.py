@@ -18,6 +18,7 @@ from sitl.autopilot import RECORD, Autopilot
 from sitl.campaign.plan import Plan, plan_from_files
 from sitl.campaign.variation import Draw, Variator
 from sitl.errors import SitlError
+from sitl.injection import Injection
 from sitl.loop import TRUTH, Flight, Simulator, first_loss
 from sitl.metrics import Performance, performance
 from sitl.models import reference_models
@@ -49,30 +50,36 @@ class Stand:
         samples = len(plan.scenarios[0].setpoint)
         self.noise = np.empty((samples, self.simulator.noise(1).shape[1]))
         self.truth = np.zeros(samples, TRUTH)
-        self.records = [np.zeros(samples, RECORD) for _ in plan.scenarios]
-        amplitude = max(float(np.abs(scenario.setpoint).max()) for scenario in plan.scenarios)
-        self.variator = Variator(plan.airframe, plan.description.vary, amplitude)
+        self.record = np.zeros(samples, RECORD)
+        self.runs = np.ones(samples, np.int64)
+        self.variator = Variator(plan.airframe, plan.description.vary, plan.scenarios[0])
 
     def draw(self, run: int) -> Draw:
         """Everything random of a run: what varies, and the noise, which is the same for all its flights."""
         seed = self.plan.description.seed
         np.random.default_rng([seed, run, 1]).standard_normal(out=self.noise)
         draw = self.variator.draw(seed, run)
-        for record, scenario in zip(self.records, self.plan.scenarios, strict=True):
-            record["setpoint"] = draw.factor * scenario.setpoint
         return draw
 
     def fly(self, draw: Draw, gains: str, index: int) -> Flight:
         """One flight of the run that was drawn last, on the axis of the scenario `index`; the next overwrites it."""
-        simulator, autopilot, record = self.simulator, self.autopilots[gains], self.records[index]
+        simulator, autopilot, record = self.simulator, self.autopilots[gains], self.record
+        scenario = self.plan.scenarios[index]
         simulator.plant, simulator.delay = draw.plant, draw.delay
         simulator.sensors = simulator.sensors._replace(
             angle_deviation=draw.angle_deviation, rate_deviation=draw.rate_deviation
         )
         simulator.restart(draw.state.copy())
         autopilot.restart()
-        simulator.fly(autopilot, self.noise, record, self.truth)
-        return Flight(self.plan.scenarios[index], record, self.truth)
+        seed = [self.plan.description.seed, draw.run, 1]
+        injection = Injection(draw.faults, self.plan.airframe, simulator, scenario.Ts, seed, autopilot)
+        record["setpoint"] = injection.setpoints(draw.factor * scenario.setpoint)
+        self.runs[:] = 1
+        for piece, runs, delays in injection.stretches(0, len(record)):
+            simulator.fly(autopilot, self.noise[piece], record[piece], self.truth[piece], runs, delays)
+            if runs is not None:
+                self.runs[piece] = runs
+        return Flight(scenario, record, self.truth, self.runs)
 
     def flights(self, run: int) -> Iterator[tuple[dict[str, Any], Flight]]:
         """All flights of a run, each with its row of the results."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +13,7 @@ from codegen.render import generator_version
 from sitl.airframe import Airframe, Vehicle, airframe_from_toml
 from sitl.campaign.variation import Variation
 from sitl.errors import SitlError
+from sitl.faults import complaint, parse_fault
 from sitl.scenario import Scenario, make_scenario
 from tuning.files import sha256, write_atomically
 from tuning.gains import Gains, gains_from_toml, gains_to_toml, toml_value
@@ -32,12 +33,14 @@ class Description(BaseModel):
     runs, seed : int
     gains : tuple of str
         Names of the gain sets; each has a file.
-    scenario : str
+    manoeuvre : str
         See `sitl.scenario.make_scenario`.
     axes : tuple of str
-        Each run flies the scenario on each.
+        Each run flies the manoeuvre on each.
     amplitude_deg, period_s : float
-        Of the scenario.
+        Of the manoeuvre.
+    faults : tuple of str
+        Of every flight, as `sitl.faults.parse_fault` reads them.
     vary : Variation
     """
 
@@ -47,10 +50,11 @@ class Description(BaseModel):
     runs: Annotated[int, Field(ge=1, le=MAX_RUNS)]
     seed: Annotated[int, Field(ge=0)]
     gains: Annotated[tuple[str, ...], Field(min_length=1)]
-    scenario: str
+    manoeuvre: str
     axes: Annotated[tuple[str, ...], Field(min_length=1)]
     amplitude_deg: float
     period_s: float
+    faults: tuple[str, ...] = ()
     vary: Variation = Variation()
 
 
@@ -130,14 +134,14 @@ def plan_from_files(files: dict[str, str], where: str = "campaign") -> Plan:
     except tomllib.TOMLDecodeError as error:
         raise SitlError(f"{where}/{SPEC}: not a TOML file: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise SitlError(f"{where}/{SPEC}: {place}: {first['msg']}, got {first.get('input')!r}") from error
+        raise SitlError(f"{where}/{SPEC}: {complaint(error)}") from error
     periods = {one.Ts for one in gains.values()}
     if len(periods) > 1:
         raise SitlError(f"gains: the sets are for different control periods, {sorted(periods)} s; fly each by itself")
     d, (Ts,) = description, periods
-    scenarios = [make_scenario(d.scenario, axis, d.amplitude_deg, d.period_s, Ts) for axis in d.axes]
+    faults = tuple(map(parse_fault, d.faults))
+    made = (make_scenario(d.manoeuvre, axis, d.amplitude_deg, d.period_s, Ts) for axis in d.axes)
+    scenarios = [replace(scenario, faults=faults) for scenario in made]
     return Plan(files, description, airframe, gains, scenarios)
 
 

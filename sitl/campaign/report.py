@@ -40,18 +40,20 @@ def write_campaign_report(plan: Plan, results: Path, summary: Summary, wanted_ma
         See `sitl.campaign.figures.choose_map`.
     """
     d, stand = plan.description, stand_of(tuple(plan.files.items()))
+    what = [f"{d.amplitude_deg:g} degrees", f"{d.period_s:g} s", *d.faults]
     lead = (
-        f"{plan.airframe.name}: {d.runs} runs, seed {d.seed}, each a {d.scenario} on {' and '.join(d.axes)} "
-        f"({d.amplitude_deg:g} degrees, {d.period_s:g} s) under {', '.join(plan.gains)}. Every gain set flies the same "
-        f"vehicles with the same noise. {summary.rejected} draws of no vehicle that flies were drawn again."
+        f"{plan.airframe.name}: {d.runs} runs, seed {d.seed}, each a {d.manoeuvre} on {' and '.join(d.axes)} "
+        f"({', '.join(what)}) under {', '.join(plan.gains)}. All fly the same vehicles with the same noise. "
+        f"{summary.rejected} draws of no vehicle that flies were drawn again."
     )
     tables = [
         Table("Survived", SURVIVAL_COLUMNS, survival_rows(summary)),
         Table("Figures", FIGURE_COLUMNS, figure_rows(summary)),
         Table("Worst flights; the commands are for this folder", WORST_COLUMNS, worst_rows(summary, ".")),
     ]
+    sample = figures.fly_sample(stand)
     envelopes = [
-        svg(figures.envelope_figure(plan, stand, results, index), f"envelope {axis}")
+        svg(figures.envelope_figure(stand, sample, results, index), f"envelope {axis}")
         for index, axis in enumerate(d.axes)
     ]
     sections = [

@@ -17,14 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from sitl.airframe import MAX_HOVER, Airframe
+from sitl.airframe import MAX_HOVER, Airframe, Vector
 from sitl.errors import SitlError
+from sitl.faults import Fault, complaint, make_fault
+from sitl.injection import check_fault
 from sitl.plant import GRAVITY, PlantParameters, checked_inertia, hover_state
 from sitl.recorder import quaternions
-from sitl.scenario import MAX_ANGLE
+from sitl.scenario import MAX_ANGLE, Scenario
 
 ATTEMPTS = 1000  # draws for one run before the specification is refused
 MAX_DELAY = 100  # samples
+DRAWN = ("at", "duration", "size", "motor")  # of a fault
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pair = tuple[Finite, Finite]
 
@@ -68,6 +71,9 @@ class Distribution(BaseModel):
             low, high = self.loguniform
             value = math.exp(generator.uniform(math.log(low), math.log(high)))
         return float(value * own if self.relative else value)
+
+
+Number = Finite | Distribution
 
 
 def _absolute(value: Distribution) -> Distribution:
@@ -140,6 +146,26 @@ class AngleVariation(_AbsoluteTable):
     yaw: Distribution | None = None
 
 
+class FaultVariation(_Table):
+    """A fault, see `sitl.faults.Fault`, whose numbers may be distributions; a drawn motor is a whole number."""
+
+    kind: str
+    at: Number
+    duration: Number | None = None
+    size: Number | None = None
+    motor: Number | None = None
+    axis: str | None = None
+    position: Vector | None = None
+    matrix: str | None = None
+
+    @model_validator(mode="after")
+    def _is_absolute(self) -> Any:
+        for name in DRAWN:
+            if isinstance(value := getattr(self, name), Distribution):
+                _absolute(value)
+        return self
+
+
 class Variation(_Table):
     """A specification; what is not named stays as the airframe has it.
 
@@ -157,6 +183,8 @@ class Variation(_Table):
         Whole control periods between a measurement and the motor command made from it.
     amplitude_deg : degrees
         Largest angle of the set-points.
+    fault
+        What goes wrong, beside the faults of the scenario.
     """
 
     mass: Distribution | None = None
@@ -171,6 +199,7 @@ class Variation(_Table):
     attitude_deg: AngleVariation = AngleVariation()
     rates_deg_s: AngleVariation = AngleVariation()
     amplitude_deg: Distribution | None = None
+    fault: tuple[FaultVariation, ...] = ()
 
 
 def variation_from_toml(text: str, where: str) -> Variation:
@@ -186,11 +215,7 @@ def variation_from_toml(text: str, where: str) -> Variation:
     except tomllib.TOMLDecodeError as error:
         raise SitlError(f"{where}: not a TOML file: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise SitlError(
-            f"{where}: {place}: {first['msg'].removeprefix('Value error, ')}, got {first.get('input')!r}"
-        ) from error
+        raise SitlError(f"{where}: {complaint(error)}") from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +224,7 @@ class Draw:
 
     Attributes
     ----------
+    run : int
     values : dict
         Column -> what was drawn, in the specification's unit.
     plant : PlantParameters
@@ -209,10 +235,13 @@ class Draw:
         Of the noise.
     factor : float
         On the set-points.
+    faults : tuple of Fault
+        Of the scenario and those drawn.
     rejected : int
         Impossible draws before this one.
     """
 
+    run: int
     values: dict[str, float]
     plant: PlantParameters
     state: NDArray[np.float64]
@@ -220,6 +249,7 @@ class Draw:
     angle_deviation: float
     rate_deviation: float
     factor: float
+    faults: tuple[Fault, ...]
     rejected: int
 
 
@@ -232,19 +262,23 @@ class Variator:
         What is varied.
     variation : Variation
         How.
-    amplitude : float, rad
-        Largest angle of the set-points, 0 without any.
+    scenario : Scenario
+        What is flown; its axis does not matter.
 
     Raises
     ------
     SitlError
-        When the amplitude is to vary and there is none.
+        When the amplitude is to vary and there is none, or a fault of the scenario is not possible.
     """
 
-    def __init__(self, airframe: Airframe, variation: Variation, amplitude: float, altitude: float = 10.0) -> None:
-        if variation.amplitude_deg is not None and amplitude == 0:
+    def __init__(self, airframe: Airframe, variation: Variation, scenario: Scenario) -> None:
+        self.airframe, self.variation, self.scenario = airframe, variation, scenario
+        self.amplitude = float(np.abs(scenario.setpoint).max())
+        self.seconds = len(scenario.setpoint) * scenario.Ts
+        if variation.amplitude_deg is not None and self.amplitude == 0:
             raise SitlError("amplitude_deg: this scenario has no angle that could vary")
-        self.airframe, self.variation, self.amplitude, self.altitude = airframe, variation, amplitude, altitude
+        for fault in scenario.faults:
+            check_fault(fault, airframe, scenario.Ts, self.seconds)
         self.base = airframe.plant()
 
     def draw(self, seed: int, run: int) -> Draw:
@@ -258,12 +292,12 @@ class Variator:
         generator = np.random.default_rng([seed, run, 0])
         for attempt in range(ATTEMPTS):
             try:
-                return self._draw(generator, attempt)
+                return self._draw(generator, run, attempt)
             except ImpossibleError as reason:
                 last = reason
         raise SitlError(f"run {run}: {ATTEMPTS} draws in a row are of no vehicle that flies, the last because {last}")
 
-    def _draw(self, generator: np.random.Generator, attempt: int) -> Draw:
+    def _draw(self, generator: np.random.Generator, run: int, attempt: int) -> Draw:
         values: dict[str, float] = {}
 
         def drawn(name: str, distribution: Distribution | None, own: float = 0.0) -> float:
@@ -299,7 +333,7 @@ class Variator:
         deviations = drawn("noise.angle", v.noise.angle, noise.angle), drawn("noise.rate", v.noise.rate, noise.rate)
         if min(deviations) < 0:
             raise ImpossibleError("a standard deviation of the noise is negative")
-        state = hover_state(plant, self.altitude)
+        state = hover_state(plant)
         names = ("roll", "pitch", "yaw")
         angles = [drawn(f"attitude_deg.{name}", getattr(v.attitude_deg, name)) for name in names]
         rates = [drawn(f"rates_deg_s.{name}", getattr(v.rates_deg_s, name)) for name in names]
@@ -311,7 +345,22 @@ class Variator:
         factor = drawn("amplitude_deg", v.amplitude_deg, amplitude) / amplitude if v.amplitude_deg is not None else 1.0
         if not 0 <= factor * self.amplitude <= MAX_ANGLE:
             raise ImpossibleError(f"the amplitude is {factor * amplitude:.4g} degrees, expected 0 to 60")
-        return Draw(values, plant, state, delay, *deviations, factor, attempt)
+        faults = tuple(self._fault(f"fault.{i + 1}", fault, drawn) for i, fault in enumerate(v.fault))
+        return Draw(run, values, plant, state, delay, *deviations, factor, (*self.scenario.faults, *faults), attempt)
+
+    def _fault(self, name: str, fault: FaultVariation, drawn: Any) -> Fault:
+        table = fault.model_dump(exclude_none=True)
+        for field in DRAWN:
+            if isinstance(value := getattr(fault, field), Distribution):
+                table[field] = drawn(f"{name}.{field}", value)
+        if "motor" in table:
+            table["motor"] = round(table["motor"])
+        try:
+            made = make_fault(table, name)
+            check_fault(made, self.airframe, self.scenario.Ts, self.seconds)
+        except SitlError as error:
+            raise ImpossibleError(str(error)) from error
+        return made
 
     def _inertia(self, drawn: Any) -> NDArray[np.float64]:
         v, own = self.variation, self.base.inertia
