@@ -18,9 +18,10 @@ from codegen.vectors import random_inputs, reference_outputs
 from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import fly
+from sitl.mavlink import lockstep
 from sitl.mavlink.connection import Connection
 from sitl.mavlink.exchange import Conversation
-from sitl.mavlink.host import Host, plant_process
+from sitl.mavlink.plant_process import plant_process
 from sitl.mavlink.upload import apply, read
 from sitl.mavlink.words import drive, single
 from sitl.scenario import doublet, excitation_flight
@@ -94,11 +95,9 @@ def main() -> None:
         autopilot = Autopilot(airframe, gains, NativeController(library, gains))
         autopilot.warm_up()
         with plant_process("adam0", 0, TS, 0, None) as port:
-            host = Host(autopilot, 4, port)
             begin = time.perf_counter()
-            host.fly(task)
+            lockstep.fly(autopilot, task, port)
             over_wire = len(task.setpoint) * TS / (time.perf_counter() - begin)
-            host.close()
         rows.append(
             ["the same as two processes over MAVLink", f"{over_wire:.0f} x real time", f"1/{speed / over_wire:.0f}"]
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -104,9 +105,10 @@ def restore(
     from sitl.mavlink.upload_console import transact
 
     plan = restoration(read_parameters(parameters))
-    options = Options(
-        connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, parameters.with_suffix("")
-    )
+    stem = parameters.with_name(
+        re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
+    )  # a snapshot's next one is its sister
+    options = Options(connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, stem)
     transact(plan, options)
 
 
