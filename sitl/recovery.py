@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.injection import STALE_SETPOINT_S
 from sitl.loop import CRASH_ANGLE, CRASH_SECONDS, Flight
+from sitl.setpoints import STALE_SECONDS
 
 RECOVERED = np.radians(1.0)  # from the flight without faults, for good
 SUNK = 2.0  # m
@@ -131,9 +131,9 @@ def _first(signs: NDArray[np.bool_], length: int) -> int | None:
 def _stale(flight: Flight, begin: int) -> int | None:
     """First sample that is flown without a set-point, from `begin` on."""
     late = (
-        round((fault.at + STALE_SETPOINT_S) / flight.scenario.Ts)
+        round((fault.at + STALE_SECONDS) / flight.scenario.Ts)
         for fault in flight.scenario.faults
-        if fault.kind == "stale" and (fault.duration is None or fault.duration > STALE_SETPOINT_S)
+        if fault.kind == "stale" and (fault.duration is None or fault.duration > STALE_SECONDS)
     )
     sample = min(late, default=len(flight.record))
     return sample - begin if sample < len(flight.record) else None

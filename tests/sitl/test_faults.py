@@ -13,11 +13,12 @@ from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.errors import SitlError
 from sitl.faults import KINDS, fault_help, parse_fault, parse_faults
-from sitl.injection import STALE_SETPOINT_S, Injection
+from sitl.injection import Injection
 from sitl.loop import Simulator, fly
 from sitl.plant import GRAVITY
 from sitl.recorder import save_flight
 from sitl.scenario import doublet, excitation_flight, hover, load_scenario, step
+from sitl.setpoints import STALE_SECONDS
 from tests.conftest import assert_one_clear_line
 from tuning.cascade import tune
 from tuning.logs.reader import read_log
@@ -440,7 +441,7 @@ def test_a_stale_set_point_is_flown_for_half_a_second_then_level_with_its_headin
     scenario.setpoint[:] = [0.1, -0.05, 0.2]
     scenario.setpoint[60:, 0] = 0.2
     flown_for = flown(scenario, "stale@0.2+1").record["setpoint"]
-    last_fresh = 49 + round(STALE_SETPOINT_S / TS)
+    last_fresh = 49 + round(STALE_SECONDS / TS)
     assert (flown_for[: last_fresh + 1] == np.float32([0.1, -0.05, 0.2])).all()
     assert (flown_for[last_fresh + 1 : 300] == np.float32([0, 0, 0.2])).all()
     assert (flown_for[300:] == np.float32([0.2, -0.05, 0.2])).all()
