@@ -255,12 +255,17 @@ def sitl(
     ] = None,
     speed: SpeedOption = "1",
     seed: SeedOption = 0,
+    fault: FaultOption = None,
     log: Annotated[
         Path | None, typer.Option(help="Log each flight, arming to disarming, at full rate: FILE.ulg, FILE-2.ulg ...")
     ] = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
     from sitl.autopilot import Autopilot
+    from sitl.autopilot_faults import AutopilotFaults
+    from sitl.errors import SitlError
+    from sitl.faults import parse_fault
+    from sitl.injection import check_fault
     from sitl.mavlink.flight_log import FlightLog
     from sitl.mavlink.ground import Ground
     from sitl.mavlink.host import Host
@@ -274,10 +279,18 @@ def sitl(
 
     body, controller = _load(airframe, gains)
     times = _times(speed)
-    link = PlantLink(_address(plant) if plant else PlantProcess(airframe, port, controller.Ts, seed, times))
+    faults = [parse_fault(text) for text in fault or ()]
+    for one in faults:
+        check_fault(one, body, controller.Ts, None)
+    outside = [one for one in faults if one.place != "autopilot"]
+    if plant and outside:
+        raise SitlError(f"fault {str(outside[0])!r}: happens in the plant that runs already: give it to that one")
     autopilot = Autopilot(body, controller)
     autopilot.warm_up()
-    host = Host(autopilot, link, FlightLog(log, body, controller.Ts) if log else None)
+    inside = AutopilotFaults(faults, controller.Ts, autopilot) if len(faults) > len(outside) else None
+    process = PlantProcess(airframe, port, controller.Ts, seed, times, faults=outside)
+    link = PlantLink(_address(plant) if plant else process)
+    host = Host(autopilot, link, FlightLog(log, body, controller.Ts) if log else None, inside)
     telemetry = Telemetry(host.situation)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
     signer = Signer(read_key(signing_key)) if signing_key else None
@@ -307,11 +320,13 @@ def plant(
         float, typer.Option(min=0, max=1000, help="Where it starts hovering, m; 0: on the ground, rotors standing.")
     ] = 0.0,
     seed: SeedOption = 0,
+    fault: FaultOption = None,
     child: Annotated[bool, typer.Option("--child", help="End when standard input is closed.")] = False,
 ) -> None:
     """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot after another."""
     from sitl.airframe import load_airframe
     from sitl.errors import SitlError
+    from sitl.faults import parse_faults
     from sitl.mavlink.link import LOOPBACK, listen
     from sitl.mavlink.plant_server import PlantServer
     from sitl.mavlink.simulator import SimulatedVehicle
@@ -323,7 +338,8 @@ def plant(
     def tell(text: str) -> None:
         print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
 
-    vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell)
+    faults = parse_faults(fault or (), ("plant", "link"), "the plant")
+    vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell, faults)
     with listen(LOOPBACK, port) as socket:
         print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
         try:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from codegen.parameters import PARAMETERS
 from sitl.autopilot import RECORD, Autopilot, tick
+from sitl.autopilot_faults import AutopilotFaults
 from sitl.errors import SitlError
 from sitl.lift import Estimate
 from sitl.mavlink.flight_log import FlightLog
@@ -45,6 +46,8 @@ class Host:
         Where the body is.
     log : FlightLog or None
         Where flights are recorded.
+    faults : AutopilotFaults, optional
+        Its own, in seconds from the first frame of a plant.
 
     Attributes
     ----------
@@ -57,8 +60,14 @@ class Host:
         How long frames of the plant wait.
     """
 
-    def __init__(self, autopilot: Autopilot, plant: PlantLink, log: FlightLog | None = None) -> None:
-        self.autopilot, self.plant, self.log = autopilot, plant, log
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        plant: PlantLink,
+        log: FlightLog | None = None,
+        faults: AutopilotFaults | None = None,
+    ) -> None:
+        self.autopilot, self.plant, self.log, self.faults = autopilot, plant, log, faults
         self.vehicle = Vehicle(autopilot.hover)
         self.vehicle.obstacles["plant"] = "no plant is connected"
         self.situation = Situation(self.vehicle)
@@ -66,7 +75,7 @@ class Host:
         self.lateness = Lateness()
         self.measurement = np.zeros(SIZE)
         euler_angles(*self.measurement[:4])  # compiled now, not in flight
-        self.stamp = -1
+        self.stamp = self._zero = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
         self.heard = 0.0
         self._connected = False
@@ -107,7 +116,7 @@ class Host:
     def _begin(self, now: float) -> None:
         """A plant that may know nothing of what was before."""
         self.heard = now
-        self.stamp = -1
+        self.stamp = self._zero = -1
         self._periods = 0
         self.situation.home = self.situation.imu = self.situation.fix = ()
         self.vehicle.plant_back()
@@ -156,7 +165,17 @@ class Host:
         self.plant.answer(self.stamp, self.situation.row["commands"], self.vehicle.armed)
         self.lateness.answered()
 
+    def _break(self) -> None:
+        """Put the faults of now into the controller, and stop what steers."""
+        assert self.faults is not None
+        self._zero = self.stamp if self._zero < 0 else self._zero
+        k = round(1e-6 * (self.stamp - self._zero) / self.faults.Ts)
+        self.faults.apply(k)
+        self.vehicle.attitude.cut = self.vehicle.sticks.cut = self.faults.stale(k)
+
     def _compute(self, state: PlantState) -> None:
+        if self.faults is not None:
+            self._break()
         state.measure(self.measurement)
         now = 1e-6 * self.stamp
         autopilot, m = self.autopilot, self.measurement

@@ -137,8 +137,10 @@ class Lockstep:
                     time.sleep(ahead)
                 elif ahead < -FORGET_S:
                     begin, count = now, 0
-            self.connection.sendall(vehicle.messages())
-            answer = self._answer()
+            messages = vehicle.messages()
+            if vehicle.copies:
+                self.connection.sendall(messages * vehicle.copies)
+                answer = self._answer()
 
     def _first_answer(self) -> tuple[Any, ...]:
         """Offer the start until it is answered."""
