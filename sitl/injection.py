@@ -209,7 +209,7 @@ class Injection:
             due = k + int(late[i])
             self.arrivals[due] = max(self.arrivals.get(due, k), k)
             self.newest = max(self.newest, self.arrivals.pop(k, self.newest))
-            ages[i] = k - self.newest
+            ages[i] = min(k - self.newest, HISTORY - 1)  # farther back nothing is kept
         return ages
 
 
