@@ -34,6 +34,7 @@ def processes(count: int) -> Iterator[Executor]:
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
     with ProcessPoolExecutor(count, context, initializer=_follow_parent) as executor:
+        executor.submit(int).result()  # forks them now, before a progress bar has threads
         yield executor
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
+from concurrent.futures import CancelledError, Executor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
@@ -96,18 +96,21 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, i
             yield executor, 2 * workers
         return
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker
     except ImportError:
         raise SitlError("--scheduler needs dask: pip install 'mimopilot[cluster]'") from None
     try:
-        client = Client(scheduler, timeout=10)
+        client = Client(scheduler, timeout=5)
     except (OSError, ValueError) as error:
         raise SitlError(f"--scheduler {scheduler}: no scheduler answers there ({error})", exit_code=1) from error
     with client:
         threads = sum(client.ncores().values())
         if not threads:
             raise SitlError(f"--scheduler {scheduler}: it has no workers; start some with dask worker", exit_code=1)
-        yield client.get_executor(pure=False), 2 * threads
+        try:
+            yield client.get_executor(pure=False), 2 * threads
+        except (KilledWorker, CancelledError, OSError) as error:
+            raise SitlError(f"--scheduler {scheduler}: the cluster failed ({error}); {AGAIN}", exit_code=1) from error
 
 
 @contextmanager

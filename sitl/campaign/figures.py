@@ -16,7 +16,8 @@ from scipy.stats import rankdata
 from sitl.campaign.flights import Stand
 from sitl.campaign.plan import Plan
 from sitl.campaign.summary import column, worst_runs
-from sitl.commands import UNITS
+from sitl.campaign.variation import UNITS
+from sitl.commands import UNITS as FIGURES
 from sitl.errors import SitlError
 from sitl.figures import SETPOINT, STYLES
 from sitl.scenario import AXES
@@ -124,7 +125,7 @@ def distribution_figure(plan: Plan, results: Path, axis: str) -> Figure:
             panel.step(ordered[at], share, where="post", color=colour, linestyle=style, linewidth=1.8, label=gains)
         if name == "J_M_o":
             panel.set_xscale("log")
-        panel.set_xlabel(UNITS[name])
+        panel.set_xlabel(FIGURES[name])
         panel.set_ylim(0, 1.02)
         panel.grid(alpha=0.3, which="both")
     for row in panels:
@@ -229,26 +230,5 @@ def _edges(value: NDArray[Any]) -> NDArray[np.float64]:
 
 def label(name: str) -> str:
     """A varied quantity with its unit."""
-    unit = next((unit for start, unit in QUANTITIES.items() if name.startswith(start)), None)
+    unit = next((unit for start, unit in UNITS.items() if name.startswith(start)), None)
     return f"{name} [{unit}]" if unit else name
-
-
-#: Beginning of a column's name -> unit.
-QUANTITIES = {
-    "mass": "kg",
-    "inertia": "kg m^2",
-    "products": "kg m^2",
-    "motors.thrust_max": "N",
-    "motors.time_constant": "s",
-    "motors.torque_ratio": "m",
-    "motors.effectiveness": "-",
-    "rate_damping": "1/s",
-    "drag": "N s/m",
-    "delay": "samples",
-    "noise.angle": "rad",
-    "noise.rate": "rad/s",
-    "wind": "m/s",
-    "attitude_deg": "deg",
-    "rates_deg_s": "deg/s",
-    "amplitude_deg": "deg",
-}

@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 
 from codegen.render import generator_version
 from sitl.autopilot import RECORD, Autopilot
+from sitl.campaign.draws import Draw, Variator
 from sitl.campaign.plan import Plan, plan_from_files
-from sitl.campaign.variation import Draw, Variator
 from sitl.errors import SitlError
 from sitl.injection import Injection
 from sitl.loop import TRUTH, Flight, Simulator, first_loss

@@ -1,6 +1,7 @@
 """Campaigns: the same runs whatever flies them, begun again without loss, each flown again bit for bit."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -19,12 +20,13 @@ from scipy.stats import binom
 
 from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
+from sitl.campaign.draws import Variator
 from sitl.campaign.execution import run_campaign
 from sitl.campaign.flights import CHUNK, Stand
 from sitl.campaign.plan import make_plan
 from sitl.campaign.replay import fly_again
 from sitl.campaign.summary import summarise
-from sitl.campaign.variation import Variator, variation_from_toml
+from sitl.campaign.variation import variation_from_toml
 from sitl.errors import SitlError
 from sitl.intervals import quantile, wilson
 from sitl.loop import fly
@@ -343,3 +345,10 @@ def test_intervals_of_quantiles_cover_at_least_what_they_say(n, p):
     assert binom.pmf(np.arange(first, last + 1), n, p).sum() >= 0.95
     inside = binom.pmf(np.arange(first + 1, last), n, p).sum()
     assert inside < 0.95
+
+
+def test_the_specification_in_the_readme_can_be_drawn_from(vehicle):
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    (example,) = (block for block in re.findall(r"```toml\n(.*?)```", readme, re.DOTALL) if "[[fault]]" in block)
+    names = drawn(vehicle, example, 1)[0].values
+    assert {"mass", "delay", "inertia.xx", "motors.effectiveness.4", "fault.1.motor", "amplitude_deg"} <= set(names)
