@@ -70,6 +70,18 @@ def test_the_plant_refuses_what_it_cannot_do_before_it_listens(mimopilot):
     assert_one_clear_line(mimopilot("plant", "adam0", "--port", 0, "--fault", "motor:5=0@1"), "motors 1 to 4")
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--plant", "127.0.0.1:1", "--fault", "loss=0.1@1"), ("'loss=0.1@1'", "give it to that one")),
+        (("--fault", "gain:Kp_o=100@1"), ("MIMO_AP_RR would be 650", "a vehicle refuses that write")),
+        (("--fault", "motor:9=0@1"), ("motors 1 to 4",)),
+    ],
+)
+def test_the_vehicle_refuses_what_it_cannot_do_before_it_takes_a_port(mimopilot, words, told):
+    assert_one_clear_line(mimopilot("sitl", "adam0", *words), *told)
+
+
 class Frames:
     """A plant that only tells that the vehicle hangs in the air, level."""
 
