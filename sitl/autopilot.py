@@ -54,7 +54,8 @@ def tick(step_address, state, controls, outputs, allocation, hover, altitude, me
     """One period: `row.setpoint` and `row.excitation` are given, everything else of `row` is filled.
 
     `controls` and `outputs` are one-row arrays of the controller's input and output; the saturation of the
-    last period is kept in `controls`.
+    last period is kept in `controls`. `hover` is the collective that carries the weight; where no altitude is
+    held (NaN) it is the collective itself. The motors of a vehicle that is not armed stand.
     """
     roll, pitch, yaw = euler_angles(measurement[0], measurement[1], measurement[2], measurement[3])
     given = controls[0]
@@ -73,9 +74,18 @@ def tick(step_address, state, controls, outputs, allocation, hover, altitude, me
         row.moment[i] = made.moment[i]
         row.rates_setpoint[i] = made.rates_setpoint[i]
     row.fault = made.fault
-    tilt = np.cos(roll) * np.cos(pitch)
-    row.collective = altitude_hold(measurement[7] / 1000.0, measurement[8] / 100.0, altitude, hover, tilt)
-    allocate(row.moment, row.collective, allocation, row.commands, row.unallocated)
+    if np.isnan(altitude):
+        row.collective = hover
+    else:
+        tilt = np.cos(roll) * np.cos(pitch)
+        row.collective = altitude_hold(measurement[7] / 1000.0, measurement[8] / 100.0, altitude, hover, tilt)
+    if given.armed != 0:
+        allocate(row.moment, row.collective, allocation, row.commands, row.unallocated)
+    else:
+        for i in range(row.commands.shape[0]):
+            row.commands[i] = 0.0
+        for i in range(3):
+            row.unallocated[i] = 0.0
     for i in range(3):
         given.saturation[i] = int(row.unallocated[i])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,6 +22,7 @@ PeriodOption = Annotated[
     float | None, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.", show_default="0.42")
 ]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
+SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast as it goes.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
@@ -135,6 +137,7 @@ def scenario_of(
     axis: str | None,
     amplitude_deg: float | None,
     period_s: float | None,
+    tail_s: float | None,
     faults: list[str] | None,
     Ts: float,
 ) -> Any:
@@ -143,15 +146,16 @@ def scenario_of(
 
     from sitl.errors import SitlError
     from sitl.faults import parse_fault
-    from sitl.scenario import AMPLITUDE_DEG, PERIOD_S, load_scenario, make_scenario
+    from sitl.scenario import AMPLITUDE_DEG, PERIOD_S, TAIL_S, load_scenario, make_scenario
 
     if name.endswith(".toml"):
-        if (axis, amplitude_deg, period_s) != (None, None, None):
-            raise SitlError(f"--axis, --amplitude-deg, --period-s: {name} says them; change them there")
+        if (axis, amplitude_deg, period_s, tail_s) != (None,) * 4:
+            raise SitlError(f"--axis, --amplitude-deg, --period-s, --tail-s: {name} says them; change them there")
         task = load_scenario(Path(name), Ts)
     else:
-        amplitude = AMPLITUDE_DEG if amplitude_deg is None else amplitude_deg
-        task = make_scenario(name, axis or "roll", amplitude, PERIOD_S if period_s is None else period_s, Ts)
+        values = zip((amplitude_deg, period_s, tail_s), (AMPLITUDE_DEG, PERIOD_S, TAIL_S), strict=True)
+        amplitude, period, tail = (default if value is None else value for value, default in values)
+        task = make_scenario(name, axis or "roll", amplitude, period, Ts, tail)
     return replace(task, faults=(*task.faults, *map(parse_fault, faults or ())))
 
 
@@ -162,6 +166,7 @@ def fly(
     axis: AxisOption = None,
     amplitude_deg: AmplitudeOption = None,
     period_s: PeriodOption = None,
+    tail_s: Annotated[float | None, typer.Option(help="Level flight after a doublet, s.", show_default="1.5")] = None,
     fault: FaultOption = None,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
@@ -183,7 +188,7 @@ def fly(
     from tuning.output import print_json, print_table
 
     body, controller = _load(airframe, gains)
-    task = scenario_of(scenario, axis, amplitude_deg, period_s, fault, controller.Ts)
+    task = scenario_of(scenario, axis, amplitude_deg, period_s, tail_s, fault, controller.Ts)
     if on not in ("native", "cortex-m4"):
         raise SitlError(f"--on: got {on!r}, expected native or cortex-m4")
     processor = load_emulated(controller) if on == "cortex-m4" else None
@@ -209,69 +214,135 @@ def fly(
         raise SitlError("the controller refused its inputs for too long and only damped the rates", exit_code=1)
 
 
+def _times(speed: str) -> float | None:
+    """``--speed``: times real time; None for ``max``."""
+    from sitl.errors import SitlError
+
+    try:
+        times = None if speed == "max" else float(speed)
+    except ValueError:
+        times = 0.0
+    if times is not None and not 0.01 <= times <= 1000:
+        raise SitlError(f"--speed {speed}: expected 0.01 to 1000, or max")
+    return times
+
+
+def _address(text: str) -> tuple[str, int]:
+    """HOST:PORT."""
+    from sitl.errors import SitlError
+
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+        raise SitlError(f"--plant {text}: expected HOST:PORT, such as 127.0.0.1:4560")
+    return host, int(port)
+
+
 def sitl(
     airframe: AirframeArgument,
     gains: GainsOption = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the plant (PX4's simulator API).")] = 4560,
+    plant: Annotated[
+        str | None, typer.Option(help="HOST:PORT of a plant that runs already; by default one is started.")
+    ] = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the started plant; 0: any.")] = 0,
     ground_port: Annotated[
         int, typer.Option(min=1, max=65535, help="UDP port where the ground station listens.")
     ] = 14550,
     vehicle_port: Annotated[int, typer.Option(min=0, max=65535, help="Local UDP port of the vehicle.")] = 18570,
-    speed: Annotated[float, typer.Option(min=0.01, max=1000, help="Times real time.")] = 1.0,
+    tcp_port: Annotated[int, typer.Option(min=0, max=65535, help="Local TCP port of the vehicle; 0: any.")] = 5760,
+    bind: Annotated[str, typer.Option(help="Local address of both.")] = "127.0.0.1",
+    signing_key: Annotated[
+        Path | None, typer.Option(help="File of 32 bytes: everything is signed, nothing unsigned is heard.")
+    ] = None,
+    speed: SpeedOption = "1",
     seed: SeedOption = 0,
+    fault: FaultOption = None,
+    log: Annotated[
+        Path | None, typer.Option(help="Log each flight, arming to disarming, at full rate: FILE.ulg, FILE-2.ulg ...")
+    ] = None,
 ) -> None:
-    """Run the vehicle as two processes that talk MAVLink, for a ground station. Ctrl-C ends it."""
+    """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
     from sitl.autopilot import Autopilot
+    from sitl.autopilot_faults import AutopilotFaults
+    from sitl.errors import SitlError
+    from sitl.faults import parse_fault
+    from sitl.injection import check_fault
+    from sitl.mavlink.flight_log import FlightLog
     from sitl.mavlink.ground import Ground
-    from sitl.mavlink.host import Host, plant_process
+    from sitl.mavlink.host import Host
     from sitl.mavlink.parameter_server import ParameterServer
+    from sitl.mavlink.plant_link import PlantLink
+    from sitl.mavlink.plant_process import PlantProcess
+    from sitl.mavlink.signing import Signer, read_key
+    from sitl.mavlink.stations import Stations
+    from sitl.mavlink.telemetry import Telemetry
+    from sitl.mavlink.vehicle_commands import VehicleCommands
 
     body, controller = _load(airframe, gains)
+    times = _times(speed)
+    faults = [parse_fault(text) for text in fault or ()]
+    for one in faults:
+        check_fault(one, body, controller.Ts, None)
+    outside = [one for one in faults if one.place != "autopilot"]
+    if plant and outside:
+        raise SitlError(f"fault {str(outside[0])!r}: happens in the plant that runs already: give it to that one")
     autopilot = Autopilot(body, controller)
     autopilot.warm_up()
-    ground = Ground(ParameterServer(autopilot.controller, controller), ground_port, vehicle_port)
-    with plant_process(airframe, port, controller.Ts, seed, speed) as plant_port:
-        host = Host(autopilot, len(body.rotors), plant_port)
-        print(
-            f"{body.name} flies: plant on TCP {plant_port}, ground station on UDP {ground_port}; Ctrl-C ends",
-            flush=True,
-        )
-        try:
-            host.run(ground)
-        except KeyboardInterrupt:
-            print("ended")
-        finally:
-            host.close()
-            ground.close()
+    inside = AutopilotFaults(faults, controller.Ts, autopilot) if len(faults) > len(outside) else None
+    process = PlantProcess(airframe, port, controller.Ts, seed, times, faults=outside)
+    link = PlantLink(_address(plant) if plant else process)
+    host = Host(autopilot, link, FlightLog(log, body, controller.Ts) if log else None, inside)
+    telemetry = Telemetry(host.situation)
+    commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
+    signer = Signer(read_key(signing_key)) if signing_key else None
+    parameters = ParameterServer(autopilot.controller, controller)
+    ground = Ground(
+        parameters,
+        commands,
+        telemetry,
+        lambda wanted: Stations(ground_port, vehicle_port, tcp_port, bind, signer, wanted),
+    )
+    try:
+        link.wait_for_child()
+        print(f"{body.name}: ground station on UDP {ground_port}, plant {link.place}; Ctrl-C ends", flush=True)
+        host.run(ground)
+    except KeyboardInterrupt:
+        print(f"ended: {host.lateness}")
+    finally:
+        host.close(ground)
 
 
 def plant(
     airframe: AirframeArgument,
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port to listen on; 0: any free one.")] = 4560,
     rate: Annotated[float, typer.Option(help="Frames a second (the autopilot's control rate), Hz.")] = 250.0,
-    speed: Annotated[str, typer.Option(help="Times real time, or max.")] = "1",
+    speed: SpeedOption = "1",
+    altitude: Annotated[
+        float, typer.Option(min=0, max=1000, help="Where it starts hovering, m; 0: on the ground, rotors standing.")
+    ] = 0.0,
     seed: SeedOption = 0,
+    fault: FaultOption = None,
+    child: Annotated[bool, typer.Option("--child", help="End when standard input is closed.")] = False,
 ) -> None:
-    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot."""
+    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot after another."""
     from sitl.airframe import load_airframe
     from sitl.errors import SitlError
+    from sitl.faults import parse_faults
     from sitl.mavlink.link import LOOPBACK, listen
-    from sitl.mavlink.simulator import PlantServer
+    from sitl.mavlink.plant_server import PlantServer
+    from sitl.mavlink.simulator import SimulatedVehicle
 
-    try:
-        times = None if speed == "max" else float(speed)
-        if not 1 <= rate <= 1e4 or not (times is None or 0 < times < 1e6):
-            raise ValueError
-    except ValueError:
-        raise SitlError(
-            f"--rate {rate}, --speed {speed}: expected 1 to 10000 Hz, and a number above 0 or max"
-        ) from None
-    server = PlantServer(load_airframe(airframe).airframe, round(1 / rate, 9), seed, times)
+    times = _times(speed)
+    if not 1 <= rate <= 1e4:
+        raise SitlError(f"--rate {rate}: expected 1 to 10000 Hz")
+
+    def tell(text: str) -> None:
+        print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
+
+    faults = parse_faults(fault or (), ("plant", "link"), "the plant")
+    vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell, faults)
     with listen(LOOPBACK, port) as socket:
         print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
         try:
-            connection, _ = socket.accept()
-            with connection:
-                server.serve(connection)
+            PlantServer(vehicle, socket, times, child).serve()
         except KeyboardInterrupt:
             pass

@@ -19,6 +19,7 @@ from sitl.errors import SitlError
 from tuning.gains import AXES
 
 NOTATION = re.compile(r"([a-z-]+)(?::([^=@]+))?(?:=([^@]+))?@([^+]+)(?:\+(.+))?")
+FOR_EVER = 1 << 62  # periods
 Place = Literal["plant", "link", "autopilot"]
 Target = Literal["motor", "axis", "position", "matrix"]
 
@@ -83,7 +84,7 @@ KINDS: dict[str, Kind] = {
     "duplicate": Kind("with this probability the autopilot runs twice on a measurement", "link", "probability"),
     "skip": Kind("the autopilot misses so many ticks in a row", "link", "ticks", 1, 1e6, lasts=False),
     "clock": Kind(
-        "the clock goes back by this; the autopilot takes nothing that is not newer", "link", "s", 0, 3600, lasts=False
+        "the clock goes back by this; the autopilot takes nothing that is not newer", "link", "s", lasts=False
     ),
     "link": Kind("no measurement arrives, the motors hold their last command", "link"),
     "gain": Kind(
@@ -176,6 +177,17 @@ class Fault(BaseModel):
         """Indices of the axes that are hit."""
         return [0, 1, 2] if self.axis is None else [AXES.index(self.axis)]
 
+    def span(self, Ts: float) -> tuple[int, int]:
+        """First control period, of `Ts` s, in which it acts, and the first after it."""
+        begin = periods(self.at, Ts)
+        if self.kind == "skip":
+            return begin, begin + round(self.magnitude)
+        if self.kind == "clock":
+            return begin, begin + periods(self.magnitude, Ts)
+        if self.duration is None or self.kind == "battery":
+            return begin, FOR_EVER
+        return begin, begin + max(1, periods(self.duration, Ts))
+
     def __str__(self) -> str:
         """As it is written on the command line."""
         target = self.target
@@ -188,6 +200,11 @@ class Fault(BaseModel):
             + f"@{_number(self.at)}"
             + ("" if self.duration is None else f"+{_number(self.duration)}")
         )
+
+
+def periods(seconds: float, Ts: float) -> int:
+    """Whole control periods of `Ts` s that come nearest to a time."""
+    return round(seconds / Ts)
 
 
 def _number(value: float) -> str:

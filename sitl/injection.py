@@ -14,24 +14,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.parameters import PARAMETERS
 from sitl.airframe import Airframe, PointMass, combine_masses
+from sitl.autopilot_faults import AutopilotFaults
 from sitl.errors import SitlError
-from sitl.faults import Fault
+from sitl.faults import Fault, periods
 from sitl.plant import HISTORY
-from tuning.gains import MATRICES
 
 if TYPE_CHECKING:
     from sitl.autopilot import Autopilot
     from sitl.loop import Simulator
 
-STALE_SETPOINT_S = 0.5  # set-points older than this are not flown any more: level
 DRAWS = 0x6661  # keeps the random numbers of faults apart from the noise of the same seed
-
-
-def failsafe_setpoint(setpoint: NDArray[Any], age: float) -> NDArray[Any]:
-    """What is flown of a set-point (3,), rad, that is `age` s old: level with its heading when it is stale."""
-    return setpoint if age <= STALE_SETPOINT_S else setpoint * np.array([0, 0, 1], setpoint.dtype)
 
 
 class Injection:
@@ -72,22 +65,17 @@ class Injection:
     ) -> None:
         for fault in faults:
             check_fault(fault, airframe, Ts, seconds)
-        self.faults, self.Ts, self.simulator, self.autopilot = tuple(faults), Ts, simulator, autopilot
-        self.spans = [_span(fault, Ts) for fault in faults]
+        self.faults, self.Ts, self.simulator = tuple(faults), Ts, simulator
+        self.spans = [fault.span(Ts) for fault in faults]
         self.generators = [
             np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(DRAWS, i))) for i in range(len(faults))
         ]
         self.sound, self.sensors, self.delay = simulator.plant, simulator.sensors, simulator.delay
         self.centre = airframe.geometry()[0][0] - self.sound.rotors[0]
-        self.gains = np.full(len(PARAMETERS), np.nan, np.float32)
-        if autopilot is not None:
-            self.gains = autopilot.controller.state["gains"][0].copy()
-        for fault in faults:
-            if fault.kind == "gain":
-                self._check_gains(fault)
+        self.inside = AutopilotFaults(faults, Ts, autopilot)
         self.arrivals: dict[int, int] = {}  # period -> the newest command that arrives in it
         self.newest = simulator.count - self.delay
-        self.changes = {k for i, fault in enumerate(faults) for k in self._changes(fault, *self.spans[i])}
+        self.changes = self.inside.changes.union(*map(self._changes, faults, self.spans))
 
     def stretches(
         self, start: int, stop: int
@@ -109,14 +97,16 @@ class Injection:
             yield slice(a, b), self._runs(a, b), self._delays(a, b)
 
     def setpoints(self, setpoint: NDArray[Any]) -> NDArray[Any]:
-        """What the autopilot flies of the set-points (N, 3), rad, that are sent."""
-        flown = setpoint.copy()
-        for fault, (begin, end) in zip(self.faults, self.spans, strict=True):
-            if fault.kind == "stale":
-                last = setpoint[max(begin - 1, 0)]
-                for k in range(begin, min(end, len(flown))):
-                    flown[k] = failsafe_setpoint(last, (k - begin + 1) * self.Ts)
-        return flown
+        """See `AutopilotFaults.setpoints`."""
+        return self.inside.setpoints(setpoint)
+
+    def clock_back(self, k: int) -> float:
+        """By how many seconds the clock has gone back up to period `k`."""
+        return sum(
+            fault.magnitude
+            for fault, (begin, _) in zip(self.faults, self.spans, strict=True)
+            if fault.kind == "clock" and begin <= k
+        )
 
     def _active(self, k: int) -> Iterator[tuple[Fault, int]]:
         """Faults of period `k`, each with the period of its begin."""
@@ -124,21 +114,18 @@ class Injection:
             if begin <= k < end:
                 yield fault, begin
 
-    def _changes(self, fault: Fault, begin: int, end: int) -> Iterator[int]:
-        """Periods before which something has to be changed."""
-        if fault.place == "link":
-            return
-        yield begin
-        if fault.kind == "battery" and fault.duration is not None:
-            yield from range(begin, begin + _periods(fault.duration, self.Ts) + 1)
-        yield end
+    def _changes(self, fault: Fault, span: tuple[int, int]) -> Iterator[int]:
+        """Periods before which something has to be changed in the plant."""
+        if fault.place == "plant":
+            yield from span
+            if fault.kind == "battery" and fault.duration is not None:
+                yield from range(span[0], span[0] + periods(fault.duration, self.Ts) + 1)
 
     def _apply(self, k: int) -> None:
         bias, stuck, failed = self.sensors.bias.copy(), self.sensors.stuck.copy(), self.sensors.failed.copy()
         rate_deviation = self.sensors.rate_deviation
         effectiveness = self.sound.effectiveness.copy()
         loads: list[Fault] = []
-        factors = np.ones(len(PARAMETERS), np.float32)
         for fault, begin in self._active(k):
             match fault.kind:
                 case "motor":
@@ -155,23 +142,18 @@ class Injection:
                     stuck[fault.axes] = True
                 case "gyro-nan":
                     failed[fault.axes] = True
-                case "gain":
-                    factors[_elements(fault)] *= fault.magnitude
         self.simulator.sensors = self.sensors._replace(
             rate_deviation=rate_deviation, bias=bias, stuck=stuck, failed=failed
         )
         self.simulator.plant = self.simulator.plant._replace(effectiveness=effectiveness)
         if any(fault.kind == "mass" for fault in self.faults):
             self._load(loads)
-        if self.autopilot is not None and any(fault.kind == "gain" for fault in self.faults):
-            controller, gains = self.autopilot.controller, self.gains * factors
-            if (controller.state["gains"][0] != gains).any():  # each write seats the integrators anew
-                controller.set_gains(gains)
+        self.inside.apply(k)
 
-    def _battery(self, fault: Fault, periods: int) -> float:
+    def _battery(self, fault: Fault, since: int) -> float:
         """Share of the thrust, so many periods after the sag began."""
-        ramp = 0 if fault.duration is None else _periods(fault.duration, self.Ts)
-        return 1.0 - (1.0 - fault.magnitude) * (1.0 if periods >= ramp else periods / ramp)
+        ramp = 0 if fault.duration is None else periods(fault.duration, self.Ts)
+        return 1.0 - (1.0 - fault.magnitude) * (1.0 if since >= ramp else since / ramp)
 
     def _load(self, loads: list[Fault]) -> None:
         """Put the loads on the sound body; what is attached moves with it, so no point of it is jerked."""
@@ -193,10 +175,12 @@ class Injection:
 
     def _runs(self, start: int, stop: int) -> NDArray[np.int64] | None:
         """How often the autopilot runs in each period."""
+        # A process that only has the plant sets its clock back, and the autopilot on the other end finds out.
+        kinds = ("loss", "duplicate", "skip", "link", *(() if self.inside.autopilot is None else ("clock",)))
         runs = None
         for fault, span, generator in zip(self.faults, self.spans, self.generators, strict=True):
             inside = _overlap(span, start, stop)
-            if inside is None or fault.kind not in ("loss", "duplicate", "skip", "clock", "link"):
+            if inside is None or fault.kind not in kinds:
                 continue
             runs = np.ones(stop - start, np.int64) if runs is None else runs
             if fault.kind in ("loss", "duplicate"):
@@ -216,45 +200,17 @@ class Injection:
             if inside is None:
                 continue
             if fault.kind == "delay":
-                late[inside] = _periods(fault.magnitude, self.Ts)
+                late[inside] = periods(fault.magnitude, self.Ts)
             elif fault.kind == "jitter":
-                choices = _periods(fault.magnitude, self.Ts) + 1
+                choices = periods(fault.magnitude, self.Ts) + 1
                 late[inside] += (choices * generator.random(inside.stop - inside.start)).astype(np.int64)
         ages = np.empty_like(late)
         for i, k in enumerate(range(start, stop)):
             due = k + int(late[i])
             self.arrivals[due] = max(self.arrivals.get(due, k), k)
             self.newest = max(self.newest, self.arrivals.pop(k, self.newest))
-            ages[i] = k - self.newest
+            ages[i] = min(k - self.newest, HISTORY - 1)  # farther back nothing is kept
         return ages
-
-    def _check_gains(self, fault: Fault) -> None:
-        if self.autopilot is None:
-            raise SitlError(f"fault {str(fault)!r}: there is no controller in this process")
-        values = self.gains * np.float32(fault.magnitude)
-        for i in _elements(fault):
-            parameter = PARAMETERS[i]
-            if not parameter.minimum <= values[i] <= parameter.maximum:
-                raise SitlError(
-                    f"fault {str(fault)!r}: {parameter.name} would be {values[i]:.4g}, expected "
-                    f"{parameter.minimum:g} to {parameter.maximum:g}: a vehicle refuses that write"
-                )
-
-
-def _periods(seconds: float, Ts: float) -> int:
-    return round(seconds / Ts)
-
-
-def _span(fault: Fault, Ts: float) -> tuple[int, int]:
-    """First period of a fault, and the first after it."""
-    begin = _periods(fault.at, Ts)
-    if fault.kind == "skip":
-        return begin, begin + round(fault.magnitude)
-    if fault.kind == "clock":
-        return begin, begin + _periods(fault.magnitude, Ts)
-    if fault.duration is None or fault.kind == "battery":
-        return begin, 1 << 62
-    return begin, begin + max(1, _periods(fault.duration, Ts))
 
 
 def _overlap(span: tuple[int, int], start: int, stop: int) -> slice | None:
@@ -263,20 +219,12 @@ def _overlap(span: tuple[int, int], start: int, stop: int) -> slice | None:
     return slice(begin - start, end - start) if begin < end else None
 
 
-def _elements(fault: Fault) -> range:
-    """Places of the gains that a fault changes, in the order of the parameter table."""
-    if fault.matrix is None:
-        return range(4 * len(MATRICES))
-    first = 4 * list(MATRICES).index(fault.matrix)
-    return range(first, first + 4)
-
-
 def check_fault(fault: Fault, airframe: Airframe, Ts: float, seconds: float | None) -> None:
     """Refuse a fault that this vehicle cannot have, or that comes after the flight; see `Injection`."""
     where, rotors = f"fault {str(fault)!r}", len(airframe.rotors)
     if fault.motor is not None and fault.motor > rotors:
         raise SitlError(f"{where}: {airframe.name} has motors 1 to {rotors}")
-    if seconds is not None and _periods(fault.at, Ts) >= _periods(seconds, Ts):
+    if seconds is not None and periods(fault.at, Ts) >= periods(seconds, Ts):
         raise SitlError(f"{where}: begins at {fault.at:g} s, the flight ends at {seconds:g} s")
     if fault.kind in ("delay", "jitter"):
         longest = (HISTORY // 2 - 1 - airframe.computing_delay) * Ts

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.parameters import PARAMETERS, identity_parameters
+from codegen.parameters import IDENTITY, PARAMETERS, to_array
 from codegen.render import generator_version
 from sitl.airframe import Airframe
 from sitl.loop import Flight
@@ -45,13 +45,66 @@ def record_flight(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
     gains : Gains
         The controller that flew: logged as the vehicle's parameters.
     """
-    record, truth = flight.record, flight.truth
+    truth = flight.truth
+    topics = _seen(flight.record, len(airframe.rotors)) | {
+        "vehicle_attitude_groundtruth": {"q": quaternions(truth["attitude"])},
+        "vehicle_angular_velocity_groundtruth": {"xyz": truth["rates"].astype(np.float32)},
+        "vehicle_local_position_groundtruth": {
+            name: truth[field][:, i].astype(np.float32)
+            for field, names in (("position", "x y z"), ("velocity", "vx vy vz"))
+            for i, name in enumerate(names.split())
+        },
+    }
+    return _file(flight.scenario.Ts, topics, to_array(gains), airframe)
+
+
+def vehicle_log(
+    record: NDArray[Any], landed: NDArray[np.bool_], Ts: float, airframe: Airframe, gains: NDArray[np.float32]
+) -> bytes:
+    """A flight of which only the vehicle's own view is known, from arming to disarming, as a ULog file.
+
+    Parameters
+    ----------
+    record : (N,) array of `sitl.autopilot.RECORD`
+        What the autopilot saw and did.
+    landed : (N,) array of bool
+        Whether it stood on the ground.
+    Ts : float, s
+        Control period.
+    airframe : Airframe
+        The vehicle.
+    gains : (36,) float32 array
+        What flew, in the order of `codegen.parameters.PARAMETERS`.
+    """
+    topics = _seen(record, len(airframe.rotors)) | {
+        "vehicle_land_detected": {"landed": landed.astype(np.uint8)},
+        "actuator_armed": {"armed": np.ones(len(record), np.uint8)},
+    }
+    return _file(Ts, topics, gains, airframe)
+
+
+def _file(
+    Ts: float, topics: dict[str, dict[str, NDArray[Any]]], gains: NDArray[np.float32], airframe: Airframe
+) -> bytes:
+    parameters = {parameter.name: float(value) for parameter, value in zip(PARAMETERS, gains, strict=True)}
+    scale = airframe.moment_scale()
+    parameters |= {parameter.name: value for parameter, value in zip(IDENTITY, scale, strict=True)}
+    information = {
+        "sys_name": "mimopilot",
+        "ver_hw": f"SITL {airframe.name}",
+        "ver_sw": f"mimopilot {generator_version()}",
+    }
+    return ulog_bytes(Ts, topics, parameters, information)
+
+
+def _seen(record: NDArray[Any], rotors: int) -> dict[str, dict[str, NDArray[Any]]]:
+    """Topics of what the autopilot saw and did."""
     excitation = record["excitation"]
     # z is the axis that is being excited: 0 roll, 1 pitch, -1 none.
     active = np.where(excitation[:, 0] != 0, 0, np.where(excitation[:, 1] != 0, 1, -1)).astype(np.float32)
     thrust = np.zeros_like(excitation)
     thrust[:, 2] = -record["collective"]
-    topics = {
+    return {
         "vehicle_angular_velocity": {"xyz": record["rates"]},
         "vehicle_attitude": {"q": record["quaternion"]},
         "vehicle_attitude_setpoint": {"q_d": quaternions(record["setpoint"]), "thrust_body": thrust},
@@ -61,7 +114,7 @@ def record_flight(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
         },
         "vehicle_torque_setpoint": {"xyz": record["moment"]},
         "vehicle_thrust_setpoint": {"xyz": thrust},
-        "actuator_motors": {"control": record["commands"][:, : len(airframe.rotors)]},
+        "actuator_motors": {"control": record["commands"][:, :rotors]},
         "control_allocator_status": {"unallocated_torque": record["unallocated"]},
         "debug_vect": {
             "x": excitation[:, 0],
@@ -69,23 +122,7 @@ def record_flight(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
             "z": active,
             "name": np.full(len(record), EXCITATION_NAME, "S10"),
         },
-        "vehicle_attitude_groundtruth": {"q": quaternions(truth["attitude"])},
-        "vehicle_angular_velocity_groundtruth": {"xyz": truth["rates"].astype(np.float32)},
-        "vehicle_local_position_groundtruth": {
-            name: truth[field][:, i].astype(np.float32)
-            for field, names in (("position", "x y z"), ("velocity", "vx vy vz"))
-            for i, name in enumerate(names.split())
-        },
     }
-    elements = gains.elements()
-    parameters = {parameter.name: elements[parameter.code] for parameter in PARAMETERS}
-    parameters |= identity_parameters(gains)
-    information = {
-        "sys_name": "mimopilot",
-        "ver_hw": f"SITL {airframe.name}",
-        "ver_sw": f"mimopilot {generator_version()}",
-    }
-    return ulog_bytes(flight.scenario.Ts, topics, parameters, information)
 
 
 def save_flight(path: Path, flight: Flight, airframe: Airframe, gains: Gains) -> None:

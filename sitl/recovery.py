@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.injection import STALE_SETPOINT_S
 from sitl.loop import CRASH_ANGLE, CRASH_SECONDS, Flight
+from sitl.setpoints import STALE_SECONDS
 
 RECOVERED = np.radians(1.0)  # from the flight without faults, for good
+SUNK = 2.0  # m
 PATIENCE_S = 0.1  # that rates may repeat themselves, or an axis may saturate, before it is called a failure
 
 
@@ -85,6 +86,7 @@ def detection(flight: Flight, begin: int) -> tuple[int, str] | None:
     - ``clock``: a tick is missing or repeated, seen from the time stamps when the next one comes;
     - ``stuck``: a measured rate repeats itself, bit for bit, for 0.1 s;
     - ``motors``: a moment on the same axis cannot be given for 0.1 s;
+    - ``altitude``: it is 2 m below where it was at `begin`;
     - ``attitude``: the estimate is beyond 60 degrees for 0.3 s (PX4's failure detector, FD_FAIL_R, FD_FAIL_P);
     - ``set-point``: none for 0.5 s.
 
@@ -101,11 +103,14 @@ def detection(flight: Flight, begin: int) -> tuple[int, str] | None:
     repeated = np.zeros((len(record), 3), np.bool_)
     repeated[len(repeated) - len(rates) + 1 :] = rates[1:] == rates[:-1]
     tilted = np.any(np.abs(record["attitude"][:, :2]) > CRASH_ANGLE, axis=1)
+    height = flight.truth["position"][begin:, 2]
+    sunk = height > height[0] + SUNK  # the vehicle's own estimate is this, rounded to a millimetre
     signs = {
         "input": _first(record["fault"][:, None] != 0, 1),
         "clock": _first(((ran > 1) | (missed & (ran > 0)))[:, None], 1),
         "stuck": _first(repeated & (ran > 0)[:, None], patience),
         "motors": _first(record["unallocated"] != 0, patience),
+        "altitude": _first(sunk[:, None], 1),
         "attitude": _first(tilted[:, None], max(1, round(CRASH_SECONDS / Ts))),
         "set-point": _stale(flight, begin),
     }
@@ -126,9 +131,9 @@ def _first(signs: NDArray[np.bool_], length: int) -> int | None:
 def _stale(flight: Flight, begin: int) -> int | None:
     """First sample that is flown without a set-point, from `begin` on."""
     late = (
-        round((fault.at + STALE_SETPOINT_S) / flight.scenario.Ts)
+        round((fault.at + STALE_SECONDS) / flight.scenario.Ts)
         for fault in flight.scenario.faults
-        if fault.kind == "stale" and (fault.duration is None or fault.duration > STALE_SETPOINT_S)
+        if fault.kind == "stale" and (fault.duration is None or fault.duration > STALE_SECONDS)
     )
     sample = min(late, default=len(flight.record))
     return sample - begin if sample < len(flight.record) else None

@@ -6,6 +6,7 @@ A scenario file names a manoeuvre and its faults:
     axis = "roll"
     amplitude_deg = 15
     period_s = 0.42
+    tail_s = 1.5                # level flight after a doublet
 
     [[fault]]
     kind = "motor"
@@ -32,7 +33,7 @@ from tuning.excitation import hold_from_bandwidth, prbs
 AXES = ("roll", "pitch")
 LEAD = 1.0  # s of hover before a manoeuvre
 MAX_ANGLE = np.radians(60.0)  # a vehicle that tilts further counts as lost
-AMPLITUDE_DEG, PERIOD_S = 22.5, 0.42  # of a manoeuvre that says nothing else
+AMPLITUDE_DEG, PERIOD_S, TAIL_S = 22.5, 0.42, 1.5  # of a manoeuvre that says nothing else
 MIN_SAMPLES, MAX_SECONDS = 10, 3600.0
 
 
@@ -84,7 +85,7 @@ def _check_angle(amplitude: float) -> None:
         raise SitlError(f"amplitude: got {got:.6g} degrees, expected above 0 and at most {limit:.0f}")
 
 
-def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float = 1.5) -> Scenario:
+def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float = TAIL_S) -> Scenario:
     """Set-point +A for half of `period`, -A for the other half, then level.
 
     Parameters
@@ -102,6 +103,8 @@ def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float =
     """
     _check_angle(amplitude)
     _check_length("period", period, Ts)
+    if not 0 <= tail <= MAX_SECONDS:
+        raise SitlError(f"tail: got {tail} s, expected 0 to {MAX_SECONDS:g} s")
     column = _axis_index(axis)
     start, half = round(LEAD / Ts), round(period / 2 / Ts)
     setpoint = np.zeros((start + 2 * half + round(tail / Ts), 3))
@@ -128,10 +131,14 @@ def hover(axis: str, period: float, Ts: float) -> Scenario:
     return Scenario("hover", Ts, setpoint, np.zeros_like(setpoint), _axis_index(axis), (0, len(setpoint)))
 
 
-def make_scenario(name: str, axis: str, amplitude_deg: float, period: float, Ts: float) -> Scenario:
-    """A scenario by name: ``doublet``, ``step`` or ``hover``; amplitude in degrees, period in seconds."""
+def make_scenario(
+    name: str, axis: str, amplitude_deg: float, period: float, Ts: float, tail: float = TAIL_S
+) -> Scenario:
+    """A scenario by name: ``doublet``, ``step`` or ``hover``; amplitude in degrees, period and tail in seconds."""
     if name == "doublet":
-        return doublet(axis, float(np.radians(amplitude_deg)), period, Ts)
+        return doublet(axis, float(np.radians(amplitude_deg)), period, Ts, tail)
+    if tail != TAIL_S:
+        raise SitlError(f"tail: belongs to a doublet, not to {name}")
     if name == "step":
         return step(axis, float(np.radians(amplitude_deg)), period, Ts)
     if name == "hover":
@@ -148,6 +155,7 @@ class Task(BaseModel):
     axis: Literal["roll", "pitch"] = "roll"
     amplitude_deg: float = AMPLITUDE_DEG
     period_s: float = PERIOD_S
+    tail_s: float = TAIL_S
 
 
 def read_scenario(path: Path) -> tuple[Task, tuple[Fault, ...]]:
@@ -187,7 +195,7 @@ def load_scenario(path: Path, Ts: float) -> Scenario:
     """
     task, faults = read_scenario(path)
     try:
-        scenario = make_scenario(task.manoeuvre, task.axis, task.amplitude_deg, task.period_s, Ts)
+        scenario = make_scenario(task.manoeuvre, task.axis, task.amplitude_deg, task.period_s, Ts, task.tail_s)
     except SitlError as error:
         raise SitlError(f"{path}: {error}") from error
     return replace(scenario, faults=faults)

@@ -18,12 +18,14 @@ from codegen.vectors import random_inputs, reference_outputs
 from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import fly
+from sitl.mavlink import lockstep
 from sitl.mavlink.connection import Connection
 from sitl.mavlink.exchange import Conversation
-from sitl.mavlink.host import Host, plant_process
+from sitl.mavlink.plant_process import plant_process
 from sitl.mavlink.upload import apply, read
 from sitl.mavlink.words import drive, single
 from sitl.scenario import doublet, excitation_flight
+from sitl.studies.faults import standard_faults
 from tests.bench_campaign import campaign_rows, rotorpy_rows
 from tests.bench_tuning import best, tuning_rows
 from tests.sitl.scripted_vehicle import ScriptedVehicle, UdpVehicle
@@ -55,6 +57,14 @@ def upload_seconds(round_trip: float) -> float:
     if (outcome.state, outcome.storage, vehicle.values) != ("verified", "acknowledged", new):
         raise RuntimeError(f"the upload ended as {outcome}")
     return seconds
+
+
+def fault_rows() -> list[list[str]]:
+    """How long the table of faults takes, by its command."""
+    runs, faults = 40, len(standard_faults(load_airframe("adam0").airframe))
+    seconds = best(command("faults", "adam0", "--runs", str(runs)), 2)
+    title = f"mimopilot faults, {runs * faults} flights with faults and {runs} without, start included"
+    return [[title, f"{seconds:.1f} s", "1000 runs under 60 s"]]
 
 
 def main() -> None:
@@ -90,6 +100,7 @@ def main() -> None:
         rows.append([title, f"{speed:.0f} x real time", "over 5000"])
         rows += rotorpy_rows(speed)
         rows += campaign_rows(folder)
+        rows += fault_rows()
         processor = load_emulated(gains)
         emulated = 40.0 / best(lambda: fly(airframe, Autopilot(airframe, gains, processor), scenario, 0), 2)
         rows.append(["the same on the emulated Cortex-M4", f"{emulated:.0f} x real time", f"1/{speed / emulated:.0f}"])
@@ -98,11 +109,9 @@ def main() -> None:
         autopilot = Autopilot(airframe, gains, NativeController(library, gains))
         autopilot.warm_up()
         with plant_process("adam0", 0, TS, 0, None) as port:
-            host = Host(autopilot, 4, port)
             begin = time.perf_counter()
-            host.fly(task)
+            lockstep.fly(autopilot, task, port)
             over_wire = len(task.setpoint) * TS / (time.perf_counter() - begin)
-            host.close()
         rows.append(
             ["the same as two processes over MAVLink", f"{over_wire:.0f} x real time", f"1/{speed / over_wire:.0f}"]
         )

@@ -17,7 +17,7 @@ from tests.conftest import assert_one_clear_line
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise"),
-    *("generate", "pil", "fly", "sitl", "plant", "convert", "upload", "restore", "params"),
+    *("generate", "pil", "fly", "faults", "sitl", "plant", "convert", "upload", "restore", "params"),
 ]
 
 

@@ -6,23 +6,20 @@ import select
 import socket
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.errors import SitlError
 from sitl.mavlink.link import Codec, udp_socket
+from sitl.mavlink.signing import Signer
 from sitl.mavlink.words import Ack, Beat, Heartbeat, Incoming, Outgoing, Read, Refusal, Value, Write
 
 #: How ground stations call themselves.
 GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
 BAUD = 57600
 FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
-KEY_BYTES = 32
 CONNECT_S = 5.0
-#: Signatures count units of 10 us from this second on (2015-01-01).
-SIGNING_EPOCH_S, SIGNING_PER_S = 1420070400, 100_000
 
 
 def understand(message: Any) -> Incoming | None:
@@ -60,26 +57,6 @@ def express(order: Outgoing) -> Any:
     return mavlink.MAVLink_command_long_message(order.system, order.component, command, 0, 1, 0, 0, 0, 0, 0, 0)
 
 
-def read_key(path: Path) -> bytes:
-    """Signing key from a file: 32 bytes, or 64 hexadecimal digits.
-
-    Raises
-    ------
-    SitlError
-        When it holds neither.
-    """
-    content = path.read_bytes()
-    if len(content) == KEY_BYTES:
-        return content
-    try:
-        key = bytes.fromhex(content.decode())
-    except ValueError:
-        key = b""
-    if len(key) != KEY_BYTES:
-        raise SitlError(f"{path}: not a signing key: expected {KEY_BYTES} bytes or {2 * KEY_BYTES} hexadecimal digits")
-    return key
-
-
 class Connection:
     """A link to a vehicle over a socket or a serial port; see `sitl.mavlink.words.Link`.
 
@@ -98,20 +75,13 @@ class Connection:
 
     def __init__(self, url: str, key: bytes | None = None) -> None:
         self.closed = False
-        self.codec = Codec(GROUND_SYSTEM, GROUND_COMPONENT)
-        if key is not None:
-            self._sign(key)
+        self.codec = Codec(GROUND_SYSTEM, GROUND_COMPONENT, None if key is None else Signer(key))
         self.kind, _, rest = url.partition(":")
         self.peers: dict[Any, None] = {}
         if self.kind in ("udp", "udpin", "udpout", "tcp"):
             self.port: Any = self._open_socket(url, rest)
         else:
             self.port = self._open_serial(url)
-
-    def _sign(self, key: bytes) -> None:
-        signing = self.codec.mav.signing
-        signing.secret_key, signing.sign_outgoing = key, True
-        signing.timestamp = int((time.time() - SIGNING_EPOCH_S) * SIGNING_PER_S)
 
     def _open_socket(self, url: str, rest: str) -> socket.socket:
         host, _, number = rest.rpartition(":")
@@ -146,11 +116,10 @@ class Connection:
     @property
     def hint(self) -> str:
         """What signatures tell about a silence; empty when nothing."""
-        signing = self.codec.mav.signing
-        if signing.secret_key is None:
-            return "; messages on this link are signed: give --signing-key" if signing.sig_count else ""
-        refused = self.codec.mav.total_receive_errors
-        return "; messages came that are not signed with this key" if refused and not signing.goodsig_count else ""
+        if self.codec.unasked:
+            return "; messages on this link are signed: give --signing-key"
+        trusted = self.codec.signer is not None and self.codec.signer.heard
+        return "; messages came that are not signed with this key" if self.codec.refused and not trusted else ""
 
     def close(self) -> None:
         """Release the port."""

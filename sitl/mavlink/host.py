@@ -1,166 +1,249 @@
-"""The autopilot host: runs the compiled controller against a plant on the other end of a TCP connection."""
+"""The autopilot host: runs the compiled controller against a plant, and is a vehicle for ground stations."""
 
 from __future__ import annotations
 
 import select
-import socket
-import subprocess
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.autopilot import MAX_ROTORS, RECORD, Autopilot, tick
+from codegen.parameters import PARAMETERS
+from sitl.autopilot import RECORD, Autopilot, tick
+from sitl.autopilot_faults import AutopilotFaults
 from sitl.errors import SitlError
+from sitl.lift import Estimate
+from sitl.mavlink.flight_log import FlightLog
 from sitl.mavlink.ground import Ground
-from sitl.mavlink.link import LOOPBACK, Codec
-from sitl.scenario import Scenario
-from sitl.sensors import SIZE
+from sitl.mavlink.lateness import Lateness
+from sitl.mavlink.lean import GPS, SENSOR, STATE
+from sitl.mavlink.plant_link import PlantLink, PlantState
+from sitl.mavlink.telemetry import Situation
+from sitl.modes import Severity, Vehicle
+from sitl.sensors import SIZE, euler_angles
 
-ARMED = 128
-LOCKSTEP = 1
+SILENT_S = 0.9  # a plant that says nothing for so long is said to be silent
+TURN_S = 0.01  # longest wait for anything
+CLOCK_BACK_US = 1_000_000  # a plant whose time goes back by more has started anew
+EXAMINED = 250  # periods between examinations of what forbids arming
+REPEATED_S = 1.0  # the same text is told no more often
 
-
-@contextmanager
-def plant_process(airframe: str, port: int, Ts: float, seed: int, speed: float | None) -> Iterator[int]:
-    """Run `mimopilot plant` as a child; yields the port that it listens on, and ends it on leaving.
-
-    Raises
-    ------
-    SitlError
-        When it does not come up, with its own message.
-    """
-    command = [sys.executable, "-m", "mimopilot", "plant", airframe, "--port", str(port), "--seed", str(seed)]
-    command += ["--rate", repr(1 / Ts), "--speed", "max" if speed is None else repr(speed)]
-    child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert child.stdout is not None and child.stderr is not None
-    try:
-        line = child.stdout.readline()
-        if not line:
-            raise SitlError(
-                child.stderr.read().strip().removeprefix("mimopilot: ") or "the plant process did not start"
-            )
-        yield int(line.rsplit(":", 1)[1])
-    finally:
-        child.terminate()
-        try:
-            child.wait(timeout=5)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-        child.stdout.close()
-        child.stderr.close()
+#: Moment to inject in a period, (3,); called with the vehicle's clock, s.
+Excitation = Callable[[float], Sequence[float]]
 
 
 class Host:
-    """One autopilot on one plant connection.
+    """One autopilot on one plant link.
 
     Parameters
     ----------
     autopilot : Autopilot
         The controller and what surrounds it.
-    rotors : int
-        Number of motors.
-    port : int
-        TCP port of the plant on this machine.
+    plant : PlantLink
+        Where the body is.
+    log : FlightLog or None
+        Where flights are recorded.
+    faults : AutopilotFaults, optional
+        Its own, in seconds from the first frame of a plant.
+
+    Attributes
+    ----------
+    vehicle : Vehicle
+    situation : Situation
+        What telemetry shows.
+    excitation : callable
+        May be replaced.
+    lateness : Lateness
+        How long frames of the plant wait.
     """
 
-    def __init__(self, autopilot: Autopilot, rotors: int, port: int) -> None:
-        self.autopilot, self.rotors = autopilot, rotors
-        self.codec = Codec()
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        plant: PlantLink,
+        log: FlightLog | None = None,
+        faults: AutopilotFaults | None = None,
+    ) -> None:
+        self.autopilot, self.plant, self.log, self.faults = autopilot, plant, log, faults
+        self.vehicle = Vehicle(autopilot.hover)
+        self.vehicle.obstacles["plant"] = "no plant is connected"
+        self.situation = Situation(self.vehicle)
+        self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
+        self.lateness = Lateness()
         self.measurement = np.zeros(SIZE)
-        self.stamp = -1
-        self.row: NDArray[Any] = np.zeros(1, RECORD)
-        try:
-            self.plant = socket.create_connection((LOOPBACK, port), timeout=10.0)
-        except OSError as error:
-            raise SitlError(f"no plant on TCP port {port}: {error}", exit_code=1) from error
-        self.plant.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        euler_angles(*self.measurement[:4])  # compiled now, not in flight
+        self.stamp = self._zero = -1
+        self.rows: NDArray[Any] = np.zeros(1, RECORD)
+        self.heard = 0.0
+        self._connected = False
+        self._periods = self._first = 0
+        self._told: dict[str, float] = {}
 
-    def close(self) -> None:
-        """Leave the plant."""
-        self.plant.close()
-
-    def _frames(self) -> Iterator[Any]:
-        """Messages of the plant; ends when it goes away."""
-        while True:
-            data = self.plant.recv(65536)
-            if not data:
-                return
-            yield from self.codec.parse(data)
-
-    def _take(self, message: Any) -> bool:
-        """Note a message of the plant; True when a new period is due. A repeated time is answered, not flown."""
-        if message.get_type() != "HIL_STATE_QUATERNION":
-            return False
-        if message.time_usec <= self.stamp:
-            self._answer(self.row[0])
-            return False
-        self.stamp = message.time_usec
-        self.measurement[:4] = message.attitude_quaternion
-        self.measurement[4:7] = message.rollspeed, message.pitchspeed, message.yawspeed
-        self.measurement[7] = message.alt
-        self.measurement[8] = -message.vz
-        return True
-
-    def _fly_period(self, row: Any) -> None:
-        tick(*self.autopilot.arguments(), self.measurement, row)
-        self.row[0] = row
-        self._answer(row)
-
-    def _answer(self, row: Any) -> None:
-        controls = [float(v) for v in row["commands"][: self.rotors]] + [0.0] * (MAX_ROTORS - self.rotors)
-        message = mavlink.MAVLink_hil_actuator_controls_message(self.stamp, controls, ARMED, LOCKSTEP)
-        self.plant.sendall(self.codec.pack(message))
-
-    def fly(self, scenario: Scenario) -> NDArray[Any]:
-        """Fly a scenario from the first frame on.
-
-        Returns
-        -------
-        (N,) array of `sitl.autopilot.RECORD`
-
-        Raises
-        ------
-        SitlError
-            When the plant goes away before the end.
-        """
-        record = np.zeros(len(scenario.setpoint), RECORD)
-        record["setpoint"], record["excitation"] = scenario.setpoint, scenario.excitation
-        count = 0
-        for message in self._frames():
-            if self._take(message):
-                self._fly_period(record[count])
-                count += 1
-                if count == len(record):
-                    return record
-        raise SitlError(f"the plant went away after {count} of {len(record)} periods", exit_code=1)
+    def reboot(self) -> None:
+        """Leave the plant and come back as another autopilot: it is put back at its start."""
+        self.plant.drop()
+        self._lose("the vehicle starts again")
 
     def run(self, ground: Ground) -> None:
-        """Fly level and serve a ground station, until the plant goes away.
-
-        Raises
-        ------
-        SitlError
-            When it does.
-        """
-        row = np.zeros(1, RECORD)
-        self.plant.setblocking(False)
+        """Fly and serve ground stations, for ever; the plant comes first, and is found again when it goes away."""
         while True:
-            ready, _, _ = select.select([self.plant, ground.socket], [], [], 0.2)
-            if ground.socket in ready:
-                ground.receive()
-            if self.plant in ready:
-                data = self.plant.recv(65536)
-                if not data:
-                    raise SitlError("the plant process went away", exit_code=1)
-                for message in self.codec.parse(data):
-                    if self._take(message):
-                        row[0]["setpoint"] = ground.setpoint
-                        self._fly_period(row[0])
-            ground.telemeter(time.monotonic(), self.stamp, self.row[0])
+            now = time.monotonic()
+            self._connect(now)
+            if self._wait(ground):
+                self._fly()
+            elif self._connected and now > self.heard + SILENT_S and "plant" not in self.vehicle.obstacles:
+                self.vehicle.obstacles["plant"] = f"the plant has been silent for {SILENT_S:g} s"
+                self.vehicle.say(Severity.CRITICAL, self.vehicle.obstacles["plant"])
+            ground.receive(now)
+            self.situation.load = self.lateness.load
+            self._tell(ground, now)
+            ground.send(now)
+
+    def _connect(self, now: float) -> None:
+        if self._connected:
+            return
+        try:
+            self._connected = self.plant.connect(now)
+        except SitlError as error:
+            self.vehicle.obstacles["plant"] = str(error)
+            self.vehicle.say(Severity.CRITICAL, str(error))
+        if self._connected:
+            self._begin(now)
+
+    def _begin(self, now: float) -> None:
+        """A plant that may know nothing of what was before."""
+        self.heard = now
+        self.stamp = self._zero = -1
+        self._periods = 0
+        self.situation.home = self.situation.imu = self.situation.fix = ()
+        self.vehicle.plant_back()
+
+    def _lose(self, why: str) -> None:
+        self._connected = False
+        self.vehicle.plant_lost(why)
+        self._note_arming()
+
+    def _wait(self, ground: Ground) -> bool:
+        """Wait for anything; True when the plant has something to say."""
+        plants = [self.plant.socket] if self.plant.socket is not None else []
+        if plants and select.select(plants, [], [], 0)[0]:
+            return True
+        begin = time.monotonic()
+        ready = select.select([*plants, *ground.stations.sockets], [], [], TURN_S)[0]
+        end = time.monotonic()
+        self.lateness.nothing_waits(end - begin, end)
+        return self.plant.socket in ready
+
+    def _fly(self) -> None:
+        """Answer what the plant says."""
+        try:
+            for kind, fields in self.plant.receive():
+                if kind is STATE:
+                    self._period(PlantState(*fields))
+                elif kind is SENSOR:
+                    self.situation.imu = fields
+                elif kind is GPS:
+                    self.situation.fix = fields
+        except ConnectionError as error:
+            self._lose(f"the plant is gone: {error}")
+
+    def _period(self, state: PlantState) -> None:
+        """One control period; a repeated time is answered, not flown."""
+        self.heard = time.monotonic()
+        if state.stamp < self.stamp - CLOCK_BACK_US:
+            self.vehicle.plant_lost("the plant has started anew")
+            self._begin(self.heard)
+        elif "plant" in self.vehicle.obstacles:
+            del self.vehicle.obstacles["plant"]
+            self.vehicle.say(Severity.INFO, "the plant is heard again")
+        if state.stamp > self.stamp:
+            self.stamp = state.stamp
+            self._compute(state)
+        self.plant.answer(self.stamp, self.situation.row["commands"], self.vehicle.armed)
+        self.lateness.answered()
+
+    def _break(self) -> None:
+        """Put the faults of now into the controller, and stop what steers."""
+        assert self.faults is not None
+        self._zero = self.stamp if self._zero < 0 else self._zero
+        k = round(1e-6 * (self.stamp - self._zero) / self.faults.Ts)
+        self.faults.apply(k)
+        self.vehicle.attitude.cut = self.vehicle.sticks.cut = self.faults.stale(k)
+
+    def _compute(self, state: PlantState) -> None:
+        if self.faults is not None:
+            self._break()
+        state.measure(self.measurement)
+        now = 1e-6 * self.stamp
+        autopilot, m = self.autopilot, self.measurement
+        roll, pitch, yaw = euler_angles(m[0], m[1], m[2], m[3])
+        velocity = (-state.vz / 100, state.vx / 100, state.vy / 100)
+        estimate = Estimate(roll, pitch, yaw, (state.p, state.q, state.r), state.alt / 1000, *velocity)
+        demand = self.vehicle.step(now, estimate)
+        self._note_arming()
+        row = self.rows[0] if self.log is None else self.log.row(self.vehicle)
+        row["setpoint"] = demand[:3]
+        row["excitation"] = self.excitation(now)
+        autopilot.controls["landed"] = self.vehicle.lift.landed
+        tick(*autopilot.arguments()[:5], demand.collective, demand.altitude, m, row)
+        situation = self.situation
+        situation.stamp, situation.row, situation.state = self.stamp, row, state
+        situation.home = situation.home or (state.lat, state.lon, state.alt)
+        if self._periods % EXAMINED == 0 or row["fault"]:
+            self._examine(int(row["fault"]))
+        self._periods += 1
+
+    def _note_arming(self) -> None:
+        """The controller and the log follow what the vehicle is."""
+        armed = self.vehicle.armed
+        if armed == bool(self.autopilot.controls["armed"][0]):
+            return
+        self.autopilot.controls["armed"] = armed
+        if self.log is None:
+            return
+        if armed:
+            self.log.begin(self.autopilot.controller.state["gains"][0])
+        elif (path := self.log.save()) is not None:
+            self.lateness.nothing_waits(0.0, time.monotonic())  # writing is not counted: nothing flies
+            self.vehicle.say(Severity.INFO, f"logged: {path.name}")
+
+    def _examine(self, fault: int) -> None:
+        """What forbids arming and only we know."""
+        found = {}
+        if fault:
+            found["controller"] = f"the controller refuses its inputs (fault {fault}) and only damps the rates"
+        gains = self.autopilot.controller.state["gains"][0]
+        for parameter, value in zip(PARAMETERS, gains.tolist(), strict=True):
+            if not parameter.minimum <= value <= parameter.maximum:
+                found["parameters"] = f"{parameter.name} is {value:g}, not within its range"
+        Ts, period = float(gains[-1]), (self.stamp - self._first) * 1e-6 / EXAMINED
+        if self._periods and abs(period - Ts) > 0.02 * Ts and not fault:
+            found["rate"] = f"the plant's period is {1e3 * period:.3g} ms, the gains are for {1e3 * Ts:.3g} ms"
+        if not fault:
+            self._first = self.stamp
+        for subject in ("controller", "parameters", "rate"):
+            before = self.vehicle.obstacles.pop(subject, None)
+            if subject in found:
+                self.vehicle.obstacles[subject] = found[subject]
+                if before is None:
+                    self.vehicle.say(Severity.CRITICAL, found[subject])
+
+    def _tell(self, ground: Ground, now: float) -> None:
+        """What the vehicle has said, to the ground stations and the console."""
+        for severity, text in self.vehicle.said:
+            if now - self._told.get(text, -REPEATED_S) >= REPEATED_S:
+                self._told[text] = now
+                ground.say(severity, text)
+                print(f"[{max(self.vehicle.now, 0):.2f} s] {text}", flush=True)
+        self.vehicle.said.clear()
+        if len(self._told) > 100:
+            self._told.clear()
+
+    def close(self, ground: Ground) -> Path | None:
+        """Leave the plant and the ground stations; the log that was written, if any."""
+        self.plant.close()
+        ground.close()
+        return None if self.log is None else self.log.save()

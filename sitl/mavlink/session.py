@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from sitl.errors import SitlError
-from sitl.mavlink.connection import Connection, read_key
+from sitl.mavlink.connection import Connection
 from sitl.mavlink.exchange import TRY_S, Conversation
+from sitl.mavlink.signing import read_key
 from sitl.mavlink.upload import read
 from sitl.mavlink.words import Heartbeat, Steps, T, drive
 from tuning.output import progress_console

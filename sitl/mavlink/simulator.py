@@ -1,158 +1,172 @@
-"""The plant as a process of its own: PX4's simulator API over TCP, in lockstep.
+"""The vehicle as an autopilot meets it over PX4's simulator API: messages out, motor commands in, one period at a time.
 
-The autopilot connects; each period the plant sends HIL_SENSOR and HIL_STATE_QUATERNION, waits for
-HIL_ACTUATOR_CONTROLS and only then steps.
+No sockets and no clock here: see `sitl.mavlink.plant_server` and `sitl.mavlink.hitl`.
 """
 
 from __future__ import annotations
 
 import math
-import socket
-import time
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.airframe import Airframe
 from sitl.autopilot import MAX_ROTORS
+from sitl.contact import ground_state, touch
+from sitl.faults import Fault
+from sitl.injection import Injection
+from sitl.instruments import FIX_3D, GPS_EPH, GPS_EPV, GPS_PERIOD, SATELLITES, Instruments, centi, place
 from sitl.loop import Simulator
-from sitl.mavlink.link import Codec
+from sitl.mavlink.lean import GPS, SENSOR, STATE, LeanCodec
 from sitl.plant import GRAVITY
 
-FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is answered
 NOISE_BLOCK = 250
-EPOCH_US = 1_000_000
-HOME_LATITUDE, HOME_LONGITUDE = 473977420, 85455940  # 1e-7 deg
-METRES_PER_DEGREE = 111_319.5
-METRES_PER_DEGREE_EAST = METRES_PER_DEGREE * math.cos(math.radians(HOME_LATITUDE * 1e-7))
-ALL_FIELDS = 7 | 56 | 448 | 6656  # accelerometer, gyro, magnetometer, barometer
-EARTH_FIELD = (0.21, 0.01, 0.43)  # Gauss, NED
+EPOCH_US = 1_000_000  # the simulated clock starts here: autopilots take zero for no time at all
+INERTIAL, FIELD_AND_AIR = 7 | 56, 448 | 6656  # bits of fields_updated
+FIELD_AND_AIR_PERIOD = 0.02  # s
+HARD_LANDING = 2.0  # m/s
+TIPPED = math.cos(math.radians(60.0))
+ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+
+Tell = Callable[[str], None]
 
 
-class PlantServer:
-    """A simulated vehicle at one end of a TCP connection.
+class SimulatedVehicle:
+    """A vehicle with its instruments, on the ground or in the air.
 
     Parameters
     ----------
     airframe : Airframe
         The vehicle.
     Ts : float, s
-        Interval between frames.
+        Control period.
     seed : int
-        Of the measurement noise.
-    speed : float or None
-        Times real time; None: as fast as the autopilot answers.
+        Of all noise.
+    altitude : float, m
+        Where it starts, hovering; 0: on the ground, with standing rotors.
+    tell : callable
+        Called with each thing that a user must know.
+    faults : sequence of Fault
+        What goes wrong, in seconds from the first answer of an autopilot.
+
+    Attributes
+    ----------
+    copies : int
+        How often the messages of now reach the autopilot: 0 when they are lost, 2 when they are duplicated.
+    periods : int
+        What the simulated clock has counted.
+    codec : LeanCodec
+        Of the plant's end of the link.
     """
 
-    def __init__(self, airframe: Airframe, Ts: float, seed: int, speed: float | None = 1.0) -> None:
-        self.simulator = Simulator(airframe, Ts, seed)
-        self.Ts, self.speed = Ts, speed
-        self.rotors = len(airframe.rotors)
-        self.codec = Codec(system=1, component=mavlink.MAV_COMP_ID_USER1)
-        self._warm_up(airframe, seed)
+    def __init__(
+        self, airframe: Airframe, Ts: float, seed: int, altitude: float, tell: Tell, faults: Sequence[Fault] = ()
+    ) -> None:
+        self.airframe, self.Ts, self.seed, self.altitude, self.tell = airframe, Ts, seed, altitude, tell
+        self.faults = faults
+        self.field_every = max(1, round(FIELD_AND_AIR_PERIOD / Ts))
+        self.fix_every = max(1, round(GPS_PERIOD / Ts))
+        self.restart()
+        # Compile what each period calls now, so that the first frames come in time.
+        self.messages()
+        self.fly([0.0] * MAX_ROTORS, ARMED)
+        touch(ground_state(self.simulator.plant), self.simulator.plant, Ts)
+        self.restart()
 
-    def _warm_up(self, airframe: Airframe, seed: int) -> None:
-        """Compile what each period calls now, so that the first frames come in time."""
-        spare = Simulator(airframe, self.Ts, seed)
-        spare.measure(spare.noise(1)[0])
-        spare.advance(np.zeros(MAX_ROTORS, np.float32))
+    def restart(self) -> None:
+        """Put the vehicle back at its start; what follows is the same as the first time."""
+        self.simulator = Simulator(self.airframe, self.Ts, self.seed, altitude=self.altitude)
+        if self.altitude == 0:
+            self.simulator.state[:] = ground_state(self.simulator.plant)
+            self.simulator.history[:] = 0.0
+        self.instruments = Instruments(self.simulator.state, self.Ts, self.seed)
+        self.injection = Injection(self.faults, self.airframe, self.simulator, self.Ts, self.seed)
+        self.codec = LeanCodec(1, mavlink.MAV_COMP_ID_USER1)
+        self.periods = self.flown = 0
+        self.lost = self.odd = False
+        self.copies, self.gyro = 1, [0.0, 0.0, 0.0]
+        self._measure()
 
-    def serve(self, connection: socket.socket) -> int:
-        """Fly until the autopilot goes away; returns the number of periods."""
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        answers = self._answers(connection)
-        begin = time.monotonic()
-        count = 0
-        while True:
-            if count % NOISE_BLOCK == 0:
-                noise = self.simulator.noise(NOISE_BLOCK)
-            measurement = self.simulator.measure(noise[count % NOISE_BLOCK])
-            frame = self._frame(count, measurement)
-            try:
-                connection.sendall(frame)
-                connection.settimeout(FIRST_ANSWER_S if count == 0 else None)
-                answer = None
-                while answer is None or answer.time_usec < EPOCH_US + round(count * self.Ts * 1e6):
-                    answer = next(answers)  # an answer to a repeated frame is older than this one
-                    if answer is None:
-                        connection.sendall(frame)
-            except (StopIteration, OSError):
-                return count
-            self.simulator.advance(np.array(answer.controls, np.float32))
-            count += 1
-            if self.speed is not None:
-                ahead = begin + count * self.Ts / self.speed - time.monotonic()
-                if ahead > 0:
-                    time.sleep(ahead)
+    @property
+    def stamp(self) -> int:
+        """The simulated clock, us."""
+        return EPOCH_US + round((self.periods * self.Ts - self.injection.clock_back(self.flown)) * 1e6)
 
-    def _answers(self, connection: socket.socket) -> Iterator[Any]:
-        """Actuator messages as they come; None each time that the wait for one ran out."""
-        while True:
-            try:
-                data = connection.recv(65536)
-            except TimeoutError:
-                yield None
-                continue
-            if not data:
-                return
-            for message in self.codec.parse(data):
-                if message.get_type() == "HIL_ACTUATOR_CONTROLS":
-                    yield message
+    def _measure(self) -> None:
+        if self.faults:
+            self._break()
+        if self.flown % NOISE_BLOCK == 0:
+            self.noise = self.simulator.noise(NOISE_BLOCK)
+        self.simulator.measure(self.noise[self.flown % NOISE_BLOCK])
 
-    def _frame(self, count: int, measurement: Any) -> bytes:
-        """One HIL_SENSOR and one HIL_STATE_QUATERNION."""
-        stamp = EPOCH_US + round(count * self.Ts * 1e6)
-        q = [float(v) for v in measurement[:4]]
-        p, q_rate, r = (float(v) for v in measurement[4:7])
-        x, y, z, vx, vy = (float(v) for v in self.simulator.state[:5])
-        speeds = self.simulator.state[13:]
-        lift = self.simulator.plant.thrust_coefficient * float(speeds @ speeds) / self.simulator.plant.mass
-        pressure = 1013.25 * (1 + z / 44330.0) ** 5.255
-        sensor = mavlink.MAVLink_hil_sensor_message(
-            stamp,
-            *(0.0, 0.0, -lift),
-            *(p, q_rate, r),
-            *_to_body(q, EARTH_FIELD),
-            pressure,
-            0.0,
-            -z,
-            20.0,
-            ALL_FIELDS,
+    def _break(self) -> None:
+        """Put the faults of this period into the vehicle and into its link."""
+        for _, runs, delays in self.injection.stretches(self.flown, self.flown + 1):
+            self.copies = 1 if runs is None else int(runs[0])
+            if delays is not None:
+                self.simulator.delay = int(delays[0])
+
+    def stand(self) -> None:
+        """Let a period pass without flying: the clock and the instruments run, the vehicle stays where it is."""
+        self.periods += 1
+
+    def fly(self, controls: Sequence[float], mode: int) -> None:
+        """Fly one period under HIL_ACTUATOR_CONTROLS: thrust fractions and the autopilot's mode bits."""
+        commands = np.array(controls, np.float32)
+        if not math.isfinite(sum(controls)):
+            if not self.odd:
+                self.tell("motor commands that are not finite came from the autopilot; those motors stop")
+            self.odd = True
+            commands = np.where(np.isfinite(commands), commands, np.float32(0.0))
+        if self.lost or not mode & ARMED:
+            commands[:] = 0.0
+        simulator = self.simulator
+        simulator.advance(commands)
+        speed = touch(simulator.state, simulator.plant, self.Ts)
+        if speed >= 0.0:
+            self._judge_landing(speed)
+        self.periods += 1
+        self.flown += 1
+        self._measure()
+
+    def _judge_landing(self, speed: float) -> None:
+        """Tell of a crash; the vehicle lies where it is, its motors stopped, until `restart`."""
+        x, y = self.simulator.state[7:9]
+        level = 1 - 2 * (x * x + y * y)
+        if self.lost or (speed <= HARD_LANDING and level >= TIPPED):
+            return
+        self.lost = True
+        tilt = math.degrees(math.acos(min(1.0, max(-1.0, level))))
+        self.tell(
+            f"crashed at {self.flown * self.Ts:.2f} s: came down at {speed:.1f} m/s (at most {HARD_LANDING:g}), tilted by "
+            f"{tilt:.0f} deg (at most 60); it lies there with stopped motors until an autopilot connects anew"
         )
-        gx, gy, gz = _to_body(q, (0.0, 0.0, 1.0))
-        state = mavlink.MAVLink_hil_state_quaternion_message(
-            stamp,
-            q,
-            p,
-            q_rate,
-            r,
-            HOME_LATITUDE + round(x / METRES_PER_DEGREE * 1e7),
-            HOME_LONGITUDE + round(y / METRES_PER_DEGREE_EAST * 1e7),
-            int(measurement[7]),
-            _int16(vx * 100),
-            _int16(vy * 100),
-            _int16(-float(measurement[8])),
-            0,
-            0,
-            _int16(gx * 1000),
-            _int16(gy * 1000),
-            _int16((gz - lift / GRAVITY) * 1000),
-        )
-        return self.codec.pack(sensor) + self.codec.pack(state)
 
+    def _gyro(self, rates: list[float]) -> list[float]:
+        """What is left of the gyro's reading."""
+        sensors = self.simulator.sensors
+        biased = rates + sensors.bias
+        self.gyro = np.where(sensors.failed, np.nan, np.where(sensors.stuck, self.gyro, biased)).tolist()
+        return self.gyro
 
-def _int16(value: float) -> int:
-    return max(-32768, min(32767, round(value)))
-
-
-def _to_body(q: list[float], v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """An earth vector in body axes; plain floats, NumPy would cost more than the rest of the frame."""
-    w, x, y, z = q
-    a, b, c = v
-    return (
-        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
-        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
-        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
-    )
+    def messages(self, truth: bool = True) -> bytes:
+        """HIL_SENSOR, HIL_GPS when it is due and, if wanted, HIL_STATE_QUATERNION of now."""
+        stamp, state = self.stamp, self.simulator.state
+        readings = self.instruments.read(state)
+        if self.faults:
+            readings[3:6] = self._gyro(readings[3:6])
+        fields = INERTIAL | (FIELD_AND_AIR if self.periods % self.field_every == 0 else 0)
+        data = self.codec.pack(SENSOR, stamp, *readings[:10], 0.0, *readings[10:12], fields, 0)
+        if self.periods % self.fix_every == 0:
+            fix = self.instruments.fix(state)
+            said = (fix.speed, fix.north, fix.east, fix.down, fix.course, FIX_3D, SATELLITES, 0, 0)
+            data += self.codec.pack(GPS, stamp, *fix.place, GPS_EPH, GPS_EPV, *said)
+        if truth:
+            seen = self.simulator.seen.tolist()
+            x, y, z, vx, vy = state[:5].tolist()
+            latitude, longitude, _ = place(x, y, z)
+            acceleration = (centi(10.0 * a / GRAVITY) for a in readings[12:])
+            place_and_speed = (latitude, longitude, int(seen[7]), centi(vx), centi(vy), int(-seen[8]))
+            data += self.codec.pack(STATE, stamp, *seen[:7], *place_and_speed, 0, 0, *acceleration)
+        return data

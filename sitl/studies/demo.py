@@ -19,7 +19,8 @@ from sitl.autopilot import Autopilot
 from sitl.errors import SitlError
 from sitl.figures import experiment_figure, manoeuvre_figure, svg
 from sitl.loop import Flight, fly
-from sitl.mavlink.host import Host, plant_process
+from sitl.mavlink import lockstep
+from sitl.mavlink.plant_process import plant_process
 from sitl.metrics import Performance, performance
 from sitl.models import reference_models
 from sitl.recorder import save_flight
@@ -162,13 +163,9 @@ def _same_over_mavlink(
     autopilot = Autopilot(airframe, gains, NativeController(controller.library))
     autopilot.warm_up()
     with plant_process(AIRFRAME, 0, gains.Ts, seed, None) as port:
-        host = Host(autopilot, len(airframe.rotors), port)
-        try:
-            begin = time.monotonic()
-            record = host.fly(flight.scenario)
-            elapsed = time.monotonic() - begin
-        finally:
-            host.close()
+        begin = time.monotonic()
+        record = lockstep.fly(autopilot, flight.scenario, port)
+        elapsed = time.monotonic() - begin
     different = np.flatnonzero(
         (record["moment"].view(np.uint32) != flight.record["moment"].view(np.uint32)).any(axis=1)
     )

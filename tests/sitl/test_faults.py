@@ -13,11 +13,16 @@ from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.errors import SitlError
 from sitl.faults import KINDS, fault_help, parse_fault, parse_faults
-from sitl.injection import STALE_SETPOINT_S, Injection
+from sitl.injection import Injection
 from sitl.loop import Simulator, fly
 from sitl.plant import GRAVITY
-from sitl.scenario import doublet, hover, load_scenario
+from sitl.recorder import save_flight
+from sitl.scenario import doublet, excitation_flight, hover, load_scenario, step
+from sitl.setpoints import STALE_SECONDS
 from tests.conftest import assert_one_clear_line
+from tuning.cascade import tune
+from tuning.logs.reader import read_log
+from tuning.spec import load_spec
 
 TS = 0.004
 
@@ -342,6 +347,28 @@ def test_a_delay_makes_every_command_so_late_and_none_acts_before_its_time(vehic
     assert ages.tolist() == [1] * 10 + [1, 2, 3, 4, 5] + [5] * 5 + [5, 1] + [1] * 18
 
 
+def test_the_limit_cycle_starts_at_the_delay_margin_that_the_certificate_gives(vehicle, library, tmp_path):
+    own = vehicle.default_gains()
+    scenario = excitation_flight(20.0, 0.15, 50.0, TS, np.random.default_rng(0))
+    experiment = fly(vehicle.airframe, Autopilot(vehicle.airframe, own, NativeController(library, own)), scenario, 0)
+    save_flight(tmp_path / "a.ulg", experiment, vehicle.airframe, own)
+    gains = tune(read_log(tmp_path / "a.ulg"), load_spec(method="mimo"))
+    assert gains.certificate is not None
+    margin = min(gains.certificate["figures"]["delay_margin_ms"].values()) / 1e3
+    allowed = int(vehicle.airframe.computing_delay + margin / TS)  # whole periods, the vehicle's own among them
+
+    def growth(periods):
+        faults = (parse_fault(f"delay={periods * TS}@0.5"),)
+        task = replace(step("roll", np.radians(2.0), 15.0, TS), faults=faults)
+        flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), task, 0, noise=False)
+        rates = np.abs(flight.truth["rates"][:, 0])
+        return rates[-500:].max() / rates[500:1000].max()
+
+    assert 4 < allowed < 12
+    assert growth(allowed) < 0.1
+    assert growth(allowed + 1) > 3
+
+
 def test_jitter_delivers_the_newest_command_that_has_arrived(vehicle):
     _, ages = link(vehicle, "jitter=0.02@0", 4000)
     acting = np.arange(4000) - ages
@@ -414,7 +441,7 @@ def test_a_stale_set_point_is_flown_for_half_a_second_then_level_with_its_headin
     scenario.setpoint[:] = [0.1, -0.05, 0.2]
     scenario.setpoint[60:, 0] = 0.2
     flown_for = flown(scenario, "stale@0.2+1").record["setpoint"]
-    last_fresh = 49 + round(STALE_SETPOINT_S / TS)
+    last_fresh = 49 + round(STALE_SECONDS / TS)
     assert (flown_for[: last_fresh + 1] == np.float32([0.1, -0.05, 0.2])).all()
     assert (flown_for[last_fresh + 1 : 300] == np.float32([0, 0, 0.2])).all()
     assert (flown_for[300:] == np.float32([0.2, -0.05, 0.2])).all()

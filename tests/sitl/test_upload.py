@@ -17,10 +17,11 @@ from codegen.parameters import IDENTITY, PARAMETERS
 from codegen.render import render
 from sitl.airframe import load_airframe
 from sitl.errors import SitlError
-from sitl.mavlink.connection import Connection, express, read_key, understand
+from sitl.mavlink.connection import Connection, express, understand
 from sitl.mavlink.link import Codec
 from sitl.mavlink.parameter_files import read_parameters
 from sitl.mavlink.profiles import make_plan
+from sitl.mavlink.signing import Signer, read_key
 from sitl.mavlink.words import Beat, Heartbeat, Read, Refusal, Store, Value, Write
 from tests.conftest import assert_one_clear_line
 from tests.sitl.scripted_vehicle import FAILING, ScriptedVehicle, SerialVehicle, TcpVehicle, UdpVehicle, encode, float32
@@ -404,11 +405,11 @@ damage = st.one_of(
 def test_any_bytes_are_read_without_a_stumble_and_a_whole_frame_is_found_again(chunks, signed):
     codec = Codec(255, 190)
     if signed:
-        codec.mav.signing.secret_key = KEY
+        codec.signer = Signer(KEY)
     for chunk in chunks:
         for message in codec.parse(chunk):
             understand(message)
-    codec.mav.signing.secret_key = None
+    codec.signer = None
     # A false start may swallow as much as the longest frame; then the parser is back.
     heard = [understand(message) for _ in range(20) for message in codec.parse(FRAMES[2])]
     assert heard[-1] == Value(1, 1, "SIXTEEN_LETTERS_", -1.5)

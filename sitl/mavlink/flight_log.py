@@ -1,0 +1,69 @@
+"""The log of a vehicle that is flown by others: each flight, from arming to disarming, at full rate."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.airframe import Airframe
+from sitl.autopilot import RECORD
+from sitl.modes import Vehicle
+from sitl.recorder import vehicle_log
+from tuning.files import write_atomically
+
+BLOCK = 15_000  # rows, a minute
+
+
+class FlightLog:
+    """Writes FILE.ulg for the first flight, FILE-2.ulg for the second, and so on.
+
+    Parameters
+    ----------
+    path : Path
+        Of the first.
+    airframe : Airframe
+        The vehicle.
+    Ts : float, s
+        Control period.
+    """
+
+    def __init__(self, path: Path, airframe: Airframe, Ts: float) -> None:
+        self.path, self.airframe, self.Ts = path, airframe, Ts
+        self.flights = 0
+        self._spare: NDArray[Any] = np.zeros(1, RECORD)
+        self._forget()
+
+    def _forget(self) -> None:
+        self._blocks: list[NDArray[Any]] = []
+        self._landed: list[bool] = []
+        self._gains: NDArray[np.float32] | None = None
+
+    def begin(self, gains: NDArray[np.float32]) -> None:
+        """A flight begins, under these gains, (36,)."""
+        self._forget()
+        self._gains = gains.copy()
+
+    def row(self, vehicle: Vehicle) -> Any:
+        """The record of the next period, of `sitl.autopilot.RECORD`, to be filled."""
+        if self._gains is None:
+            return self._spare[0]
+        place = len(self._landed) % BLOCK
+        if place == 0:
+            self._blocks.append(np.zeros(BLOCK, RECORD))
+        self._landed.append(vehicle.lift.landed)
+        return self._blocks[-1][place]
+
+    def save(self) -> Path | None:
+        """The flight ends: write it. None: there was none."""
+        if self._gains is None or not self._landed:
+            return None
+        record = np.concatenate(self._blocks)[: len(self._landed)]
+        content = vehicle_log(record, np.array(self._landed), self.Ts, self.airframe, self._gains)
+        self.flights += 1
+        name = self.path if self.flights == 1 else self.path.with_stem(f"{self.path.stem}-{self.flights}")
+        write_atomically(name, content)
+        self._forget()
+        return name

@@ -1,0 +1,212 @@
+"""The plant as a process of its own: serves one autopilot after another over TCP, in lockstep.
+
+Each period the plant sends its messages, waits for HIL_ACTUATOR_CONTROLS, and only then steps. Until an autopilot
+has answered for the first time the vehicle is held at its start. The first frame is repeated, because an autopilot
+may miss it; one that says something else first (PX4 sends HEARTBEAT, boots for seconds, and needs the clock to run
+for that) gets new frames in real time.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+import sys
+import time
+from typing import Any
+
+from sitl.mavlink.lean import ACTUATORS, Message
+from sitl.mavlink.simulator import SimulatedVehicle
+
+FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is answered
+LOOK_S = 0.2  # between looks at everything but the autopilot
+FROZEN_S = 1.0  # without an answer
+MUTE_S = 10.0  # without the first one
+SPIN_S = 300e-6  # at full speed an answer comes sooner than a sleeping process wakes
+FORGET_S = 0.25  # a simulation that is late by more does not race to catch up
+
+
+class ParentGone(Exception):
+    """The process that started this one has ended."""
+
+
+class PlantServer:
+    """Serves a vehicle at a listening socket.
+
+    Parameters
+    ----------
+    vehicle : SimulatedVehicle
+        It is put back at its start for each autopilot.
+    listener : socket
+        Listening.
+    speed : float or None
+        Times real time; None: as fast as the autopilot answers.
+    child : bool
+        End when standard input is closed.
+    """
+
+    def __init__(self, vehicle: SimulatedVehicle, listener: socket.socket, speed: float | None, child: bool) -> None:
+        self.vehicle, self.listener, self.speed = vehicle, listener, speed
+        self.watched: list[Any] = [listener, sys.stdin] if child else [listener]
+        self.next_look = 0.0
+        listener.setblocking(False)
+
+    def serve(self) -> None:
+        """Serve until the parent ends, or for ever."""
+        try:
+            while True:
+                self._serve_one(self._accept())
+        except ParentGone:
+            return
+
+    def _accept(self) -> socket.socket:
+        while True:
+            ready, _, _ = select.select(self.watched, [], [])
+            self._end_with_parent(ready)
+            if self.listener in ready:
+                try:
+                    return self.listener.accept()[0]
+                except OSError:  # it has gone again
+                    continue
+
+    @staticmethod
+    def _end_with_parent(ready: list[Any]) -> None:
+        if sys.stdin in ready and not os.read(sys.stdin.fileno(), 4096):
+            raise ParentGone
+
+    def _serve_one(self, connection: socket.socket) -> None:
+        vehicle = self.vehicle
+        vehicle.restart()
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        try:
+            with connection:
+                Lockstep(self, connection).fly()
+        except OSError:
+            vehicle.tell(
+                f"the autopilot went away at {vehicle.flown * vehicle.Ts:.2f} s of flight; "
+                "the vehicle is back at its start and waits for the next"
+            )
+
+    def look_around(self, now: float) -> None:
+        """Turn a second autopilot away, and end with the parent.
+
+        Raises
+        ------
+        ParentGone
+        """
+        if now < self.next_look:
+            return
+        self.next_look = now + LOOK_S
+        ready, _, _ = select.select(self.watched, [], [], 0)
+        self._end_with_parent(ready)
+        if self.listener in ready:
+            try:
+                self.listener.accept()[0].close()
+            except OSError:
+                return
+            self.vehicle.tell("a second autopilot was turned away: this vehicle has one already")
+
+
+class Lockstep:
+    """One autopilot's flight."""
+
+    def __init__(self, server: PlantServer, connection: socket.socket) -> None:
+        self.server, self.vehicle, self.connection = server, server.vehicle, connection
+        self.spin = SPIN_S if server.speed is None else 0.0
+        self.garbage = False
+        connection.setblocking(False)
+
+    def fly(self) -> None:
+        """Fly until the autopilot goes away.
+
+        Raises
+        ------
+        OSError
+            When it does.
+        """
+        vehicle, speed = self.vehicle, self.server.speed
+        answer = self._first_answer()
+        begin, count = time.monotonic(), 0
+        while True:
+            vehicle.fly(answer[2:18], answer[18])
+            count += 1
+            if speed is not None:
+                now = time.monotonic()
+                ahead = begin + count * vehicle.Ts / speed - now
+                if ahead > 0:
+                    time.sleep(ahead)
+                elif ahead < -FORGET_S:
+                    begin, count = now, 0
+            messages = vehicle.messages()
+            if vehicle.copies:
+                self.connection.sendall(messages * vehicle.copies)
+                answer = self._answer()
+
+    def _first_answer(self) -> tuple[Any, ...]:
+        """Offer the start until it is answered."""
+        vehicle = self.vehicle
+        begin = time.monotonic()
+        booting, told = False, False
+        frame = vehicle.messages()
+        self.connection.sendall(frame)
+        pace = vehicle.Ts / (self.server.speed or 1.0)
+        due = begin + FIRST_ANSWER_S
+        while True:
+            for kind, fields in self._receive(due):
+                if kind is not ACTUATORS:
+                    booting = True
+                elif fields[0] >= vehicle.stamp:
+                    return fields
+            now = time.monotonic()
+            if now > begin + MUTE_S and not told:
+                told = True
+                vehicle.tell(f"no HIL_ACTUATOR_CONTROLS in {MUTE_S:g} s: is that an autopilot in simulation?")
+            if now >= due:
+                if booting:
+                    vehicle.stand()
+                    frame = vehicle.messages()
+                due = max(due, now - FORGET_S) + (pace if booting else FIRST_ANSWER_S)
+                if select.select([], [self.connection], [], 0)[1]:  # it may not read for as long as it boots
+                    self.connection.sendall(frame)
+
+    def _answer(self) -> tuple[Any, ...]:
+        """Wait for the commands of this period; answers to older frames are passed over."""
+        since = time.monotonic()
+        frozen = False
+        while True:
+            until = time.monotonic() + LOOK_S if frozen else since + FROZEN_S
+            for kind, fields in self._receive(until):
+                if kind is ACTUATORS and fields[0] >= self.vehicle.stamp:
+                    if frozen:
+                        waited = time.monotonic() - since
+                        self.vehicle.tell(f"the autopilot answers again, after {waited:.1f} s")
+                    return fields
+            if not frozen and time.monotonic() >= since + FROZEN_S:
+                frozen = True
+                self.vehicle.tell(
+                    f"the autopilot has not answered for {FROZEN_S:g} s, at {self.vehicle.flown * self.vehicle.Ts:.2f} s "
+                    "of flight; time stands still until it does"
+                )
+
+    def _receive(self, until: float) -> list[Message]:
+        """What came, as soon as something comes; nothing when the time is over."""
+        connection, spin_until = self.connection, time.monotonic() + self.spin
+        while True:
+            try:
+                data = connection.recv(65536)
+            except BlockingIOError:
+                now = time.monotonic()
+                self.server.look_around(now)
+                if now < spin_until:
+                    continue
+                if now >= until:
+                    return []
+                select.select([connection], [], [], min(until - now, LOOK_S))
+                continue
+            if not data:
+                raise ConnectionResetError
+            messages = self.vehicle.codec.parse(data)
+            if self.vehicle.codec.skipped and not self.garbage:
+                self.garbage = True
+                self.vehicle.tell("bytes that are no MAVLink came from the autopilot and are passed over")
+            return messages

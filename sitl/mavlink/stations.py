@@ -1,0 +1,253 @@
+"""Ground stations of one vehicle: several at once, by UDP and by TCP, none of which can hold up the flight.
+
+Whoever sends a sound frame is a station from then on. What is read in one call is bounded in time, what waits for a
+slow reader is bounded in size, and a frame is only read when it is for this vehicle and, with a key, signed.
+"""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Container, Iterator, Sequence
+from typing import Any, TypeVar
+
+from sitl.mavlink.link import COMPONENT, EVERY, LOOPBACK, SYSTEM, Codec, listen, udp_socket
+from sitl.mavlink.signing import Signer
+
+TCP_PORT = 5760
+#: Time that one call of `Stations.receive` may take up, answers included, s; an eighth of a control period.
+BUDGET_S = 0.0005
+#: Most stations of one kind, and the silence (s) after which one of them gives way to another.
+MAX_STATIONS, SILENCE_S = 8, 10.0
+#: A TCP station that lets more wait than this is cut off, bytes.
+MAX_WAITING = 1 << 16
+CHUNK = 2048
+
+Address = tuple[str, int]
+Heard = tuple[Any, "Station"]
+#: Yields what was said by one message or none at all; None: nothing is there now.
+Reader = Iterator["list[Heard] | None"]
+S = TypeVar("S", bound="Station")
+
+
+class Station:
+    """One ground station: counts its own messages, so that it does not take those of another for lost ones.
+
+    Parameters
+    ----------
+    codec : Codec
+        Packs for it and parses what it says.
+    """
+
+    def __init__(self, codec: Codec) -> None:
+        self.codec = codec
+        self.heard = time.monotonic()
+
+    def send(self, message: Any) -> None:
+        """One message; a station that is not there is no error."""
+        self.transmit(self.codec.pack(message))
+
+    def transmit(self, data: bytes) -> None:
+        """Bytes of one message."""
+        raise NotImplementedError
+
+
+class UdpStation(Station):
+    """Behind an address."""
+
+    def __init__(self, codec: Codec, link: socket.socket, address: Address) -> None:
+        super().__init__(codec)
+        self.link, self.address = link, address
+
+    def transmit(self, data: bytes) -> None:  # noqa: D102
+        try:
+            self.link.sendto(data, self.address)
+        except OSError:
+            return
+
+
+class TcpStation(Station):
+    """Behind a connection that it made."""
+
+    def __init__(self, codec: Codec, link: socket.socket) -> None:
+        super().__init__(codec)
+        self.link, self.open = link, True
+        self.waiting = b""
+        self.reader = self._read()
+        link.setblocking(False)
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def transmit(self, data: bytes) -> None:  # noqa: D102
+        if not self.open:
+            return
+        self.waiting += data
+        try:
+            self.waiting = self.waiting[self.link.send(self.waiting) :]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self.close()
+        if len(self.waiting) > MAX_WAITING:
+            self.close()
+
+    def close(self) -> None:
+        """Cut it off."""
+        self.open = False
+        self.link.close()
+
+    def _read(self) -> Reader:
+        while True:
+            try:
+                data = self.link.recv(CHUNK)
+            except BlockingIOError:
+                yield None
+                continue
+            except OSError:
+                data = b""
+            if not data:
+                self.close()
+                yield None
+                continue
+            for message in self.codec.parse(data):
+                yield [(message, self)] if _is_ours(message) else []
+            yield []
+
+
+class Stations:
+    """All ground stations.
+
+    Parameters
+    ----------
+    ground_port : int
+        UDP port on this machine where a station listens; it is spoken to from the start.
+    udp_port, tcp_port : int
+        Local ports where stations may speak first; 0: any free one.
+    bind : str
+        Local address of both.
+    signer : Signer, optional
+        Signs all that is sent; nothing unsigned is then heard.
+    wanted : container of int
+        Numbers of the messages that mean anything to the vehicle.
+
+    Raises
+    ------
+    SitlError
+        When a port or the address cannot be used.
+    """
+
+    def __init__(
+        self,
+        ground_port: int,
+        udp_port: int,
+        tcp_port: int = 0,
+        bind: str = LOOPBACK,
+        signer: Signer | None = None,
+        wanted: Container[int] = EVERY,
+    ) -> None:
+        self.signer, self.wanted = signer, wanted
+        self.udp = udp_socket(bind, udp_port)
+        try:
+            self.tcp = listen(bind, tcp_port, MAX_STATIONS, "--tcp-port")
+        except BaseException:
+            self.udp.close()
+            raise
+        self.tcp.setblocking(False)
+        self.datagrams = self._codec()
+        self.first = LOOPBACK, ground_port
+        self.by_address: dict[Address, UdpStation] = {self.first: UdpStation(self._codec(), self.udp, self.first)}
+        self.connected: list[TcpStation] = []
+        self.from_udp = self._read_udp()
+
+    def _codec(self) -> Codec:
+        return Codec(signer=self.signer, wanted=self.wanted)
+
+    @property
+    def sockets(self) -> list[socket.socket]:
+        """What becomes readable when there is something to receive."""
+        return [self.udp, self.tcp, *(station.link for station in self.connected)]
+
+    def close(self) -> None:
+        """Release the ports."""
+        for station in self.connected:
+            station.close()
+        self.udp.close()
+        self.tcp.close()
+
+    def send(self, message: Any) -> None:
+        """One message to every station."""
+        for station in (*self.by_address.values(), *self.connected):
+            station.send(message)
+
+    def receive(self) -> Iterator[Heard]:
+        """What stations say to this vehicle, one message of each in turn, until nothing is left or the time is up."""
+        end = time.perf_counter() + BUDGET_S
+        self._admit()
+        busy = [self.from_udp, *(station.reader for station in self.connected)]
+        while busy:
+            for reader in tuple(busy):
+                found = next(reader)
+                if found is None:
+                    busy.remove(reader)
+                    continue
+                for message, station in found:
+                    station.heard = time.monotonic()
+                    yield message, station
+                if time.perf_counter() > end:
+                    busy.clear()
+                    break
+        self.connected = [station for station in self.connected if station.open]
+
+    def _admit(self) -> None:
+        """Let one more connection in."""
+        try:
+            link, _ = self.tcp.accept()
+        except OSError:
+            return
+        if len(self.connected) >= MAX_STATIONS:
+            silent = _silent(self.connected)
+            if silent is None:
+                link.close()
+                return
+            silent.close()
+            self.connected.remove(silent)
+        self.connected.append(TcpStation(self._codec(), link))
+
+    def _read_udp(self) -> Reader:
+        while True:
+            try:
+                data, address = self.udp.recvfrom(CHUNK)
+            except OSError:
+                yield None
+                continue
+            for message in self.datagrams.parse_datagram(data):
+                station = self._at(address) if _is_ours(message) else None
+                yield [] if station is None else [(message, station)]
+            yield []
+
+    def _at(self, address: Address) -> UdpStation | None:
+        """The station at an address, new or known; None when there are too many."""
+        station = self.by_address.get(address)
+        if station is None:
+            learned = [other for other in self.by_address.values() if other.address != self.first]
+            if len(learned) >= MAX_STATIONS:
+                silent = _silent(learned)
+                if silent is None:
+                    return None
+                del self.by_address[silent.address]
+            station = self.by_address[address] = UdpStation(self._codec(), self.udp, address)
+        return station
+
+
+def _is_ours(message: Any) -> bool:
+    """Whether a message is for this vehicle, and not one of its own that came back."""
+    return (
+        (message.get_srcSystem(), message.get_srcComponent()) != (SYSTEM, COMPONENT)
+        and getattr(message, "target_system", 0) in (0, SYSTEM)
+        and getattr(message, "target_component", 0) in (0, COMPONENT)
+    )
+
+
+def _silent(stations: Sequence[S]) -> S | None:
+    """The station that was silent for longest, if that is long."""
+    oldest = min(stations, key=lambda station: station.heard)
+    return oldest if time.monotonic() - oldest.heard > SILENCE_S else None
