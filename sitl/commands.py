@@ -21,6 +21,7 @@ AmplitudeOption = Annotated[float | None, typer.Option(help="Of the doublet or s
 PeriodOption = Annotated[
     float | None, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.", show_default="0.42")
 ]
+TailOption = Annotated[float | None, typer.Option(help="Level flight after a doublet, s.", show_default="1.5")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
 SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast as it goes.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
@@ -166,7 +167,7 @@ def fly(
     axis: AxisOption = None,
     amplitude_deg: AmplitudeOption = None,
     period_s: PeriodOption = None,
-    tail_s: Annotated[float | None, typer.Option(help="Level flight after a doublet, s.", show_default="1.5")] = None,
+    tail_s: TailOption = None,
     fault: FaultOption = None,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,

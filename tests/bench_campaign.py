@@ -8,6 +8,10 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
+
+from sitl.campaign.flights import Stand
+from sitl.campaign.plan import plan_from_files, read_files
 from tests.bench_tuning import best
 from tuning.parallel import cores
 
@@ -37,6 +41,7 @@ def campaign_rows(folder: Path) -> list[list[str]]:
     return [
         [f"{title}, {cores()} processes", f"{seconds:.1f} s", "under 10 s on two cores"],
         ["the same, for each core", f"{pace:.0f} x real time", ""],
+        [f"one of its {FLIGHT_S:g} s flights: draw, noise, flight, figures", *_parts(folder / f"campaign-{RUNS}")],
         ["its memory, largest process", f"{large:.0f} MB", f"{small:.0f} MB with {RUNS // 10}"],
     ]
 
@@ -51,6 +56,21 @@ def _campaign(folder: Path, spec: Path, runs: int) -> tuple[float, float]:
     if status:
         raise RuntimeError(f"the campaign ended with {status}")
     return time.perf_counter() - begin, usage.ru_maxrss / 1024
+
+
+def _parts(folder: Path) -> tuple[str, str]:
+    """Where the time of one flight of a campaign goes, and what it is in all."""
+    stand = Stand(plan_from_files(read_files(folder)))
+    seed, noise = stand.plan.description.seed, stand.noise
+    draw = stand.draw(0)
+    flight = stand.fly(draw, "default", 0)
+    seconds = (
+        best(lambda: stand.variator.draw(seed, 0), 50),
+        best(lambda: np.random.default_rng([seed, 0, 1]).standard_normal(out=noise), 50),
+        best(lambda: stand.fly(draw, "default", 0), 50),
+        best(lambda: stand.row(0, draw, "default", "roll", flight), 50),
+    )
+    return " + ".join(f"{part * 1e6:.0f}" for part in seconds) + " us", f"{sum(seconds) * 1e6:.0f} us"
 
 
 def rotorpy_rows(speed: float) -> list[list[str]]:

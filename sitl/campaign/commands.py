@@ -15,6 +15,7 @@ from sitl.commands import (
     JsonOption,
     PeriodOption,
     SeedOption,
+    TailOption,
 )
 
 
@@ -40,6 +41,7 @@ def campaign(
     axis: Annotated[str | None, typer.Option(help="roll, pitch or both.", show_default="both")] = None,
     amplitude_deg: AmplitudeOption = None,
     period_s: PeriodOption = None,
+    tail_s: TailOption = None,
     fault: FaultOption = None,
     seed: SeedOption = 0,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
@@ -80,7 +82,7 @@ def campaign(
         vehicle.gain_sets([*(gains or ()), *(more_gains or ())]),
         runs=runs,
         seed=seed,
-        **_task(scenario, axis, amplitude_deg, period_s, fault),
+        **_task(scenario, axis, {"amplitude_deg": amplitude_deg, "period_s": period_s, "tail_s": tail_s}, fault),
         vary=tomllib.loads(text),
     )
     results = Results(plan, run_campaign(plan, out, workers or cores(), scheduler))
@@ -97,30 +99,25 @@ def campaign(
     print(f"results {results.path}\nreport  {report}")
 
 
-def _task(
-    scenario: str, axis: str | None, amplitude_deg: float | None, period_s: float | None, faults: list[str] | None
-) -> dict[str, Any]:
+def _task(scenario: str, axis: str | None, sizes: dict[str, float | None], faults: list[str] | None) -> dict[str, Any]:
     """Entries of the plan from the options that say what is flown."""
     from sitl.errors import SitlError
     from sitl.faults import parse_fault
-    from sitl.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, read_scenario
+    from sitl.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, TAIL_S, read_scenario
 
-    faults = [str(parse_fault(text)) for text in faults or ()]
+    named = [str(parse_fault(text)) for text in faults or ()]
+    given = {name: value for name, value in sizes.items() if value is not None}
     if scenario.endswith(".toml"):
-        if (axis, amplitude_deg, period_s) != (None, None, None):
-            raise SitlError(f"--axis, --amplitude-deg, --period-s: {scenario} says them; change them there")
+        if axis or given:
+            raise SitlError(f"--axis, --amplitude-deg, --period-s, --tail-s: {scenario} says them; change them there")
         task, own = read_scenario(Path(scenario))
-        scenario, axis, amplitude_deg, period_s = task.manoeuvre, task.axis, task.amplitude_deg, task.period_s
-        faults = [*map(str, own), *faults]
+        given = {name: getattr(task, name) for name in sizes}
+        scenario, axis, named = task.manoeuvre, task.axis, [*map(str, own), *named]
     if axis not in (*AXES, "both", None):
         raise SitlError(f"--axis: got {axis!r}, expected roll, pitch or both")
-    return {
-        "manoeuvre": scenario,
-        "axes": [axis] if axis in AXES else list(AXES),
-        "amplitude_deg": AMPLITUDE_DEG if amplitude_deg is None else amplitude_deg,
-        "period_s": PERIOD_S if period_s is None else period_s,
-        "faults": faults,
-    }
+    usual = {"amplitude_deg": AMPLITUDE_DEG, "period_s": PERIOD_S, "tail_s": TAIL_S}
+    axes = [axis] if axis in AXES else list(AXES)
+    return {"manoeuvre": scenario, "axes": axes, **usual, **given, "faults": named}
 
 
 def replay(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -178,28 +178,24 @@ class Variator:
         return Draw(run, values, plant, _state(plant, values), delay, angle, rate, factor, faults, attempt)
 
     def _plant(self, values: dict[str, float]) -> PlantParameters:
-        changes = {field: values[name] for name, field in PLANT.items() if name in values}
+        changes: dict[str, Any] = {field: values[name] for name, field in PLANT.items() if name in values}
         for field, value in changes.items():
             if value < 0 or (value == 0 and field != "drag"):
                 raise ImpossibleError(f"{field} is {value:.4g}")
-        plant = self.base._replace(**changes)  # type: ignore[arg-type]
-        effectiveness = [values.get(f"motors.effectiveness.{i + 1}", 1.0) for i in range(len(plant.rotors))]
-        thrust = plant.thrust_max * sum(effectiveness)
-        if min(effectiveness) < 0 or plant.mass * GRAVITY > MAX_HOVER * thrust:
-            raise ImpossibleError(
-                f"a weight of {plant.mass * GRAVITY:.4g} N against {thrust:.4g} N of thrust cannot hover"
-            )
-        plant = plant._replace(
-            effectiveness=np.array(effectiveness), wind=np.array([values.get(f"wind.{name}", 0.0) for name in WIND])
-        )
         if "rate_damping" in values:
             if values["rate_damping"] < 0:
                 raise ImpossibleError("the rate damping is negative")
-            plant = plant._replace(rate_damping=values["rate_damping"] * np.diag(np.array(self.airframe.inertia)))
+            changes["rate_damping"] = values["rate_damping"] * np.diag(np.array(self.airframe.inertia))
         inertia = self._inertia(values)
-        if inertia is None:
-            return plant
-        return plant._replace(inertia=inertia, inertia_inverse=np.linalg.inv(inertia).astype(np.float64))
+        if inertia is not None:
+            changes |= {"inertia": inertia, "inertia_inverse": np.linalg.inv(inertia)}
+        effectiveness = [values.get(f"motors.effectiveness.{i + 1}", 1.0) for i in range(len(self.base.rotors))]
+        wind = [values.get(f"wind.{name}", 0.0) for name in WIND]
+        plant = self.base._replace(effectiveness=np.array(effectiveness), wind=np.array(wind), **changes)
+        weight, thrust = plant.mass * GRAVITY, plant.thrust_max * sum(effectiveness)
+        if min(effectiveness) < 0 or weight > MAX_HOVER * thrust:
+            raise ImpossibleError(f"a weight of {weight:.4g} N against {thrust:.4g} N of thrust cannot hover")
+        return plant
 
     def _inertia(self, values: dict[str, float]) -> NDArray[np.float64] | None:
         """The tensor; None: the airframe's own."""

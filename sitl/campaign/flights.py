@@ -58,8 +58,7 @@ class Stand:
         """Everything random of a run: what varies, and the noise, which is the same for all its flights."""
         seed = self.plan.description.seed
         np.random.default_rng([seed, run, 1]).standard_normal(out=self.noise)
-        draw = self.variator.draw(seed, run)
-        return draw
+        return self.variator.draw(seed, run)
 
     def fly(self, draw: Draw, gains: str, index: int) -> Flight:
         """One flight of the run that was drawn last, on the axis of the scenario `index`; the next overwrites it."""

@@ -37,7 +37,7 @@ class Description(BaseModel):
         See `sitl.scenario.make_scenario`.
     axes : tuple of str
         Each run flies the manoeuvre on each.
-    amplitude_deg, period_s : float
+    amplitude_deg, period_s, tail_s : float
         Of the manoeuvre.
     faults : tuple of str
         Of every flight, as `sitl.faults.parse_fault` reads them.
@@ -54,6 +54,7 @@ class Description(BaseModel):
     axes: Annotated[tuple[str, ...], Field(min_length=1)]
     amplitude_deg: float
     period_s: float
+    tail_s: float
     faults: tuple[str, ...] = ()
     vary: Variation = Variation()
 
@@ -140,7 +141,7 @@ def plan_from_files(files: dict[str, str], where: str = "campaign") -> Plan:
         raise SitlError(f"gains: the sets are for different control periods, {sorted(periods)} s; fly each by itself")
     d, (Ts,) = description, periods
     faults = tuple(map(parse_fault, d.faults))
-    made = (make_scenario(d.manoeuvre, axis, d.amplitude_deg, d.period_s, Ts) for axis in d.axes)
+    made = (make_scenario(d.manoeuvre, axis, d.amplitude_deg, d.period_s, Ts, d.tail_s) for axis in d.axes)
     scenarios = [replace(scenario, faults=faults) for scenario in made]
     return Plan(files, description, airframe, gains, scenarios)
 

@@ -7,7 +7,6 @@ Whole numbers of samples are rounded, so that ``delay = { uniform = [0.5, 3.5] }
 
 from __future__ import annotations
 
-import math
 import tomllib
 from collections.abc import Iterator
 from typing import Annotated, Any
@@ -50,14 +49,16 @@ class Distribution(BaseModel):
     def draw(self, generator: np.random.Generator, own: float = 0.0) -> float:
         """A number; `own` is the airframe's value, for relative ones."""
         if self.normal is not None:
-            value = generator.normal(*self.normal)
+            mean, deviation = self.normal
+            value = mean + deviation * generator.standard_normal()
         elif self.uniform is not None:
-            value = generator.uniform(*self.uniform)
+            low, high = self.uniform
+            value = low + (high - low) * generator.random()
         else:
             assert self.loguniform is not None
             low, high = self.loguniform
-            value = math.exp(generator.uniform(math.log(low), math.log(high)))
-        return float(value * own if self.relative else value)
+            value = low * (high / low) ** generator.random()
+        return value * own if self.relative else value
 
 
 Number = Finite | Distribution

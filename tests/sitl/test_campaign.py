@@ -62,7 +62,7 @@ def plan_of(vehicle, gains=None, vary=VARY, **entries):
     import tomllib
 
     given = {"runs": 2 * CHUNK + 5, "seed": 3, "manoeuvre": "doublet", "axes": ["roll", "pitch"]}
-    given |= {"amplitude_deg": 22.5, "period_s": 0.42, "vary": tomllib.loads(vary)}
+    given |= {"amplitude_deg": 22.5, "period_s": 0.42, "tail_s": 1.5, "vary": tomllib.loads(vary)}
     return make_plan(vehicle, gains or {"default": vehicle.default_gains()}, **(given | entries))
 
 
