@@ -89,9 +89,15 @@ def _text(value: Any) -> str:
 
 
 def experiment(
-    airframe: AirframeArgument,
-    out: Annotated[Path, typer.Option(help="Log to write (ULog, .ulg); a folder for --runs.")],
+    airframe: Annotated[str | None, typer.Argument(help="Airframe to simulate; or give --connect.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Log to write (ULog, .ulg), of a simulated flight; a folder for --runs.")
+    ] = None,
+    connect: Annotated[
+        str | None, typer.Option(help="Link to a vehicle that hovers under our controller; see upload.")
+    ] = None,
     gains: GainsOption = None,
+    axis: Annotated[str, typer.Option(help="roll, pitch, or both, one after the other.")] = "both",
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
     amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
     bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,
@@ -103,15 +109,59 @@ def experiment(
     excitation_seed: Annotated[
         int | None, typer.Option(min=0, help="Inject the same moment in every run; by default each has its own.")
     ] = None,
+    mode: Annotated[
+        str, typer.Option(help="Flight mode to excite in: hold, position, altitude, offboard; with --connect.")
+    ] = "hold",
+    tilt_deg: Annotated[float, typer.Option(help="Stop beyond this roll or pitch, degrees; with --connect.")] = 28.0,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    timeout: Annotated[float, typer.Option(min=0.5, max=600, help="Silence of the vehicle that ends all, s.")] = 12.0,
+    signing_key: Annotated[Path | None, typer.Option(help="Key of the link; see upload.")] = None,
+    system: Annotated[int, typer.Option(min=0, max=255, help="The vehicle's system number; see upload.")] = 0,
+    as_json: JsonOption = False,
 ) -> None:
-    """Fly with a pseudo-random moment injected on roll, then on pitch, and log it."""
+    """Fly with a pseudo-random moment injected on roll, then on pitch, and log it.
+
+    Simulated in process; or with --connect on a vehicle in the air, whose own injector does it. That one is watched on
+    the way: tilt, flight mode, link and Ctrl-C end it, and its parameters are put back.
+    """
+    from sitl.errors import SitlError
+
+    if (airframe is None) == (connect is None):
+        raise SitlError("give either an airframe to simulate, or --connect to a vehicle")
+    if airframe is not None:
+        if out is None:
+            raise SitlError("--out: name the log to write, FILE.ulg")
+        plan = (seconds_per_axis, amplitude, bandwidth, excitation_seed)
+        _simulated_experiment(airframe, out, gains, plan, seed, runs)
+        return
+    if (out, gains, runs, excitation_seed) != (None,) * 4:
+        raise SitlError(
+            "--out, --gains, --runs, --excitation-seed: are of a simulated flight; a vehicle has its gains and writes "
+            "its own log"
+        )
+    from sitl.mavlink.experiment_console import Choice
+    from sitl.mavlink.experiment_console import experiment as fly_experiment
+    from sitl.mavlink.session import Options
+
+    options = Options(connect or "", system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json)
+    fly_experiment(options, Choice(axis, seconds_per_axis, amplitude, bandwidth, seed, mode, tilt_deg))
+
+
+def _simulated_experiment(
+    airframe: str,
+    out: Path,
+    gains: Path | None,
+    excitation: tuple[float, float, float, int | None],
+    seed: int,
+    runs: int | None,
+) -> None:
     import numpy as np
 
     from sitl.errors import SitlError
     from sitl.experiments import ExperimentPlan, repeat_experiment
 
     body, controller = _load(airframe, gains)
-    plan = ExperimentPlan(body, controller, seconds_per_axis, amplitude, bandwidth, excitation_seed)
+    plan = ExperimentPlan(body, controller, *excitation)
     if runs is not None:
         from rich.progress import Progress
 
@@ -121,7 +171,7 @@ def experiment(
         with Progress(console=progress_console(), transient=True) as bar:
             task = bar.add_task("flying", total=runs)
             lost = repeat_experiment(plan, out, range(seed, seed + runs), cores(), lambda: bar.advance(task))
-        print(f"{out}: {runs} logs of {2 * seconds_per_axis:.1f} s")
+        print(f"{out}: {runs} logs of {2 * excitation[0]:.1f} s")
         if lost:
             names = ", ".join(f"{one} at {when:.2f} s" for one, when in list(lost.items())[:5])
             raise SitlError(f"{len(lost)} of {runs} vehicles were lost (seed {names}); lower --amplitude", exit_code=1)
@@ -248,11 +298,21 @@ def sitl(
     ground_port: Annotated[
         int, typer.Option(min=1, max=65535, help="UDP port where the ground station listens.")
     ] = 14550,
-    vehicle_port: Annotated[int, typer.Option(min=0, max=65535, help="Local UDP port of the vehicle.")] = 18570,
-    tcp_port: Annotated[int, typer.Option(min=0, max=65535, help="Local TCP port of the vehicle; 0: any.")] = 5760,
-    bind: Annotated[str, typer.Option(help="Local address of both.")] = "127.0.0.1",
+    vehicle_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="UDP port where ground stations may speak first; 0: any.")
+    ] = 18570,
+    tcp_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="TCP port where ground stations connect; 0: any.")
+    ] = 5760,
+    bind: Annotated[
+        str, typer.Option(help="Local address of both; 0.0.0.0: all, and whoever reaches it commands the vehicle.")
+    ] = "127.0.0.1",
     signing_key: Annotated[
-        Path | None, typer.Option(help="File of 32 bytes: everything is signed, nothing unsigned is heard.")
+        Path | None, typer.Option(help="Sign with this key (32 bytes or 64 hexadecimal digits), hear nothing unsigned.")
+    ] = None,
+    parameters: Annotated[
+        Path | None,
+        typer.Option(help="Keep here what ground stations change; at the next start it outranks the gains."),
     ] = None,
     speed: SpeedOption = "1",
     seed: SeedOption = 0,
@@ -260,56 +320,25 @@ def sitl(
     log: Annotated[
         Path | None, typer.Option(help="Log each flight, arming to disarming, at full rate: FILE.ulg, FILE-2.ulg ...")
     ] = None,
+    scenario: Annotated[
+        str | None, typer.Option(help="Take off, fly doublet, step, hover or a scenario file, land and end.")
+    ] = None,
+    axis: AxisOption = None,
+    amplitude_deg: AmplitudeOption = None,
+    period_s: PeriodOption = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
-    from sitl.autopilot import Autopilot
-    from sitl.autopilot_faults import AutopilotFaults
-    from sitl.errors import SitlError
     from sitl.faults import parse_fault
-    from sitl.injection import check_fault
-    from sitl.mavlink.flight_log import FlightLog
-    from sitl.mavlink.ground import Ground
-    from sitl.mavlink.host import Host
-    from sitl.mavlink.parameter_server import ParameterServer
-    from sitl.mavlink.plant_link import PlantLink
-    from sitl.mavlink.plant_process import PlantProcess
-    from sitl.mavlink.signing import Signer, read_key
-    from sitl.mavlink.stations import Stations
-    from sitl.mavlink.telemetry import Telemetry
-    from sitl.mavlink.vehicle_commands import VehicleCommands
+    from sitl.mavlink.sitl_console import Options, run
 
     body, controller = _load(airframe, gains)
-    times = _times(speed)
-    faults = [parse_fault(text) for text in fault or ()]
-    for one in faults:
-        check_fault(one, body, controller.Ts, None)
-    outside = [one for one in faults if one.place != "autopilot"]
-    if plant and outside:
-        raise SitlError(f"fault {str(outside[0])!r}: happens in the plant that runs already: give it to that one")
-    autopilot = Autopilot(body, controller)
-    autopilot.warm_up()
-    inside = AutopilotFaults(faults, controller.Ts, autopilot) if len(faults) > len(outside) else None
-    process = PlantProcess(airframe, port, controller.Ts, seed, times, faults=outside)
-    link = PlantLink(_address(plant) if plant else process)
-    host = Host(autopilot, link, FlightLog(log, body, controller.Ts) if log else None, inside)
-    telemetry = Telemetry(host.situation)
-    commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
-    signer = Signer(read_key(signing_key)) if signing_key else None
-    parameters = ParameterServer(autopilot.controller, controller)
-    ground = Ground(
-        parameters,
-        commands,
-        telemetry,
-        lambda wanted: Stations(ground_port, vehicle_port, tcp_port, bind, signer, wanted),
-    )
-    try:
-        link.wait_for_child()
-        print(f"{body.name}: ground station on UDP {ground_port}, plant {link.place}; Ctrl-C ends", flush=True)
-        host.run(ground)
-    except KeyboardInterrupt:
-        print(f"ended: {host.lateness}")
-    finally:
-        host.close(ground)
+    task, faults = None, tuple(map(parse_fault, fault or ()))
+    if scenario is not None:
+        task = scenario_of(scenario, axis, amplitude_deg, period_s, None, fault, controller.Ts)
+        faults = task.faults
+    address = _address(plant) if plant else None
+    links = (ground_port, vehicle_port, tcp_port, bind, signing_key)
+    run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log, task, faults))
 
 
 def plant(
@@ -323,11 +352,15 @@ def plant(
     seed: SeedOption = 0,
     fault: FaultOption = None,
     child: Annotated[bool, typer.Option("--child", help="End when standard input is closed.")] = False,
+    serial: Annotated[
+        str | None, typer.Option(help="DEVICE,BAUD of a board in HITL mode, in place of the TCP port; in real time.")
+    ] = None,
 ) -> None:
-    """Serve the plant alone over PX4's simulator API (TCP, lockstep) to one autopilot after another."""
+    """Serve the plant alone over PX4's simulator API to one autopilot after another, in lockstep over TCP."""
     from sitl.airframe import load_airframe
     from sitl.errors import SitlError
     from sitl.faults import parse_faults
+    from sitl.mavlink.hitl import SerialPlant
     from sitl.mavlink.link import LOOPBACK, listen
     from sitl.mavlink.plant_server import PlantServer
     from sitl.mavlink.simulator import SimulatedVehicle
@@ -339,11 +372,17 @@ def plant(
     def tell(text: str) -> None:
         print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
 
+    if serial and times != 1.0:
+        raise SitlError(f"--speed {speed}: a board on a serial port flies in real time")
     faults = parse_faults(fault or (), ("plant", "link"), "the plant")
     vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell, faults)
-    with listen(LOOPBACK, port) as socket:
-        print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
-        try:
+    try:
+        if serial:
+            board = SerialPlant(vehicle, serial)
+            print(f"plant of {airframe} speaks on {serial}", flush=True)
+            board.serve()
+        with listen(LOOPBACK, port) as socket:
+            print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
             PlantServer(vehicle, socket, times, child).serve()
-        except KeyboardInterrupt:
-            pass
+    except KeyboardInterrupt:
+        pass

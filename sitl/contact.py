@@ -37,14 +37,11 @@ def _turn(state, a, b, c):  # type: ignore[no-untyped-def]
     """Rotate the attitude by a small angle (rad) about the body axes."""
     w, x, y, z = state[6], state[7], state[8], state[9]
     a, b, c = 0.5 * a, 0.5 * b, 0.5 * c
-    w, x, y, z = (
-        w - x * a - y * b - z * c,
-        x + w * a + y * c - z * b,
-        y + w * b + z * a - x * c,
-        z + w * c + x * b - y * a,
-    )
-    scale = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
-    state[6], state[7], state[8], state[9] = w * scale, x * scale, y * scale, z * scale
+    state[6], state[7] = w - x * a - y * b - z * c, x + w * a + y * c - z * b
+    state[8], state[9] = y + w * b + z * a - x * c, z + w * c + x * b - y * a
+    scale = 1.0 / np.sqrt(state[6] ** 2 + state[7] ** 2 + state[8] ** 2 + state[9] ** 2)
+    for i in range(6, 10):
+        state[i] *= scale
 
 
 @inlined

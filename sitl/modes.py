@@ -51,6 +51,10 @@ class Denied(Refused):
     """Neither now nor later."""
 
 
+class Failed(Refused):
+    """It was tried, in vain."""
+
+
 class Demand(NamedTuple):
     """What one period is to fly: angles (rad), altitude to hold (m; NaN: none) and collective."""
 

@@ -15,15 +15,19 @@ from codegen.budget import processor_in_the_loop
 from codegen.cortex_m4 import load_emulated
 from codegen.native import NativeController, build_native, load_native
 from codegen.vectors import random_inputs, reference_outputs
-from sitl.airframe import load_airframe
+from sitl.airframe import Airframe, load_airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import fly
 from sitl.mavlink import lockstep
 from sitl.mavlink.connection import Connection
 from sitl.mavlink.exchange import Conversation
+from sitl.mavlink.lean import SENSOR, LeanCodec
+from sitl.mavlink.link import Codec
 from sitl.mavlink.plant_process import plant_process
+from sitl.mavlink.simulator import ARMED, SimulatedVehicle
 from sitl.mavlink.upload import apply, read
 from sitl.mavlink.words import drive, single
+from sitl.plant import GRAVITY
 from sitl.scenario import doublet, excitation_flight
 from sitl.studies.faults import standard_faults
 from tests.bench_campaign import campaign_rows, rotorpy_rows
@@ -65,6 +69,30 @@ def fault_rows() -> list[list[str]]:
     seconds = best(command("faults", "adam0", "--runs", str(runs)), 2)
     title = f"mimopilot faults, {runs * faults} flights with faults and {runs} without, start included"
     return [[title, f"{seconds:.1f} s", "1000 runs under 60 s"]]
+
+
+def plant_rows(airframe: Airframe) -> list[list[str]]:
+    """What one period costs the plant process, its body and its messages apart, and what lean messages save."""
+    vehicle = SimulatedVehicle(airframe, TS, 0, 10.0, print)
+    hover = [vehicle.simulator.plant.mass * GRAVITY / (4 * airframe.motors.thrust_max)] * 16
+    lean, generic, periods = LeanCodec(1, 1), Codec(), 2000
+
+    def repeat(work: Callable[[], object]) -> Callable[[], object]:
+        return lambda: [work() for _ in range(periods)]
+
+    body = best(repeat(lambda: vehicle.fly(hover, ARMED))) / periods
+    vehicle.restart()
+    vehicle.periods = 1  # neither the first nor every 25th
+    messages = best(repeat(vehicle.messages)) / periods
+    fields = (1, *[0.5] * 13, 63, 0)
+    data = lean.pack(SENSOR, *fields)
+    fast = best(repeat(lambda: lean.parse(lean.pack(SENSOR, *fields)))) / periods
+    slow = best(repeat(lambda: [list(generic.parse(data)), generic.pack(SENSOR(*fields))])) / periods
+    return [
+        ["one period of the plant process: body, ground, estimate", f"{body * 1e6:.0f} us", ""],
+        ["its messages: instruments read, HIL_SENSOR and HIL_STATE_QUATERNION packed", f"{messages * 1e6:.0f} us", ""],
+        ["HIL_SENSOR packed and parsed, lean", f"{fast * 1e6:.1f} us", f"pymavlink {slow * 1e6:.0f} us"],
+    ]
 
 
 def main() -> None:
@@ -112,9 +140,10 @@ def main() -> None:
             begin = time.perf_counter()
             lockstep.fly(autopilot, task, port)
             over_wire = len(task.setpoint) * TS / (time.perf_counter() - begin)
-        rows.append(
-            ["the same as two processes over MAVLink", f"{over_wire:.0f} x real time", f"1/{speed / over_wire:.0f}"]
-        )
+        beside = f"at least 20; 1/{speed / over_wire:.0f}"
+        rows.append(["the same as two processes over MAVLink", f"{over_wire:.0f} x real time", beside])
+
+        rows += plant_rows(airframe)
 
         inputs = random_inputs(2000, np.random.default_rng(0))
         native = best(lambda: NativeController(library, gains).run(inputs)) / len(inputs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,14 +68,41 @@ def prbs(
     TuningError
         When the hold times are not 1 <= hold_min <= hold_max or N is negative.
     """
-    if samples < 0 or not 1 <= hold_min <= hold_max:
-        raise TuningError(f"prbs: got {samples} samples, hold {hold_min}..{hold_max}; expected N >= 0, 1 <= min <= max")
+    if samples < 0:
+        raise TuningError(f"prbs: got {samples} samples, expected 0 or more")
     signal = np.empty(samples)
-    sign = 1.0 if generator.integers(2) else -1.0
     start = 0
-    while start < samples:
-        hold = int(generator.integers(hold_min, hold_max, endpoint=True))
+    for sign, hold in pulses(hold_min, hold_max, generator):
+        if start >= samples:
+            break
         signal[start : start + hold] = sign * amplitude
-        sign = -sign
         start += hold
     return signal
+
+
+def pulses(hold_min: int, hold_max: int, generator: np.random.Generator) -> Iterator[tuple[float, int]]:
+    """The pulses of `prbs` one by one, without end.
+
+    Parameters
+    ----------
+    hold_min, hold_max, generator
+        As in `prbs`.
+
+    Yields
+    ------
+    sign : float
+        1 or -1.
+    hold : int, samples
+        How long it is held.
+
+    Raises
+    ------
+    TuningError
+        When the hold times are not 1 <= hold_min <= hold_max.
+    """
+    if not 1 <= hold_min <= hold_max:
+        raise TuningError(f"prbs: got hold {hold_min}..{hold_max}; expected 1 <= min <= max")
+    sign = 1.0 if generator.integers(2) else -1.0
+    while True:
+        yield sign, int(generator.integers(hold_min, hold_max, endpoint=True))
+        sign = -sign

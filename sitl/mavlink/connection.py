@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import select
 import socket
+import struct
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -13,11 +14,29 @@ from pymavlink.dialects.v20 import common as mavlink
 from sitl.errors import SitlError
 from sitl.mavlink.link import Codec, udp_socket
 from sitl.mavlink.signing import Signer
-from sitl.mavlink.words import Ack, Beat, Heartbeat, Incoming, Outgoing, Read, Refusal, Value, Write
+from sitl.mavlink.words import (
+    INT32,
+    Ack,
+    Attitude,
+    Beat,
+    Excited,
+    Heartbeat,
+    Incoming,
+    Landed,
+    Outgoing,
+    Read,
+    Refusal,
+    Request,
+    Text,
+    Value,
+    Write,
+)
 
 #: How ground stations call themselves.
 GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
 BAUD = 57600
+#: Name under which the vehicle tells what its injector does.
+EXCITATION = "MIMO_EXC"
 FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
 CONNECT_S = 5.0
 
@@ -30,13 +49,23 @@ def understand(message: Any) -> Incoming | None:
         if message.type == mavlink.MAV_TYPE_GCS or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
             return None
         armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        return Heartbeat(*speaker, message.autopilot, armed)
+        return Heartbeat(*speaker, message.autopilot, armed, message.custom_mode)
     if kind == "PARAM_VALUE":
-        return Value(*speaker, message.param_id, message.param_value + 0.0, message.param_type)
+        value = message.param_value
+        whole = struct.unpack("<i", struct.pack("<f", value))[0] if message.param_type == INT32 else value
+        return Value(*speaker, message.param_id, whole + 0.0, message.param_type)
     if kind == "PARAM_ERROR":
         return Refusal(*speaker, message.param_id, message.error)
     if kind == "COMMAND_ACK":
         return Ack(*speaker, message.command, message.result)
+    if kind == "ATTITUDE":
+        return Attitude(*speaker, message.roll, message.pitch)
+    if kind == "EXTENDED_SYS_STATE":
+        return Landed(*speaker, message.landed_state)
+    if kind == "DEBUG_VECT" and message.name == EXCITATION and message.z in (-1, 0, 1, 2):
+        return Excited(*speaker, int(message.z), message.time_usec)
+    if kind == "STATUSTEXT":
+        return Text(*speaker, message.text)
     return None
 
 
@@ -51,10 +80,14 @@ def express(order: Outgoing) -> Any:
         return mavlink.MAVLink_param_request_read_message(order.system, order.component, name, -1)
     if isinstance(order, Write):
         name = order.name.encode()
-        kind = mavlink.MAV_PARAM_TYPE_REAL32
-        return mavlink.MAVLink_param_set_message(order.system, order.component, name, order.value, kind)
-    command = mavlink.MAV_CMD_PREFLIGHT_STORAGE
-    return mavlink.MAVLink_command_long_message(order.system, order.component, command, 0, 1, 0, 0, 0, 0, 0, 0)
+        value = order.value
+        coded = struct.unpack("<f", struct.pack("<i", round(value)))[0] if order.kind == INT32 else value
+        return mavlink.MAVLink_param_set_message(order.system, order.component, name, coded, order.kind)
+    if isinstance(order, Request):
+        command, parameters = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (order.message, order.interval)
+    else:
+        command, parameters = mavlink.MAV_CMD_PREFLIGHT_STORAGE, (1, 0)
+    return mavlink.MAVLink_command_long_message(order.system, order.component, command, 0, *parameters, 0, 0, 0, 0, 0)
 
 
 class Connection:

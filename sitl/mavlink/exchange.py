@@ -5,7 +5,7 @@ No socket and no clock: see `sitl.mavlink.words` for how a conversation is drive
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from sitl.mavlink.words import (
     AUTOPILOT,
     FAILED,
     IN_PROGRESS,
+    INT32,
     REAL32,
     REASONS,
     STORAGE_COMMAND,
@@ -24,6 +25,7 @@ from sitl.mavlink.words import (
     Outgoing,
     Read,
     Refusal,
+    Sight,
     Steps,
     Store,
     Turn,
@@ -76,6 +78,8 @@ class Conversation:
         The vehicle's system number; 0: the first that is heard.
     force_armed : bool
         Write even while it is armed.
+    integers : collection of str
+        Names that may be whole numbers on the vehicle; all others must be floats there.
 
     Attributes
     ----------
@@ -91,16 +95,28 @@ class Conversation:
         Names for which a write was ever sent.
     progress : callable
         Told (phase, done, of) after each answer.
+    witness : callable
+        Told what else the vehicle says, whatever the talk is about.
     """
 
-    def __init__(self, now: float, tries: int = TRIES, system: int = 0, force_armed: bool = False) -> None:
+    def __init__(
+        self,
+        now: float,
+        tries: int = TRIES,
+        system: int = 0,
+        force_armed: bool = False,
+        integers: Collection[str] = (),
+    ) -> None:
         self.now, self.tries, self.system, self.force_armed = now, tries, system, force_armed
+        self.integers = integers
         self.vehicle: Heartbeat | None = None
         self.others: set[int] = set()
         self.interrupted = self.closed = False
         self.possible: dict[str, set[float]] = {}
         self.written: set[str] = set()
         self.progress: Callable[[str, int, int], None] = lambda phase, done, of: None
+        self.witness: Callable[[Sight], None] = lambda sight: None
+        self._kinds: dict[str, int] = {}
         self._heartbeat_at = self._heard_at = now
         self._beat_due = now
         # Longest exchange, and longest of those answered at the first try: only these are sure to be a round trip.
@@ -112,6 +128,11 @@ class Conversation:
         return self.tries * TRY_S
 
     @property
+    def silence(self) -> float:
+        """Age of the last HEARTBEAT, s."""
+        return self.now - self._heartbeat_at
+
+    @property
     def gone(self) -> bool:
         """True when the link is closed, or the vehicle silent for too long."""
         return self.closed or self.now - self._heard_at >= self.patience
@@ -121,7 +142,7 @@ class Conversation:
         self.now = self._heard_at = now
         self._heartbeat_at = now - FRESH_S
 
-    def _turn(self, send: Sequence[Outgoing], wake: float) -> Steps[list[Value | Refusal | Ack]]:
+    def turn(self, send: Sequence[Outgoing], wake: float) -> Steps[list[Value | Refusal | Ack]]:
         """Send, wait, and return what the vehicle itself said; every other speaker is ignored."""
         if self.now >= self._beat_due:
             send = [Beat(), *send]
@@ -141,8 +162,10 @@ class Conversation:
             self._heard_at = self.now
             if isinstance(message, Heartbeat):
                 self.vehicle, self._heartbeat_at = message, self.now
-            else:
+            elif isinstance(message, Value | Refusal | Ack):
                 heard.append(message)
+            else:
+                self.witness(message)
         return heard
 
     def meet(self) -> Steps[Heartbeat]:
@@ -162,7 +185,7 @@ class Conversation:
             if self.now >= deadline:
                 whose = f"of system {self.system}" if self.system else "of an autopilot"
                 raise SitlError(f"no HEARTBEAT {whose} in {self.patience:g} s", exit_code=1)
-            yield from self._turn([], deadline)
+            yield from self.turn([], deadline)
         return self.vehicle
 
     def ask(self, names: Sequence[str], phase: str, keep_going: bool = False) -> Steps[dict[str, Answer]]:
@@ -200,7 +223,7 @@ class Conversation:
                     send.append(self._order(name, orders[name]))
                     request.tries, request.due = request.tries + 1, self.now + TRY_S
             wake = self.now + TRY_S if hold else min((r.due for r in under_way.values()), default=self.now)
-            for message in (yield from self._turn(send, wake)):
+            for message in (yield from self.turn(send, wake)):
                 if isinstance(message, Ack) or message.name not in under_way:
                     continue
                 answer = self._judge(message, under_way[message.name], orders[message.name])
@@ -241,14 +264,15 @@ class Conversation:
             return Read(*address, name)
         self.written.add(name)
         self.possible.setdefault(name, set()).add(value)
-        return Write(*address, name, value)
+        return Write(*address, name, value, self._kinds.get(name, REAL32))
 
     def _judge(self, message: Value | Refusal, request: _Request, wanted: float | None) -> Answer | None:
         """What a message says about a request; None: nothing final."""
         if isinstance(message, Refusal):
             return Answer(None, f"refused: {REASONS.get(message.reason, f'PARAM_ERROR {message.reason}')}")
-        if message.kind != REAL32:
+        if message.kind != REAL32 and not (message.kind == INT32 and message.name in self.integers):
             return Answer(None, f"is no float on the vehicle (param_type {message.kind})")
+        self._kinds[message.name] = message.kind
         if wanted is not None and message.value != wanted:
             # The echo of a refused or altered write, or an old answer that comes late, or another station's.
             request.contradicted.add(request.tries)
@@ -270,7 +294,7 @@ class Conversation:
         quiet = max(QUIET_S, 2 * (self._round_trip or self._longest))
         until, deadline = self.now + quiet, self.now + self.patience
         while self.now < min(until, deadline) and not self.closed:
-            heard = yield from self._turn([], until)
+            heard = yield from self.turn([], until)
             if any(not isinstance(m, Ack) and m.name in self.possible for m in heard):
                 until = self.now + quiet
 
@@ -291,7 +315,7 @@ class Conversation:
                 send = [Store(self.vehicle.system, self.vehicle.component)]
                 due = self.now + TRY_S
             wake = min(due, deadline) if result == IN_PROGRESS else deadline
-            for message in (yield from self._turn(send, wake)):
+            for message in (yield from self.turn(send, wake)):
                 if isinstance(message, Ack) and message.command == STORAGE_COMMAND:
                     result = message.result
             if result == ACCEPTED:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import select
 import time
 from collections.abc import Callable, Sequence
@@ -21,11 +22,14 @@ from sitl.mavlink.ground import Ground
 from sitl.mavlink.lateness import Lateness
 from sitl.mavlink.lean import GPS, SENSOR, STATE
 from sitl.mavlink.plant_link import PlantLink, PlantState
-from sitl.mavlink.telemetry import Situation
+from sitl.mavlink.situation import Situation
 from sitl.modes import Severity, Vehicle
+from sitl.scripted_pilot import ScriptedPilot
 from sitl.sensors import SIZE, euler_angles
 
 SILENT_S = 0.9  # a plant that says nothing for so long is said to be silent
+GROUND_S = 0.002  # between looks at what ground stations say; they wake nobody
+NEWS_S = 0.2  # between looks at what our own plant tells
 TURN_S = 0.01  # longest wait for anything
 CLOCK_BACK_US = 1_000_000  # a plant whose time goes back by more has started anew
 EXAMINED = 250  # periods between examinations of what forbids arming
@@ -46,8 +50,6 @@ class Host:
         Where the body is.
     log : FlightLog or None
         Where flights are recorded.
-    faults : AutopilotFaults, optional
-        Its own, in seconds from the first frame of a plant.
 
     Attributes
     ----------
@@ -56,28 +58,29 @@ class Host:
         What telemetry shows.
     excitation : callable
         May be replaced.
+    pilot : ScriptedPilot or None
+        Flies in place of a ground station.
+    faults : AutopilotFaults or None
+        Of this autopilot, in seconds from the first frame of a plant.
     lateness : Lateness
         How long frames of the plant wait.
     """
 
-    def __init__(
-        self,
-        autopilot: Autopilot,
-        plant: PlantLink,
-        log: FlightLog | None = None,
-        faults: AutopilotFaults | None = None,
-    ) -> None:
-        self.autopilot, self.plant, self.log, self.faults = autopilot, plant, log, faults
+    def __init__(self, autopilot: Autopilot, plant: PlantLink, log: FlightLog | None = None) -> None:
+        self.autopilot, self.plant, self.log = autopilot, plant, log
         self.vehicle = Vehicle(autopilot.hover)
         self.vehicle.obstacles["plant"] = "no plant is connected"
         self.situation = Situation(self.vehicle)
         self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
+        self.pilot: ScriptedPilot | None = None
+        self.faults: AutopilotFaults | None = None
         self.lateness = Lateness()
         self.measurement = np.zeros(SIZE)
         euler_angles(*self.measurement[:4])  # compiled now, not in flight
         self.stamp = self._zero = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
-        self.heard = 0.0
+        self.fixed = autopilot.arguments()[:5]
+        self.heard = self._news = self._turn = 0.0
         self._connected = False
         self._periods = self._first = 0
         self._told: dict[str, float] = {}
@@ -88,19 +91,33 @@ class Host:
         self._lose("the vehicle starts again")
 
     def run(self, ground: Ground) -> None:
-        """Fly and serve ground stations, for ever; the plant comes first, and is found again when it goes away."""
-        while True:
+        """Fly and serve ground stations, for ever or until `pilot` is done.
+
+        The plant comes first, and is found again when it goes away.
+        """
+        gc.collect()
+        gc.freeze()  # or looking through all that was imported would take 70 ms of a flight, now and then
+        while self.pilot is None or not self.pilot.done:
             now = time.monotonic()
             self._connect(now)
-            if self._wait(ground):
+            if self._wait():
                 self._fly()
             elif self._connected and now > self.heard + SILENT_S and "plant" not in self.vehicle.obstacles:
                 self.vehicle.obstacles["plant"] = f"the plant has been silent for {SILENT_S:g} s"
                 self.vehicle.say(Severity.CRITICAL, self.vehicle.obstacles["plant"])
-            ground.receive(now)
-            self.situation.load = self.lateness.load
+            if now >= self._turn:
+                self._turn = now + GROUND_S
+                ground.receive(now)
+            self._pass_on(now)
             self._tell(ground, now)
             ground.send(now)
+
+    def _pass_on(self, now: float) -> None:
+        """What our own plant tells, such as a crash."""
+        if self.plant.child is not None and now >= self._news:
+            self._news = now + NEWS_S
+            for text in self.plant.child.news():
+                self.vehicle.say(Severity.WARNING, text)
 
     def _connect(self, now: float) -> None:
         if self._connected:
@@ -123,19 +140,20 @@ class Host:
 
     def _lose(self, why: str) -> None:
         self._connected = False
+        self.situation.home = ()  # what was known of it holds no more
         self.vehicle.plant_lost(why)
         self._note_arming()
 
-    def _wait(self, ground: Ground) -> bool:
-        """Wait for anything; True when the plant has something to say."""
+    def _wait(self) -> bool:
+        """Wait for the plant; True when it has something to say. Ground stations wake nobody: they have their turn."""
         plants = [self.plant.socket] if self.plant.socket is not None else []
         if plants and select.select(plants, [], [], 0)[0]:
             return True
         begin = time.monotonic()
-        ready = select.select([*plants, *ground.stations.sockets], [], [], TURN_S)[0]
+        ready = select.select(plants, [], [], TURN_S)[0]
         end = time.monotonic()
         self.lateness.nothing_waits(end - begin, end)
-        return self.plant.socket in ready
+        return bool(ready)
 
     def _fly(self) -> None:
         """Answer what the plant says."""
@@ -164,6 +182,7 @@ class Host:
             self._compute(state)
         self.plant.answer(self.stamp, self.situation.row["commands"], self.vehicle.armed)
         self.lateness.answered()
+        self.situation.load = self.lateness.load
 
     def _break(self) -> None:
         """Put the faults of now into the controller, and stop what steers."""
@@ -182,13 +201,15 @@ class Host:
         roll, pitch, yaw = euler_angles(m[0], m[1], m[2], m[3])
         velocity = (-state.vz / 100, state.vx / 100, state.vy / 100)
         estimate = Estimate(roll, pitch, yaw, (state.p, state.q, state.r), state.alt / 1000, *velocity)
+        if self.pilot is not None:
+            self.pilot.steer(self.vehicle)
         demand = self.vehicle.step(now, estimate)
         self._note_arming()
         row = self.rows[0] if self.log is None else self.log.row(self.vehicle)
         row["setpoint"] = demand[:3]
         row["excitation"] = self.excitation(now)
         autopilot.controls["landed"] = self.vehicle.lift.landed
-        tick(*autopilot.arguments()[:5], demand.collective, demand.altitude, m, row)
+        tick(*self.fixed, demand.collective, demand.altitude, m, row)
         situation = self.situation
         situation.stamp, situation.row, situation.state = self.stamp, row, state
         situation.home = situation.home or (state.lat, state.lon, state.alt)
@@ -242,8 +263,6 @@ class Host:
         if len(self._told) > 100:
             self._told.clear()
 
-    def close(self, ground: Ground) -> Path | None:
-        """Leave the plant and the ground stations; the log that was written, if any."""
-        self.plant.close()
-        ground.close()
+    def leave(self) -> Path | None:
+        """Nobody flies any more: the log that was written, if any."""
         return None if self.log is None else self.log.save()

@@ -7,7 +7,10 @@ is not sent hundreds of times a second.
 
 from __future__ import annotations
 
+import os
+import socket
 import struct
+import time
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -23,6 +26,7 @@ MARK = b"\xfd"
 HEADER = struct.Struct("<BBBBBBHB")  # length, 2 x flags, sequence, system, component, 3 bytes of message id
 OVERHEAD = 12  # mark, header, checksum
 SIGNED, SIGNATURE = 1, 13
+SPIN_S = 200e-6
 
 Message = tuple[Any, tuple[Any, ...]]
 
@@ -108,3 +112,19 @@ class LeanCodec:
             return None
         size = kind.unpacker.size
         return kind, kind.unpacker.unpack(frame[10:stop][:size].ljust(size, b"\0"))
+
+
+def receive(connection: socket.socket, spin: float = 0.0) -> bytes | None:
+    """What has come to a non-blocking socket, or comes within `spin` s; None when nothing, empty when the peer left.
+
+    A process that sleeps takes longer to wake than a peer at full speed takes to answer: both look for `SPIN_S`
+    before they sleep. Whoever else wants the processor gets it.
+    """
+    until = time.monotonic() + spin
+    while True:
+        try:
+            return connection.recv(65536)
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                return None
+            os.sched_yield()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import socket
 from typing import Any
 
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.errors import SitlError
-from sitl.mavlink.lean import STATE, LeanCodec
+from sitl.mavlink.lean import SPIN_S, STATE, LeanCodec, receive
 from sitl.mavlink.link import COMPONENT, LOOPBACK, SYSTEM
 from sitl.mavlink.plant_link import PlantState, actuator_controls
 from sitl.scenario import Scenario
@@ -56,8 +57,12 @@ def _exchange(autopilot: Autopilot, plant: socket.socket, record: NDArray[Any]) 
     """Answer frames until the record is full; how many periods were flown. A repeated frame is answered, not flown."""
     codec, measurement = LeanCodec(SYSTEM, COMPONENT), np.zeros(SIZE)
     count, stamp, answer = 0, -1, b""
+    plant.setblocking(False)
     while count < len(record):
-        data = plant.recv(65536)
+        data = receive(plant, SPIN_S)
+        if data is None:
+            select.select([plant], [], [])
+            continue
         if not data:
             break
         for kind, fields in codec.parse(data):

@@ -83,18 +83,6 @@ class PlantLink:
         host, port = self.address or (LOOPBACK, self.child.port() if self.child else None)
         return f"TCP {host}:{port}"
 
-    def wait_for_child(self) -> None:
-        """Start our own plant, if it is ours, and wait until it listens.
-
-        Raises
-        ------
-        SitlError
-            When it does not, with its own message.
-        """
-        if self.child is not None:
-            self.child.start()
-            self.child.wait()
-
     def connect(self, now: float) -> bool:
         """Go on connecting; True once there is a connection. `now` is a monotonic time in s.
 

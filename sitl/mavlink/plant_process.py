@@ -51,12 +51,17 @@ class PlantProcess:
         self.command += ["--altitude", repr(altitude), "--child"]
         self.command += [word for fault in faults for word in ("--fault", str(fault))]
         self.child: subprocess.Popen[bytes] | None = None
-        self._output = b""
+        self._forget()
+
+    def _forget(self) -> None:
+        self._rest = b""
+        self._said: list[str] = []
+        self._port: int | None = None
 
     def start(self) -> None:
         """Start it; whatever ran before is ended."""
         self.end()
-        self._output = b""
+        self._forget()
         self.child = subprocess.Popen(
             self.command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
         )
@@ -68,24 +73,39 @@ class PlantProcess:
         """Whether it runs."""
         return self.child is not None and self.child.poll() is None
 
+    def _listen(self) -> None:
+        """Take what it has said since."""
+        assert self.child is not None and self.child.stdout is not None
+        *lines, self._rest = (self._rest + (self.child.stdout.read() or b"")).split(b"\n")
+        for line in lines:
+            text = line.decode(errors="replace").removeprefix("mimopilot: ")
+            if "listens on" in text:
+                self._port = int(text.rsplit(":", 1)[1])
+            else:
+                self._said.append(text)
+
     def port(self) -> int | None:
         """The TCP port on which it listens; None while it starts.
 
         Raises
         ------
         SitlError
-            When it has ended, with its own last words.
+            When it has ended without listening, with its own last words.
         """
-        assert self.child is not None and self.child.stdout is not None
+        assert self.child is not None
         alive = self.alive
-        self._output += self.child.stdout.read() or b""
-        if b"listens on" in self._output and b"\n" in self._output:
-            first = next(line for line in self._output.splitlines() if b"listens on" in line)
-            return int(first.rsplit(b":", 1)[1])
-        if not alive:
-            words = self._output.decode(errors="replace").strip().rsplit("\n", 1)[-1].removeprefix("mimopilot: ")
-            raise SitlError(words or "the plant process ended without a word", self.child.returncode or 1)
-        return None
+        self._listen()
+        if self._port is None and not alive:
+            words = self._said[-1] if self._said else "the plant process ended without a word"
+            raise SitlError(words, self.child.returncode or 1)
+        return self._port
+
+    def news(self) -> list[str]:
+        """What it has said since the last call, line by line."""
+        if self.child is not None:
+            self._listen()
+        said, self._said = self._said, []
+        return said
 
     def wait(self) -> int:
         """The port, as soon as it listens; raises as `port`."""

@@ -15,18 +15,17 @@ import sys
 import time
 from typing import Any
 
-from sitl.mavlink.lean import ACTUATORS, Message
-from sitl.mavlink.simulator import SimulatedVehicle
+from sitl.mavlink.lean import ACTUATORS, SPIN_S, Message, receive
+from sitl.mavlink.simulator import FORGET_S, SimulatedVehicle
 
 FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is answered
 LOOK_S = 0.2  # between looks at everything but the autopilot
 FROZEN_S = 1.0  # without an answer
 MUTE_S = 10.0  # without the first one
-SPIN_S = 300e-6  # at full speed an answer comes sooner than a sleeping process wakes
-FORGET_S = 0.25  # a simulation that is late by more does not race to catch up
+LOCKSTEP = 1  # flag of HIL_ACTUATOR_CONTROLS
 
 
-class ParentGone(Exception):
+class ParentGoneError(Exception):
     """The process that started this one has ended."""
 
 
@@ -56,7 +55,7 @@ class PlantServer:
         try:
             while True:
                 self._serve_one(self._accept())
-        except ParentGone:
+        except ParentGoneError:
             return
 
     def _accept(self) -> socket.socket:
@@ -72,19 +71,20 @@ class PlantServer:
     @staticmethod
     def _end_with_parent(ready: list[Any]) -> None:
         if sys.stdin in ready and not os.read(sys.stdin.fileno(), 4096):
-            raise ParentGone
+            raise ParentGoneError
 
     def _serve_one(self, connection: socket.socket) -> None:
         vehicle = self.vehicle
-        vehicle.restart()
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             with connection:
                 Lockstep(self, connection).fly()
         except OSError:
+            flown = vehicle.seconds
+            vehicle.restart()
             vehicle.tell(
-                f"the autopilot went away at {vehicle.flown * vehicle.Ts:.2f} s of flight; "
-                "the vehicle is back at its start and waits for the next"
+                f"the autopilot went away at {flown:.2f} s of flight; the vehicle is back at its start and waits for "
+                "the next"
             )
 
     def look_around(self, now: float) -> None:
@@ -92,7 +92,7 @@ class PlantServer:
 
         Raises
         ------
-        ParentGone
+        ParentGoneError
         """
         if now < self.next_look:
             return
@@ -113,7 +113,7 @@ class Lockstep:
     def __init__(self, server: PlantServer, connection: socket.socket) -> None:
         self.server, self.vehicle, self.connection = server, server.vehicle, connection
         self.spin = SPIN_S if server.speed is None else 0.0
-        self.garbage = False
+        self.told: set[str] = set()
         connection.setblocking(False)
 
     def fly(self) -> None:
@@ -146,7 +146,7 @@ class Lockstep:
         """Offer the start until it is answered."""
         vehicle = self.vehicle
         begin = time.monotonic()
-        booting, told = False, False
+        booting = False
         frame = vehicle.messages()
         self.connection.sendall(frame)
         pace = vehicle.Ts / (self.server.speed or 1.0)
@@ -155,12 +155,13 @@ class Lockstep:
             for kind, fields in self._receive(due):
                 if kind is not ACTUATORS:
                     booting = True
+                elif not fields[1] & LOCKSTEP:
+                    self._tell_once("motor commands came without the lockstep flag: the autopilot must keep lockstep")
                 elif fields[0] >= vehicle.stamp:
                     return fields
             now = time.monotonic()
-            if now > begin + MUTE_S and not told:
-                told = True
-                vehicle.tell(f"no HIL_ACTUATOR_CONTROLS in {MUTE_S:g} s: is that an autopilot in simulation?")
+            if now > begin + MUTE_S:
+                self._tell_once(f"no HIL_ACTUATOR_CONTROLS in {MUTE_S:g} s: is that an autopilot in simulation?")
             if now >= due:
                 if booting:
                     vehicle.stand()
@@ -184,29 +185,29 @@ class Lockstep:
             if not frozen and time.monotonic() >= since + FROZEN_S:
                 frozen = True
                 self.vehicle.tell(
-                    f"the autopilot has not answered for {FROZEN_S:g} s, at {self.vehicle.flown * self.vehicle.Ts:.2f} s "
-                    "of flight; time stands still until it does"
+                    f"the autopilot has not answered for {FROZEN_S:g} s, at {self.vehicle.seconds:.2f} s of flight; "
+                    "time stands still until it does"
                 )
 
     def _receive(self, until: float) -> list[Message]:
         """What came, as soon as something comes; nothing when the time is over."""
-        connection, spin_until = self.connection, time.monotonic() + self.spin
         while True:
-            try:
-                data = connection.recv(65536)
-            except BlockingIOError:
-                now = time.monotonic()
-                self.server.look_around(now)
-                if now < spin_until:
-                    continue
+            now = time.monotonic()
+            self.server.look_around(now)
+            data = receive(self.connection, self.spin)
+            if data is None:
                 if now >= until:
                     return []
-                select.select([connection], [], [], min(until - now, LOOK_S))
+                select.select([self.connection], [], [], min(until - now, LOOK_S))
                 continue
             if not data:
                 raise ConnectionResetError
             messages = self.vehicle.codec.parse(data)
-            if self.vehicle.codec.skipped and not self.garbage:
-                self.garbage = True
-                self.vehicle.tell("bytes that are no MAVLink came from the autopilot and are passed over")
+            if self.vehicle.codec.skipped:
+                self._tell_once("bytes that are no MAVLink came from the autopilot and are passed over")
             return messages
+
+    def _tell_once(self, text: str) -> None:
+        if text not in self.told:
+            self.told.add(text)
+            self.vehicle.tell(text)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,13 +41,15 @@ class Session:
     ----------
     options : Options
         How to reach it.
+    integers : collection of str
+        Names of parameters that may be whole numbers.
     """
 
-    def __init__(self, options: Options) -> None:
+    def __init__(self, options: Options, integers: Collection[str] = ()) -> None:
         self.options = options
         self.link = Connection(options.connect, read_key(options.signing_key) if options.signing_key else None)
         tries = max(1, round(options.timeout / TRY_S))
-        self.talk = Conversation(self.link.now(), tries, options.system, options.force_armed)
+        self.talk = Conversation(self.link.now(), tries, options.system, options.force_armed, integers)
 
     def run(self, steps: Steps[T]) -> T:
         """Run a part of the conversation; Ctrl-C and a closed terminal end it in order, not at once."""
@@ -92,9 +94,9 @@ class Session:
 
 
 @contextmanager
-def session(options: Options) -> Iterator[Session]:
+def session(options: Options, integers: Collection[str] = ()) -> Iterator[Session]:
     """Open a link and close it again."""
-    opened = Session(options)
+    opened = Session(options, integers)
     try:
         yield opened
     finally:

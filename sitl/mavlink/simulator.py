@@ -25,7 +25,8 @@ NOISE_BLOCK = 250
 EPOCH_US = 1_000_000  # the simulated clock starts here: autopilots take zero for no time at all
 INERTIAL, FIELD_AND_AIR = 7 | 56, 448 | 6656  # bits of fields_updated
 FIELD_AND_AIR_PERIOD = 0.02  # s
-HARD_LANDING = 2.0  # m/s
+FORGET_S = 0.25  # a simulation that is late by more does not race to catch up
+HARD_LANDING = 3.0  # m/s, a fall from half a metre
 TIPPED = math.cos(math.radians(60.0))
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
@@ -93,6 +94,11 @@ class SimulatedVehicle:
         """The simulated clock, us."""
         return EPOCH_US + round((self.periods * self.Ts - self.injection.clock_back(self.flown)) * 1e6)
 
+    @property
+    def seconds(self) -> float:
+        """How long it has flown, s of simulated time."""
+        return self.flown * self.Ts
+
     def _measure(self) -> None:
         if self.faults:
             self._break()
@@ -139,8 +145,8 @@ class SimulatedVehicle:
         self.lost = True
         tilt = math.degrees(math.acos(min(1.0, max(-1.0, level))))
         self.tell(
-            f"crashed at {self.flown * self.Ts:.2f} s: came down at {speed:.1f} m/s (at most {HARD_LANDING:g}), tilted by "
-            f"{tilt:.0f} deg (at most 60); it lies there with stopped motors until an autopilot connects anew"
+            f"crashed at {self.seconds:.2f} s of flight: came down at {speed:.1f} m/s (at most {HARD_LANDING:g}), "
+            f"tilted by {tilt:.0f} deg (at most 60); it lies there with stopped motors until an autopilot connects anew"
         )
 
     def _gyro(self, rates: list[float]) -> list[float]:

@@ -8,15 +8,19 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Container, Iterator, Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
-from sitl.mavlink.link import COMPONENT, EVERY, LOOPBACK, SYSTEM, Codec, listen, udp_socket
+from sitl.mavlink.link import COMPONENT, KINDS, LOOPBACK, SYSTEM, Codec, listen, udp_socket
 from sitl.mavlink.signing import Signer
 
 TCP_PORT = 5760
-#: Time that one call of `Stations.receive` may take up, answers included, s; an eighth of a control period.
-BUDGET_S = 0.0005
+#: Time that one call of `Stations.receive` may take, and one of `Stations.deliver`, s: an eighth of a control period;
+#: and the time from one reading to the next, whatever the simulation's speed.
+BUDGET_S, PACE_S = 0.0005, 0.002
+#: Answers that a station is sent in one call, and how many may wait: what it asks then is not heard.
+SHARE, MAX_ANSWERS = 8, 100
 #: Most stations of one kind, and the silence (s) after which one of them gives way to another.
 MAX_STATIONS, SILENCE_S = 8, 10.0
 #: A TCP station that lets more wait than this is cut off, bytes.
@@ -42,6 +46,12 @@ class Station:
     def __init__(self, codec: Codec) -> None:
         self.codec = codec
         self.heard = time.monotonic()
+        self.answers: deque[Any] = deque(maxlen=2 * MAX_ANSWERS)
+
+    @property
+    def busy(self) -> bool:
+        """True while so many answers wait for it that no further question of it is taken."""
+        return len(self.answers) >= MAX_ANSWERS
 
     def send(self, message: Any) -> None:
         """One message; a station that is not there is no error."""
@@ -126,8 +136,6 @@ class Stations:
         Local address of both.
     signer : Signer, optional
         Signs all that is sent; nothing unsigned is then heard.
-    wanted : container of int
-        Numbers of the messages that mean anything to the vehicle.
 
     Raises
     ------
@@ -142,9 +150,9 @@ class Stations:
         tcp_port: int = 0,
         bind: str = LOOPBACK,
         signer: Signer | None = None,
-        wanted: Container[int] = EVERY,
     ) -> None:
-        self.signer, self.wanted = signer, wanted
+        self.signer = signer
+        self.wanted: set[int] = set()
         self.udp = udp_socket(bind, udp_port)
         try:
             self.tcp = listen(bind, tcp_port, MAX_STATIONS, "--tcp-port")
@@ -157,14 +165,16 @@ class Stations:
         self.by_address: dict[Address, UdpStation] = {self.first: UdpStation(self._codec(), self.udp, self.first)}
         self.connected: list[TcpStation] = []
         self.from_udp = self._read_udp()
+        self.next = 0.0
 
     def _codec(self) -> Codec:
         return Codec(signer=self.signer, wanted=self.wanted)
 
-    @property
-    def sockets(self) -> list[socket.socket]:
-        """What becomes readable when there is something to receive."""
-        return [self.udp, self.tcp, *(station.link for station in self.connected)]
+    def __str__(self) -> str:
+        """Where they find the vehicle."""
+        host, udp = self.udp.getsockname()
+        others = f"others on {host}, UDP {udp} and TCP {self.tcp.getsockname()[1]}"
+        return f"ground station on UDP {self.first[1]}, {others}{', signed' if self.signer else ''}"
 
     def close(self) -> None:
         """Release the ports."""
@@ -173,14 +183,40 @@ class Stations:
         self.udp.close()
         self.tcp.close()
 
+    def hear(self, *kinds: str) -> None:
+        """Messages of these kinds mean something to the vehicle; others are passed over."""
+        self.wanted.update(number for number, kind in KINDS.items() if kind.msgname in kinds)
+
+    @property
+    def _all(self) -> tuple[Station, ...]:
+        return (*self.by_address.values(), *self.connected)
+
     def send(self, message: Any) -> None:
-        """One message to every station."""
-        for station in (*self.by_address.values(), *self.connected):
+        """One message to every station, now."""
+        for station in self._all:
             station.send(message)
+
+    def post(self, message: Any, station: Station | None = None) -> None:
+        """One message to a station, or to all, after what waits for it already; see `deliver`."""
+        for receiver in self._all if station is None else (station,):
+            receiver.answers.append(message)
+
+    def deliver(self) -> None:
+        """Send some of what waits, to each station in turn."""
+        end = time.perf_counter() + BUDGET_S
+        for _ in range(SHARE):
+            waiting = [station for station in self._all if station.answers]
+            for station in waiting:
+                station.send(station.answers.popleft())
+            if not waiting or time.perf_counter() > end:
+                return
 
     def receive(self) -> Iterator[Heard]:
         """What stations say to this vehicle, one message of each in turn, until nothing is left or the time is up."""
-        end = time.perf_counter() + BUDGET_S
+        now = time.perf_counter()
+        if now < self.next:
+            return
+        self.next, end = now + PACE_S, now + BUDGET_S
         self._admit()
         busy = [self.from_udp, *(station.reader for station in self.connected)]
         while busy:
@@ -191,7 +227,8 @@ class Stations:
                     continue
                 for message, station in found:
                     station.heard = time.monotonic()
-                    yield message, station
+                    if not station.busy:
+                        yield message, station
                 if time.perf_counter() > end:
                     busy.clear()
                     break

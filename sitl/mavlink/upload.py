@@ -56,7 +56,7 @@ def read(talk: Conversation, names: Sequence[str]) -> Steps[dict[str, float]]:
     return {name: answer.value for name, answer in answers.items() if answer.value is not None}
 
 
-def apply(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float]) -> Steps[Outcome]:
+def apply(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float], store: bool = True) -> Steps[Outcome]:
     """Write what differs, read back everything, store; on any failure put the old values back.
 
     Parameters
@@ -67,11 +67,13 @@ def apply(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float]
         Name -> value in single precision; all of them are verified.
     old : mapping
         Name -> what the vehicle holds, at least of the same names.
+    store : bool
+        False: the values are not meant to outlast the flight.
     """
     talk.possible = {name: {old[name]} for name in new}
     reason = yield from _write_and_verify(talk, new, old)
     if not reason:
-        storage = yield from talk.store()
+        storage = (yield from talk.store()) if store else ""
         return Outcome("verified", "", _held(talk, new), storage)
     if not talk.written:
         return Outcome("untouched", reason, _held(talk, new))
@@ -82,7 +84,7 @@ def apply(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float]
         return Outcome("mixed", reason, _held(talk, new))
     yield from talk.settle()
     answers = yield from talk.ask(list(new), "verifying", keep_going=True)
-    storage = yield from talk.store()
+    storage = (yield from talk.store()) if store else ""
     restored = all(answers[name].value == old[name] for name in new)
     return Outcome("rolled back" if restored else "mixed", reason, _held(talk, new), storage)
 

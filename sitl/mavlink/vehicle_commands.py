@@ -10,11 +10,24 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.mavlink.flight_modes import mode_of, mode_of_pair
-from sitl.mavlink.telemetry import TOPICS, Telemetry
-from sitl.modes import Denied, Mode, Refused, Severity, Vehicle
+from sitl.mavlink.telemetry import Telemetry
+from sitl.mavlink.topics import TOPICS
+from sitl.modes import Denied, Failed, Mode, Refused, Severity, Vehicle
 
 FORCE = 21196  # param2 of arm and disarm: override
 TAKEOFF_HEIGHT = 2.5  # m, when none is given
+
+
+class Unsupported(Refused):
+    """Asked of many vehicles, and not known to this one: no news for the pilot."""
+
+
+RESULTS = {
+    Unsupported: mavlink.MAV_RESULT_UNSUPPORTED,
+    Refused: mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+    Denied: mavlink.MAV_RESULT_DENIED,
+    Failed: mavlink.MAV_RESULT_FAILED,
+}
 
 
 @dataclass(frozen=True)
@@ -93,7 +106,6 @@ class VehicleCommands:
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
             mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._capabilities,
             mavlink.MAV_CMD_GET_HOME_POSITION: self._home,
-            mavlink.MAV_CMD_PREFLIGHT_STORAGE: self._store,
             mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
         }
 
@@ -110,9 +122,9 @@ class VehicleCommands:
         try:
             more = handler(Command.of(message))
         except Refused as refusal:
-            self.vehicle.say(Severity.WARNING, str(refusal))
-            denied = isinstance(refusal, Denied)
-            return [acknowledge(mavlink.MAV_RESULT_DENIED if denied else mavlink.MAV_RESULT_TEMPORARILY_REJECTED)]
+            if not isinstance(refusal, Unsupported):
+                self.vehicle.say(Severity.WARNING, str(refusal))
+            return [acknowledge(RESULTS[type(refusal)])]
         return [acknowledge(mavlink.MAV_RESULT_ACCEPTED), *more]
 
     def set_mode(self, message: Any) -> list[Any]:
@@ -155,7 +167,7 @@ class VehicleCommands:
     def _topic(self, command: Command) -> int:
         number = command.whole(1)
         if number not in TOPICS:
-            raise Denied(f"there is no message {number} here")
+            raise Unsupported(f"there is no message {number} here")
         return number
 
     def _set_interval(self, command: Command) -> list[Any]:
@@ -191,10 +203,6 @@ class VehicleCommands:
         if message is None:
             raise Refused("no home: no plant has told a position yet")
         return [message]
-
-    def _store(self, command: Command) -> list[Any]:
-        """Parameters are stored as they change: there is nothing left to do."""
-        return []
 
     def _reboot(self, command: Command) -> list[Any]:
         if command.whole(1) not in (1, 3):

@@ -15,7 +15,7 @@ import numpy as np
 
 from sitl.errors import SitlError
 
-REAL32 = 9
+INT32, REAL32 = 6, 9
 #: Component number of an autopilot.
 AUTOPILOT = 1
 STORAGE_COMMAND = 245
@@ -39,10 +39,11 @@ class Heartbeat(NamedTuple):
     component: int
     autopilot: int
     armed: bool
+    mode: int = 0
 
 
 class Value(NamedTuple):
-    """PARAM_VALUE; `kind` is its param_type."""
+    """PARAM_VALUE; `kind` is its param_type, and an INT32 is the whole number that its bits stand for."""
 
     system: int
     component: int
@@ -69,6 +70,40 @@ class Ack(NamedTuple):
     result: int
 
 
+class Attitude(NamedTuple):
+    """ATTITUDE: roll and pitch, rad."""
+
+    system: int
+    component: int
+    roll: float
+    pitch: float
+
+
+class Landed(NamedTuple):
+    """EXTENDED_SYS_STATE: where the vehicle is, by MAV_LANDED_STATE."""
+
+    system: int
+    component: int
+    state: int
+
+
+class Excited(NamedTuple):
+    """DEBUG_VECT of the injector: its phase (0 roll, 1 pitch, 2 between them, -1 off) at a time of the vehicle, us."""
+
+    system: int
+    component: int
+    phase: int
+    time: int
+
+
+class Text(NamedTuple):
+    """STATUSTEXT."""
+
+    system: int
+    component: int
+    text: str
+
+
 class Beat(NamedTuple):
     """Our own HEARTBEAT, so that the vehicle knows where to answer."""
 
@@ -82,12 +117,13 @@ class Read(NamedTuple):
 
 
 class Write(NamedTuple):
-    """PARAM_SET of a float."""
+    """PARAM_SET; `kind` as in `Value`."""
 
     system: int
     component: int
     name: str
     value: float
+    kind: int = REAL32
 
 
 class Store(NamedTuple):
@@ -97,8 +133,19 @@ class Store(NamedTuple):
     component: int
 
 
-Incoming = Heartbeat | Value | Refusal | Ack
-Outgoing = Beat | Read | Write | Store
+class Request(NamedTuple):
+    """MAV_CMD_SET_MESSAGE_INTERVAL: send a message every so many microseconds."""
+
+    system: int
+    component: int
+    message: int
+    interval: int
+
+
+#: What a vehicle tells of its flight.
+Sight = Attitude | Landed | Excited | Text
+Incoming = Heartbeat | Value | Refusal | Ack | Sight
+Outgoing = Beat | Read | Write | Store | Request
 T = TypeVar("T")
 
 

@@ -82,7 +82,7 @@ def test_the_plant_refuses_what_it_cannot_do_before_it_listens(mimopilot):
         (("--fault", "gain:Kp_o=100@1"), ("MIMO_AP_RR would be 650", "a vehicle refuses that write")),
     ],
 )
-def test_the_vehicle_refuses_what_it_cannot_do_before_it_takes_a_port(mimopilot, words, told):
+def test_the_vehicle_refuses_what_it_cannot_do_before_it_flies(mimopilot, words, told):
     assert_one_clear_line(mimopilot("sitl", "adam0", *words), *told)
 
 
@@ -99,7 +99,8 @@ def test_the_host_corrupts_its_gains_and_hears_no_set_points_in_the_time_of_the_
     autopilot = pilot(vehicle, library)
     controller = autopilot.controller
     faults = AutopilotFaults(tuple(map(parse_fault, ("gain:Kp_i=0.5@0.2+0.4", "stale@0.4+0.8"))), TS, autopilot)
-    host = Host(autopilot, Frames(), faults=faults)
+    host = Host(autopilot, Frames())
+    host.faults = faults
     sound, Kp_i, fresh = controller.state["gains"][0].copy(), slice(4, 8), []
     for k in range(400):
         host._period(PlantState(7_000_000 + 4000 * k, 1, 0, 0, 0, *[0.0] * 5, 10_000, *[0] * 8))

@@ -1,0 +1,97 @@
+"""How late the control loop gets when a ground station floods it: `python -m tests.sitl.flood`.
+
+The vehicle runs in real time, with its plant; the flood comes from another process as fast as that can send.
+"""
+
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import NamedTuple
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from sitl.mavlink.link import Codec
+from tests.sitl.clients import free_port
+from tuning.output import print_table
+
+
+class Lateness(NamedTuple):
+    """Control periods, how long the worst waited (ms), and how many waited for more than a millisecond."""
+
+    periods: int
+    worst_ms: float
+    late: int
+    sent: int
+
+
+def datagrams(sort):
+    """What a flood is made of."""
+    codec = Codec(255, 190)
+
+    def pack(message):
+        return codec.pack(message)
+
+    if sort == "junk":
+        return [os.urandom(300) for _ in range(50)]
+    if sort == "lists asked for, 60 in a datagram":
+        return [b"".join(pack(mavlink.MAVLink_param_request_list_message(1, 1)) for _ in range(60)) for _ in range(50)]
+    if sort == "parameters set":
+        values = (0.15 + 1e-5 * i for i in range(50))
+        return [pack(mavlink.MAVLink_param_set_message(1, 1, b"MIMO_RP_RR", value, 9)) for value in values]
+    raise ValueError(sort)
+
+
+SORTS = ("junk", "lists asked for, 60 in a datagram", "parameters set")
+
+
+def flood(port, sort, seconds):
+    """Send for so long; how many went out."""
+    link, sent, end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), 0, time.monotonic() + seconds
+    pieces = datagrams(sort)
+    with link:
+        while time.monotonic() < end:
+            for piece in pieces:
+                link.sendto(piece, ("127.0.0.1", port))
+            sent += len(pieces)
+    return sent
+
+
+def measure(sort="", seconds=10.0):
+    """Run a vehicle for so long, flooded or not."""
+    port = free_port(socket.SOCK_DGRAM)
+    ports = ["--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", port, "--tcp-port", 0]
+    command = [sys.executable, "-u", "-m", "mimopilot", "sitl", "adam0", *map(str, ports)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as vehicle:
+        try:
+            while "plant connected" not in vehicle.stdout.readline():
+                pass
+            sent = 0
+            if sort:
+                sent = flood(port, sort, seconds)
+            else:
+                time.sleep(seconds)
+            vehicle.send_signal(signal.SIGINT)
+            output = vehicle.communicate(timeout=20)[0]
+        finally:
+            vehicle.kill()
+    found = re.search(r"(\d+) periods, answered within ([\d.]+) ms, (\d+) of them", output)
+    return Lateness(int(found[1]), float(found[2]), int(found[3]), sent)
+
+
+def main():
+    rows = []
+    for sort in ("", *SORTS):
+        found = measure(sort)
+        rows.append(
+            [sort or "calm", f"{found.sent / 10:.0f}", str(found.periods), f"{found.worst_ms:.2f}", str(found.late)]
+        )
+    print_table("10 s of real time", ["flood", "datagrams/s", "periods", "worst [ms]", "later than 1 ms"], rows)
+    print(f"load of this machine, {os.cpu_count()} cores: {os.getloadavg()[0]:.1f}")
+
+
+if __name__ == "__main__":
+    main()

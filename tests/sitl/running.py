@@ -1,0 +1,157 @@
+"""The vehicle as its users run it: processes, ports, and clients that speak to it."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import common as mavlink
+
+from sitl.mavlink.flight_modes import custom_mode
+
+
+def free_port(kind=socket.SOCK_STREAM):
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+class Program:
+    """A process whose output is read as it comes."""
+
+    def __init__(self, *command, **keywords):
+        self.process = subprocess.Popen(
+            [str(word) for word in command],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            **keywords,
+        )
+        self.output = ""
+        self.reader = threading.Thread(target=self._read)
+        self.reader.start()
+
+    def _read(self):
+        while text := self.process.stdout.read(1):
+            self.output += text
+
+    def until(self, text, seconds=30.0):
+        """Wait until it has said something; how long that took, s."""
+        begin = time.monotonic()
+        while text not in self.output:
+            assert time.monotonic() < begin + seconds, f"no {text!r} in:\n{self.output}"
+            time.sleep(0.01)
+        return time.monotonic() - begin
+
+    def say(self, line):
+        self.output = ""
+        self.process.stdin.write(line + "\n")
+        self.process.stdin.flush()
+
+    def end(self):
+        if self.process.poll() is None:
+            self.process.terminate()
+        try:
+            self.process.wait(timeout=10)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        self.reader.join(timeout=10)
+        self.process.stdin.close()
+        self.process.stdout.close()
+
+
+def mimopilot(*arguments, **keywords):
+    return Program(sys.executable, "-u", "-m", "mimopilot", *arguments, **keywords)
+
+
+@contextmanager
+def running_sitl(*extra, **keywords):
+    """`mimopilot sitl adam0` on ports of its own; yields the program, with its `ports`."""
+    udp, local, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM), free_port()
+    ports = ("--ground-port", udp, "--vehicle-port", local, "--tcp-port", tcp)
+    program = mimopilot("sitl", "adam0", *ports, *extra, **keywords)
+    program.udp, program.tcp = udp, tcp
+    try:
+        program.until("Ctrl-C ends", 120)  # a first start compiles
+        yield program
+    finally:
+        program.end()
+
+
+class Pilot:
+    """A ground station made of pymavlink alone."""
+
+    def __init__(self, address):
+        self.link = mavutil.mavlink_connection(address, dialect="common", source_system=255)
+        self.texts = []
+        self.said = self.beat = None
+        self.beats = 0
+        self.wait(lambda: self.beat is not None)
+
+    def close(self):
+        self.link.close()
+
+    def take(self, timeout=0.05):
+        """One message, if there is one."""
+        message = self.link.recv_match(blocking=True, timeout=timeout)
+        if message is not None and message.get_type() == "STATUSTEXT":
+            if message.chunk_seq and self.texts:  # the rest of a long one
+                self.texts[-1] += message.text
+            else:
+                self.texts.append(message.text)
+        if message is not None and message.get_type() == "HEARTBEAT":
+            self.beat = message
+            self.beats += 1
+        return message
+
+    def wait(self, condition, seconds=30.0):
+        """Listen until something is so; how long that took, s."""
+        begin = time.monotonic()
+        while not condition():
+            assert time.monotonic() < begin + seconds, self.texts
+            self.take()
+        return time.monotonic() - begin
+
+    def hears(self, text, seconds=30.0):
+        return self.wait(lambda: any(text in said for said in self.texts), seconds)
+
+    def asks(self, kind, seconds=5.0):
+        """The next message of a kind."""
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            message = self.take()
+            if message is not None and message.get_type() == kind:
+                return message
+        raise AssertionError(f"no {kind}")
+
+    def command(self, number, *params):
+        """COMMAND_LONG; the result in its acknowledgement."""
+        self.link.mav.command_long_send(1, 1, number, 0, *params, *[0] * (7 - len(params)))
+        while True:
+            ack = self.asks("COMMAND_ACK")
+            if ack.command == number:
+                return ack.result
+
+    def ready(self):
+        """Wait until the vehicle can be armed."""
+        self.wait(
+            lambda: (
+                (m := self.take()) is not None
+                and m.get_type() == "SYS_STATUS"
+                and m.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK
+            )
+        )
+
+    def flies(self, mode, seconds=60.0):
+        """Wait until the vehicle shows a mode."""
+        return self.wait(lambda: self.beat.custom_mode == custom_mode(mode), seconds)
+
+    def armed(self):
+        return bool(self.beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -1,0 +1,365 @@
+"""The plant as a process: what autopilots of every kind meet, and what happens to them."""
+
+import os
+import pty
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import tty
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
+from sitl.airframe import load_airframe
+from sitl.errors import SitlError
+from sitl.mavlink.hitl import SerialPlant
+from sitl.mavlink.lean import ACTUATORS, GPS, SENSOR, STATE, LeanCodec
+from sitl.mavlink.link import LOOPBACK, listen
+from sitl.mavlink.plant_server import PlantServer
+from sitl.mavlink.simulator import ARMED, SimulatedVehicle
+from tests.conftest import assert_one_clear_line
+
+TS = 0.004
+AIRFRAME = load_airframe("adam0").airframe
+
+
+class Bench:
+    """A plant served in this process, on a thread; what it tells is in `told`."""
+
+    def __init__(self, speed=None, altitude=0.0):
+        self.told = []
+        self.vehicle = SimulatedVehicle(AIRFRAME, TS, 3, altitude, self.told.append)
+        self.listener = listen(LOOPBACK, 0)
+        self.port = self.listener.getsockname()[1]
+        server = PlantServer(self.vehicle, self.listener, speed, child=False)
+        threading.Thread(target=server.serve, daemon=True).start()
+
+    def until_told(self, words, seconds):
+        deadline = time.monotonic() + seconds
+        while not any(words in line for line in self.told):
+            assert time.monotonic() < deadline, (words, self.told)
+            time.sleep(0.005)
+
+
+class Pilot:
+    """A raw autopilot: answers frames one by one."""
+
+    def __init__(self, port):
+        self.codec, self.waiting = LeanCodec(1, 1), []
+        self.link = socket.create_connection((LOOPBACK, port), timeout=5)
+        self.frames = []
+
+    def read(self):
+        """The next message."""
+        while not self.waiting:
+            data = self.link.recv(65536)
+            if not data:
+                raise ConnectionResetError
+            self.waiting = self.codec.parse(data)
+        return self.waiting.pop(0)
+
+    def frame(self):
+        """Fields of the next HIL_STATE_QUATERNION; everything on the way to it is kept in `frames`."""
+        while True:
+            message = self.read()
+            self.frames.append(message)
+            if message[0] is STATE:
+                return message[1]
+
+    def answer(self, stamp, command=0.0, mode=ARMED):
+        self.link.sendall(self.codec.pack(ACTUATORS, stamp, 1, *[command] * 16, mode))
+
+    def fly(self, periods, command=0.0):
+        """Answer so many frames; returns the last."""
+        for _ in range(periods):
+            state = self.frame()
+            self.answer(state[0], command)
+        return state
+
+    def close(self):
+        self.link.close()
+
+
+@pytest.fixture
+def bench():
+    return Bench()
+
+
+def test_the_same_seed_gives_the_same_bytes_after_each_start(bench):
+    flights = []
+    for _ in range(2):
+        pilot = Pilot(bench.port)
+        pilot.fly(300, 0.6)
+        flights.append(pilot.frames)
+        pilot.close()
+    assert flights[0] == flights[1]
+    kinds = [kind for kind, _ in flights[0]]
+    assert (kinds.count(SENSOR), kinds.count(STATE), kinds.count(GPS)) == (300, 300, 12)
+    # Magnetometer and barometer at 50 Hz, accelerometer and gyro with every frame.
+    updated = [fields[14] for kind, fields in flights[0] if kind is SENSOR]
+    assert [bits & 63 for bits in updated] == [63] * 300
+    assert sum(bits & (448 | 6656) == 448 | 6656 for bits in updated) == 60
+
+
+def test_an_autopilot_that_boots_gets_a_running_clock_and_a_vehicle_that_waits():
+    bench = Bench(speed=1.0)
+    pilot = Pilot(bench.port)
+    first = pilot.frame()
+    pilot.link.sendall(pilot.codec.pack(mavlink.MAVLink_heartbeat_message, 0, 2, 12, 0, 3, 3))
+    stamps, gyro = [], set()
+    deadline = time.monotonic() + 1.0
+    while time.monotonic() < deadline:
+        state = pilot.frame()
+        stamps.append(state[0])
+        assert state[1:] == first[1:]
+        gyro.add(pilot.frames[-2][1][4])
+    moved = [b - a for a, b in pairwise(stamps) if b > a]
+    assert set(moved) == {4000}
+    assert 0.5 < (stamps[-1] - stamps[0]) / 1e6 < 1.2
+    assert len(gyro) > 100  # its sensors are alive
+    assert bench.vehicle.flown == 0
+    pilot.frames.clear()
+    pilot.fly(200, 0.6)  # now it answers frame by frame, those first that have waited
+    stamps = [fields[0] for kind, fields in pilot.frames if kind is STATE]
+    assert {b - a for a, b in pairwise(stamps)} == {4000}
+    assert 150 < bench.vehicle.flown <= 200
+    pilot.close()
+
+
+def test_it_takes_off_and_a_fall_is_a_crash_that_is_told(bench):
+    pilot = Pilot(bench.port)
+    assert pilot.fly(250, 0.3)[10] == 0  # below hover it stands
+    assert pilot.fly(300, 0.6)[10] > 1000  # mm
+    while pilot.fly(1, 0.0)[10] > 0:
+        pass
+    bench.until_told("crashed at", 1)
+    # It stays down, whatever the autopilot wants.
+    assert pilot.fly(250, 1.0)[10] == 0
+    assert len(bench.told) == 1
+    pilot.close()
+    bench.until_told("went away at", 1)
+    pilot = Pilot(bench.port)
+    assert pilot.fly(300, 0.6)[10] > 1000
+    pilot.close()
+
+
+def test_a_disarmed_autopilot_moves_nothing(bench):
+    pilot = Pilot(bench.port)
+    for _ in range(300):
+        state = pilot.frame()
+        pilot.answer(state[0], 1.0, mode=0)
+    assert pilot.frame()[10] == 0
+    pilot.close()
+
+
+KILLED = """
+import sys
+sys.path.insert(0, {top!r})
+from tests.sitl.test_plant_process import Pilot
+pilot = Pilot({port})
+pilot.fly(100, 0.6)
+print("flying", flush=True)
+while True:
+    pilot.fly(1, 0.6)
+"""
+
+
+def test_a_killed_autopilot_is_noticed_within_a_second_and_the_next_starts_anew():
+    bench = Bench(speed=1.0)
+    code = KILLED.format(top=str(Path(__file__).resolve().parents[2]), port=bench.port)
+    autopilot = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    assert autopilot.stdout.readline() == b"flying\n"
+    autopilot.send_signal(signal.SIGKILL)
+    bench.until_told("the autopilot went away at", 1)
+    autopilot.wait()
+    autopilot.stdout.close()
+    pilot = Pilot(bench.port)
+    state = pilot.frame()
+    assert (state[0], state[10]) == (1_000_000, 0)
+    pilot.answer(state[0])
+    assert pilot.frame()[0] == 1_004_000
+    pilot.close()
+
+
+def test_a_frozen_autopilot_is_told_once_and_kept(bench):
+    pilot = Pilot(bench.port)
+    pilot.fly(100, 0.6)
+    begin = time.monotonic()
+    bench.until_told("has not answered for 1 s, at 0.40 s", 2)
+    assert time.monotonic() - begin > 0.8
+    time.sleep(1.0)
+    assert len(bench.told) == 1
+    state = pilot.fly(100, 0.6)
+    assert state[0] == 1_000_000 + 199 * 4000
+    bench.until_told("answers again", 1)
+    pilot.close()
+
+
+def test_garbage_and_other_messages_are_passed_over_told_once_and_stall_nothing(bench):
+    pilot = Pilot(bench.port)
+    pilot.fly(50, 0.6)
+    for _ in range(3):
+        state = pilot.frame()
+        pilot.link.sendall(b"\xfd\xff\0\0garbage" + os.urandom(64))
+        pilot.link.sendall(pilot.codec.pack(mavlink.MAVLink_heartbeat_message, 0, 6, 8, 0, 4, 3))
+        pilot.answer(state[0] - 4000, 0.0)  # an answer to an older frame is no answer
+        pilot.answer(state[0], 0.6)
+    state = pilot.fly(50, 0.6)
+    assert state[0] == 1_000_000 + 102 * 4000
+    assert len([line for line in bench.told if "no MAVLink" in line]) == 1
+    assert bench.told == bench.told[:1]
+    pilot.close()
+
+
+def test_commands_that_are_not_finite_stop_the_motors_and_are_told_once(bench):
+    pilot = Pilot(bench.port)
+    state = pilot.fly(300, 0.6)
+    for _ in range(20):
+        state = pilot.frame()
+        pilot.answer(state[0], float("nan"))
+    after = pilot.frame()
+    assert after[13] > state[13]  # it falls
+    assert all(value == value for value in after)
+    assert [line for line in bench.told if "not finite" in line] == bench.told
+    pilot.close()
+
+
+def test_a_second_autopilot_is_turned_away_and_the_first_flies_on():
+    bench = Bench(speed=1.0)
+    first = Pilot(bench.port)
+    first.fly(50, 0.6)
+    second = Pilot(bench.port)
+    state = first.fly(100, 0.6)
+    assert state[0] == 1_000_000 + 149 * 4000
+    with pytest.raises(ConnectionResetError):
+        second.read()
+    bench.until_told("a second autopilot was turned away", 1)
+    assert len(bench.told) == 1
+    first.close()
+    second.close()
+
+
+def test_an_autopilot_that_keeps_its_own_time_is_told_that_it_cannot_fly(bench):
+    pilot = Pilot(bench.port)
+    state = pilot.frame()
+    for _ in range(3):
+        pilot.link.sendall(pilot.codec.pack(ACTUATORS, state[0], 0, *[0.6] * 16, ARMED))
+    bench.until_told("without the lockstep flag", 1)
+    assert len(bench.told) == 1
+    pilot.close()
+
+
+def test_a_peer_that_is_no_autopilot_is_asked_about(bench, monkeypatch):
+    monkeypatch.setattr("sitl.mavlink.plant_server.MUTE_S", 0.3)
+    pilot = Pilot(bench.port)
+    pilot.frame()
+    bench.until_told("no HIL_ACTUATOR_CONTROLS", 2)
+    pilot.close()
+
+
+def test_a_child_ends_with_its_parent():
+    command = [sys.executable, "-m", "mimopilot", "plant", "adam0", "--port", "0", "--child"]
+    idle, busy = (subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) for _ in range(2))
+    ports = [int(child.stdout.readline().rsplit(b":", 1)[1]) for child in (idle, busy)]
+    pilot = Pilot(ports[1])
+    pilot.fly(10)
+    pilot.link.settimeout(1)
+    for child in (idle, busy):
+        child.stdin.close()  # as the kernel does it when the parent is killed
+    with pytest.raises(ConnectionResetError):
+        while True:
+            pilot.read()
+    pilot.close()
+    deadline = time.monotonic() + 1
+    with pytest.raises(ConnectionRefusedError):
+        while time.monotonic() < deadline:
+            socket.create_connection((LOOPBACK, ports[0])).close()
+            time.sleep(0.01)
+    for child in (idle, busy):
+        assert child.wait(timeout=20) == 0
+        child.stdout.close()
+
+
+class Board:
+    """The far end of a serial line: sends motor commands at 200 Hz when told to, as a board does."""
+
+    def __init__(self):
+        self.fd, self.slave = pty.openpty()
+        tty.setraw(self.slave)
+        self.device = os.ttyname(self.slave)
+        self.codec = LeanCodec(1, 1)
+        self.sensors, self.kinds, self.command, self.running = [], set(), None, True
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self):
+        while self.running:
+            if select.select([self.fd], [], [], 0.005)[0]:
+                for kind, fields in self.codec.parse(os.read(self.fd, 65536)):
+                    self.kinds.add(kind)
+                    if kind is SENSOR:
+                        self.sensors.append(fields)
+            if self.command is not None:
+                os.write(self.fd, self.codec.pack(ACTUATORS, 0, 0, *[self.command] * 16, ARMED))
+
+    def unplug(self):
+        self.running = False
+        self.thread.join()
+        os.close(self.slave)
+        os.close(self.fd)
+
+
+def test_a_board_on_a_serial_port_flies_in_real_time_and_its_silence_and_loss_are_told(tmp_path):
+    told = []
+    vehicle = SimulatedVehicle(AIRFRAME, TS, 0, 0.0, told.append)
+    board, device = Board(), tmp_path / "ttyACM0"
+    device.symlink_to(board.device)
+
+    def until(condition, seconds):
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, told
+            time.sleep(0.01)
+
+    def until_told(words, seconds):
+        until(lambda: any(words in line for line in told), seconds)
+
+    plant = SerialPlant(vehicle, f"{device},921600")
+    threading.Thread(target=plant.serve, daemon=True).start()
+    until(lambda: len(board.sensors) > 10, 5)
+    begin, first = time.monotonic(), board.sensors[-1][0]
+    time.sleep(1.0)
+    elapsed, passed = time.monotonic() - begin, (board.sensors[-1][0] - first) / 1e6
+    assert passed == pytest.approx(elapsed, abs=0.15)
+    assert vehicle.flown == 0  # held until the board speaks
+    assert board.kinds == {SENSOR, GPS, mavlink.MAVLink_heartbeat_message}
+    board.command = 0.6
+    until(lambda: vehicle.simulator.state[2] < -1.0, 5)
+    board.command = None
+    until_told("no motor commands from the board for 0.5 s", 2)
+    until_told("crashed at", 5)
+    board.command = 0.6
+    until_told("come again", 2)
+    board.unplug()
+    until_told("went away", 2)
+    assert vehicle.flown == 0
+    board = Board()
+    device.unlink()
+    device.symlink_to(board.device)
+    until(lambda: board.sensors, 2)
+    assert board.sensors[0][0] == 1_000_000
+    board.unplug()
+
+
+def test_a_wrong_serial_port_or_speed_is_one_clear_line(mimopilot):
+    vehicle = SimulatedVehicle(AIRFRAME, TS, 0, 0.0, print)
+    for url, words in (("/dev/nowhere,921600", "cannot be opened"), ("/dev/ttyACM0", "expected DEVICE,BAUD")):
+        with pytest.raises(SitlError, match=words):
+            SerialPlant(vehicle, url)
+    assert_one_clear_line(mimopilot("plant", "adam0", "--serial", "/dev/ttyACM0,9", "--speed", "2"), "real time")

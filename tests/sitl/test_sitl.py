@@ -1,0 +1,213 @@
+"""`mimopilot sitl` flown by real clients, and what it survives."""
+
+import math
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+from pyulog import ULog
+
+from codegen.parameters import EXCITATION, IDENTITY, PARAMETERS
+from sitl.mavlink.flight_modes import custom_mode
+from sitl.modes import Mode
+from tests.sitl.running import Pilot, Program, free_port, mimopilot, running_sitl
+
+ARM, TAKEOFF, LAND, SET_MODE = 400, 22, 21, 176
+ACCEPTED, TEMPORARILY_REJECTED = 0, 1
+
+
+class Sender:
+    """Sends an attitude set-point again and again, as a companion computer does."""
+
+    def __init__(self, pilot, seconds):
+        self.pilot, self.seconds = pilot, seconds
+        self.roll = 0.0
+        self.on = True
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self):
+        while self.on:
+            q = [math.cos(self.roll / 2), math.sin(self.roll / 2), 0, 0]
+            self.pilot.link.mav.set_attitude_target_send(0, 1, 1, 7 | 64, q, 0, 0, 0, 0)
+            time.sleep(self.seconds)
+
+    def stop(self):
+        self.on = False
+        self.thread.join()
+
+
+def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logged(tmp_path):
+    with running_sitl("--speed", "4", "--log", tmp_path / "flight.ulg") as sitl:
+        pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
+        assert not pilot.armed()
+        pilot.ready()
+        assert pilot.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 3) == TEMPORARILY_REJECTED
+        pilot.hears("no take-off: not armed")
+        assert pilot.command(SET_MODE, 1, 6) == TEMPORARILY_REJECTED
+        pilot.hears("no set-points arrive")
+        assert pilot.command(ARM, 1) == ACCEPTED
+        assert pilot.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 3) == ACCEPTED
+        pilot.flies(Mode.TAKEOFF)
+        pilot.flies(Mode.HOLD)
+        assert pilot.armed()
+        assert pilot.command(ARM, 0) == TEMPORARILY_REJECTED  # in the air
+        sender = Sender(pilot, 0.01)
+        time.sleep(0.1)
+        assert pilot.command(SET_MODE, 1, 6) == ACCEPTED
+        rolls = []
+        pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, 10_000)
+        for roll in (0.3, -0.3, 0.0):
+            sender.roll = roll
+            end = time.monotonic() + 0.2
+            while time.monotonic() < end:
+                message = pilot.take()
+                if message is not None and message.get_type() == "ATTITUDE":
+                    rolls.append(message.roll)
+        sender.stop()
+        assert max(rolls) > 0.2
+        assert min(rolls) < -0.2
+        # Nobody steers any more: level, then down.
+        pilot.hears("no set-points for 0.5 s: level")
+        pilot.hears("no set-points for 2.5 s: landing")
+        pilot.hears("disarmed: landed", 60)
+        pilot.wait(lambda: not pilot.armed())
+        pilot.hears("logged: flight.ulg")
+        pilot.close()
+    log = ULog(str(tmp_path / "flight.ulg"))
+    attitude = log.get_dataset("vehicle_attitude").data
+    assert set(np.diff(attitude["timestamp"])) == {4000}
+    landed = log.get_dataset("vehicle_land_detected").data["landed"]
+    assert landed[0] == 1
+    assert 0.5 < np.mean(landed == 0) < 1.0
+    commands = log.get_dataset("actuator_motors").data
+    assert max(commands[f"control[{i}]"].max() for i in range(4)) > 0.4
+
+
+def test_a_plant_that_is_killed_in_flight_is_told_within_a_second_and_comes_back(tmp_path):
+    with running_sitl("--log", tmp_path / "f.ulg") as sitl:
+        pilot = Pilot(f"tcp:127.0.0.1:{sitl.tcp}")
+        pilot.ready()
+        assert pilot.command(ARM, 1) == ACCEPTED
+        assert pilot.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 1) == ACCEPTED
+        pilot.flies(Mode.TAKEOFF)
+        pilot.wait(lambda: (m := pilot.take()) is not None and getattr(m, "relative_alt", 0) > 200)
+        (plant,) = children(sitl.process.pid)
+        os.kill(plant, signal.SIGKILL)
+        assert pilot.hears("the plant is gone", 5) < 1.0
+        assert "the plant is gone" in sitl.output
+        assert pilot.command(ARM, 1) in (ACCEPTED, TEMPORARILY_REJECTED)  # answered all the time
+        beats = pilot.beats
+        pilot.wait(lambda: pilot.beats > beats + 1)
+        pilot.texts.clear()
+        pilot.ready()
+        assert pilot.command(ARM, 1) == ACCEPTED
+        assert pilot.armed() or pilot.wait(pilot.armed) >= 0
+        assert children(sitl.process.pid) != [plant]
+        pilot.close()
+    assert (tmp_path / "f.ulg").is_file()  # what flew before the loss
+    assert (tmp_path / "f-2.ulg").is_file()  # and what was on the way when it ended
+
+
+def children(parent):
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            if stat.read_text().rsplit(")", 1)[1].split()[1] == str(parent):
+                found.append(int(stat.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+def runs(process):
+    """Whether it exists and is no zombie that nobody has collected."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def gone(process, seconds):
+    end = time.monotonic() + seconds
+    while runs(process) and time.monotonic() < end:
+        time.sleep(0.02)
+    return not runs(process)
+
+
+def test_a_host_that_is_killed_leaves_no_plant_behind():
+    with running_sitl() as sitl:
+        (plant,) = children(sitl.process.pid)
+        sitl.process.kill()
+        sitl.process.wait()
+        assert gone(plant, 2.0)
+
+
+def test_ctrl_c_ends_both_processes_and_says_how_late_the_loop_was():
+    with running_sitl() as sitl:
+        (plant,) = children(sitl.process.pid)
+        time.sleep(0.5)
+        sitl.process.send_signal(signal.SIGINT)
+        assert sitl.process.wait(timeout=10) == 0
+        sitl.until("answered within")
+        assert gone(plant, 2.0)
+
+
+def test_somebody_elses_plant_is_waited_for_and_found_again():
+    port = free_port()
+    with running_sitl("--plant", f"127.0.0.1:{port}") as sitl:
+        pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
+        assert pilot.beat.system_status == mavlink.MAV_STATE_BOOT
+        assert pilot.command(ARM, 1) == TEMPORARILY_REJECTED
+        pilot.hears("no plant is connected")
+        for _ in range(2):
+            pilot.texts.clear()
+            plant = mimopilot("plant", "adam0", "--port", port)
+            pilot.hears("plant connected")
+            pilot.ready()
+            plant.process.kill()
+            assert pilot.hears("the plant is gone", 5) < 1.0
+            plant.end()
+        pilot.close()
+
+
+@pytest.mark.parametrize("way", ["udp", "tcp"])
+def test_mavproxy_connects_without_an_error_sets_parameters_and_flies(tmp_path, way):
+    with running_sitl("--speed", "5") as sitl:
+        address = f"udp:127.0.0.1:{sitl.udp}" if way == "udp" else f"tcp:127.0.0.1:{sitl.tcp}"
+        modules = "--default-modules=param,link,arm,mode,cmdlong"
+        proxy = Program(sys.executable, "-m", "MAVProxy.mavproxy", f"--master={address}", modules, cwd=tmp_path)
+        try:
+            proxy.until(f"Received {len(PARAMETERS + IDENTITY + EXCITATION)} parameters")
+            for word in ("rror", "imeout", "raceback"):
+                assert word not in proxy.output.replace("no tty", "")
+            proxy.say("param set MIMO_RP_RR 0.12")
+            time.sleep(0.5)
+            proxy.say("param fetch MIMO_RP_RR")
+            time.sleep(0.5)
+            proxy.say("param show MIMO_RP_RR")
+            proxy.until("MIMO_RP_RR       0.11999999731779099")
+            proxy.say("arm throttle")
+            proxy.until("armed")
+            proxy.say("takeoff 2")
+            proxy.until("mode hold", 60)
+            proxy.say(f"mode {custom_mode(Mode.LAND)}")
+            proxy.until("disarmed: landed", 60)
+        finally:
+            proxy.end()
+
+
+def test_real_time_is_kept():
+    with running_sitl() as sitl:
+        pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
+        first, begin = pilot.asks("ATTITUDE").time_boot_ms, time.monotonic()
+        while time.monotonic() < begin + 2:
+            last = pilot.asks("ATTITUDE").time_boot_ms
+        assert (last - first) / 1000 / (time.monotonic() - begin) == pytest.approx(1.0, abs=0.1)
+        pilot.close()
