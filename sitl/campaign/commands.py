@@ -93,6 +93,8 @@ def campaign(
         print_json({"results": str(results.path), "report": str(report), **summary.as_json(str(out))})
         return
     print(INTERVALS)
+    if summary.rejected:
+        print(f"{summary.rejected} draws of no vehicle that flies were drawn again")
     print_table("Survived", SURVIVAL_COLUMNS, survival_rows(summary))
     print_table("Figures", FIGURE_COLUMNS, figure_rows(summary))
     print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))
