@@ -1,6 +1,7 @@
 """Campaigns: the same runs whatever flies them, begun again without loss, each flown again bit for bit."""
 
 import json
+import os
 import re
 import signal
 import subprocess
@@ -279,6 +280,16 @@ def alive(pid):
         return False
 
 
+@pytest.fixture
+def environment():
+    """Left as it was: a cluster writes the number of threads into it, and tests after this one would inherit it."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.mark.usefixtures("environment")
 def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(vehicle, tmp_path):
     from distributed import LocalCluster
 
