@@ -23,7 +23,7 @@ from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.campaign.draws import Variator
 from sitl.campaign.execution import run_campaign
-from sitl.campaign.figures import choose_map
+from sitl.campaign.figures import choose_map, parse_map
 from sitl.campaign.flights import CHUNK, Stand
 from sitl.campaign.plan import make_plan
 from sitl.campaign.replay import fly_again
@@ -331,10 +331,13 @@ at = 1.1
     results = Results(plan, run_campaign(plan, tmp_path, 1))
     survived = results.column("survived", "default", "roll")
     assert 0.1 < survived.mean() < 0.9
-    assert set(choose_map(results, None)) == {"motors.time_constant", "fault.1.size"}
-    assert choose_map(results, "wind.north,wind.east") == ("wind.north", "wind.east")
-    with pytest.raises(SitlError, match="--map: got 'mass,drag'"):
-        choose_map(results, "mass,drag")
+    assert set(choose_map(results)) == {"motors.time_constant", "fault.1.size"}
+    assert parse_map(plan, "wind.north,wind.east") == ("wind.north", "wind.east")
+    for wrong in ("mass,drag", "wind.north", "wind.north,wind.north"):
+        with pytest.raises(
+            SitlError, match=f"--map: got '{wrong}', expected two of those that vary: motors.time_constant"
+        ):
+            parse_map(plan, wrong)
 
 
 def test_another_campaign_in_the_same_folder_is_refused_by_what_differs(vehicle, tmp_path):
@@ -352,6 +355,9 @@ def test_another_campaign_in_the_same_folder_is_refused_by_what_differs(vehicle,
             run_campaign(plan, tmp_path, 1)
         assert words in str(error.value)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    (tmp_path / "spec.toml").unlink()
+    with pytest.raises(SitlError, match="holds results, but no spec"):
+        run_campaign(plan_of(vehicle, runs=2, axes=["roll"]), tmp_path, 1)
 
 
 def test_a_run_flown_again_has_the_figures_of_the_table_and_its_log_is_that_flight(vehicle, mimopilot, tmp_path):
