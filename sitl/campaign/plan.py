@@ -67,7 +67,7 @@ class Plan:
     Attributes
     ----------
     files : dict
-        Name -> text: what `from_files` makes the same plan of, on this machine or another.
+        Name -> text: what `plan_from_files` makes the same plan of, on this machine or another.
     description : Description
     airframe : Airframe
     gains : dict of Gains

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -238,7 +239,9 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
     command += ["--vary", str(vary), "--out", str(out), "--workers", "2", "--json"]
 
     def begun(parts):
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        # A shell's background jobs, this one perhaps, ignore Ctrl-C, and so do their children.
+        heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heed)
         deadline = time.monotonic() + 60
         while len(list((out / "parts").glob("[0-9]*.parquet"))) < parts:
             assert time.monotonic() < deadline
