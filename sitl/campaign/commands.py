@@ -54,10 +54,9 @@ def campaign(
     as_json: JsonOption = False,
 ) -> None:
     """Fly a vehicle that varies, thousands of times, and say with which gains it survives and how well it follows."""
-    import tomllib
-
     from sitl.airframe import load_airframe
     from sitl.campaign.execution import run_campaign
+    from sitl.campaign.figures import parse_map
     from sitl.campaign.plan import make_plan
     from sitl.campaign.report import INTERVALS, write_campaign_report
     from sitl.campaign.summary import (
@@ -69,30 +68,31 @@ def campaign(
         survival_rows,
         worst_rows,
     )
-    from sitl.campaign.variation import variation_from_toml
+    from sitl.campaign.variation import read_variation
     from tuning.files import write_atomically
     from tuning.output import json_text, print_json, print_table
     from tuning.parallel import cores
 
     vehicle = load_airframe(airframe)
-    text = vary.read_text() if vary else ""
-    variation_from_toml(text, str(vary))
     plan = make_plan(
         vehicle,
         vehicle.gain_sets([*(gains or ()), *(more_gains or ())]),
         runs=runs,
         seed=seed,
         **_task(scenario, axis, {"amplitude_deg": amplitude_deg, "period_s": period_s, "tail_s": tail_s}, fault),
-        vary=tomllib.loads(text),
+        vary=read_variation(vary) if vary else {},
     )
+    over = parse_map(plan, survival_map) if survival_map else None
     results = Results(plan, run_campaign(plan, out, workers or cores(), scheduler))
     summary = results.summarise()
     write_atomically(out / "summary.json", json_text(summary.as_json(".")))
-    report = write_campaign_report(results, summary, survival_map)
+    report = write_campaign_report(results, summary, over)
     if as_json:
         print_json({"results": str(results.path), "report": str(report), **summary.as_json(str(out))})
         return
     print(INTERVALS)
+    if summary.rejected:
+        print(f"{summary.rejected} draws of no vehicle that flies were drawn again")
     print_table("Survived", SURVIVAL_COLUMNS, survival_rows(summary))
     print_table("Figures", FIGURE_COLUMNS, figure_rows(summary))
     print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))

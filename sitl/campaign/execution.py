@@ -16,13 +16,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from sitl.campaign.flights import CHUNK, chunks, fly_chunk, stand_of
-from sitl.campaign.plan import Plan, settle
+from sitl.campaign.plan import PARTS, RESULTS, Plan, settle
 from sitl.errors import SitlError
 from tuning.files import write_atomically
 from tuning.output import progress_console
 from tuning.parallel import processes, run_all
 
-RESULTS, PARTS = "results.parquet", "parts"
 ROW_GROUP = 1 << 14  # rows: what is in memory at a time
 AGAIN = "give the same command again to go on"
 
@@ -97,6 +96,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, i
         return
     try:
         from distributed import Client, KilledWorker
+        from distributed.comm import CommClosedError
     except ImportError:
         raise SitlError("--scheduler needs dask: pip install 'mimopilot[cluster]'") from None
     try:
@@ -109,7 +109,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, i
             raise SitlError(f"--scheduler {scheduler}: it has no workers; start some with dask worker", exit_code=1)
         try:
             yield client.get_executor(pure=False), 2 * threads
-        except (KilledWorker, CancelledError, OSError) as error:
+        except (KilledWorker, CancelledError, CommClosedError) as error:
             raise SitlError(f"--scheduler {scheduler}: the cluster failed ({error}); {AGAIN}", exit_code=1) from error
 
 

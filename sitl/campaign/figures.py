@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
+from sitl.campaign.draws import Variator
 from sitl.campaign.flights import Stand
 from sitl.campaign.plan import Plan
 from sitl.campaign.summary import Results
@@ -135,31 +136,33 @@ def distribution_figure(results: Results, axis: str) -> Figure:
     return figure
 
 
-def choose_map(results: Results, wanted: str | None) -> tuple[str, str] | None:
-    """The two quantities of the survival map.
+def varied(plan: Plan) -> list[str]:
+    """Columns of the results that are drawn, in their order."""
+    variator = Variator(plan.airframe, plan.description.vary, plan.scenarios[0])
+    return [quantity.name for quantity in variator.quantities]
 
-    Parameters
-    ----------
-    results : Results
-    wanted : str or None
-        NAME,NAME; None: those that have most to do with survival, or with J_M,o where all survive (by rank).
 
-    Returns
-    -------
-    tuple of str or None
-        None when fewer than two quantities vary.
+def parse_map(plan: Plan, text: str) -> tuple[str, str]:
+    """The two quantities of a survival map, from NAME,NAME.
 
     Raises
     ------
     SitlError
-        When a wanted one does not vary.
+        When there are not two of those that vary.
     """
-    known, plan = results.varied(), results.plan
-    if wanted is not None:
-        names = tuple(wanted.split(","))
-        if len(names) != 2 or not set(names) <= set(known):
-            raise SitlError(f"--map: got {wanted!r}, expected two of those that vary: {', '.join(known) or 'none'}")
-        return names
+    known = varied(plan)
+    first, _, second = text.partition(",")
+    if first == second or not {first, second} <= set(known):
+        raise SitlError(f"--map: got {text!r}, expected two of those that vary: {', '.join(known) or 'none'}")
+    return first, second
+
+
+def choose_map(results: Results) -> tuple[str, str] | None:
+    """The two quantities that have most to do with survival, or with J_M,o where all survive, by rank.
+
+    None when fewer than two vary.
+    """
+    plan, known = results.plan, varied(results.plan)
     if len(known) < 2:
         return None
     strength = dict.fromkeys(known, 0.0)

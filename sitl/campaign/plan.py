@@ -15,10 +15,11 @@ from sitl.campaign.variation import Variation
 from sitl.errors import SitlError
 from sitl.faults import complaint, parse_fault
 from sitl.scenario import Scenario, make_scenario
-from tuning.files import sha256, write_atomically
+from tuning.files import write_atomically
 from tuning.gains import Gains, gains_from_toml, gains_to_toml, toml_value
 
 SPEC, AIRFRAME = "spec.toml", "airframe.toml"
+RESULTS, PARTS = "results.parquet", "parts"
 HEAD = "# A campaign of mimopilot. Run k is drawn from the seed and k alone; every gain set flies the same runs."
 MAX_RUNS = 100_000_000
 
@@ -66,7 +67,7 @@ class Plan:
     Attributes
     ----------
     files : dict
-        Name -> text: what `from_files` makes the same plan of, on this machine or another.
+        Name -> text: what `plan_from_files` makes the same plan of, on this machine or another.
     description : Description
     airframe : Airframe
     gains : dict of Gains
@@ -80,11 +81,6 @@ class Plan:
     airframe: Airframe
     gains: dict[str, Gains]
     scenarios: list[Scenario]
-
-    @property
-    def key(self) -> str:
-        """Hash of everything."""
-        return sha256(repr(sorted(self.files.items())))
 
 
 def make_plan(vehicle: Vehicle, gains: dict[str, Gains], **entries: Any) -> Plan:
@@ -150,8 +146,13 @@ def read_files(folder: Path) -> dict[str, str]:
     """Texts of the campaign in a folder, by name; empty when there is none."""
     if not (folder / SPEC).is_file():
         return {}
-    paths = [folder / SPEC, folder / AIRFRAME, *sorted((folder / "gains").glob("*.gains.toml"))]
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in paths if path.is_file()}
+    spec = (folder / SPEC).read_text()
+    try:
+        names = [str(name) for name in tomllib.loads(spec).get("gains", ())]
+    except tomllib.TOMLDecodeError:
+        names = []
+    others = [AIRFRAME, *map(gains_file, names)]
+    return {SPEC: spec, **{name: (folder / name).read_text() for name in others if (folder / name).is_file()}}
 
 
 def settle(plan: Plan, folder: Path) -> None:
@@ -160,9 +161,11 @@ def settle(plan: Plan, folder: Path) -> None:
     Raises
     ------
     SitlError
-        When the folder holds another campaign: names the first difference.
+        When the folder holds another campaign: names the first difference; or results of an unknown one.
     """
     there = read_files(folder)
+    if not there and ((folder / RESULTS).exists() or (folder / PARTS).exists()):
+        raise SitlError(f"{folder}: holds results, but no {SPEC} that says of what; give another --out")
     if there and there != plan.files:
         raise SitlError(
             f"{folder}: holds another campaign ({_difference(there, plan.files)}); give another --out, or the same "

@@ -10,9 +10,8 @@ import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from sitl.campaign.execution import RESULTS
 from sitl.campaign.flights import Stand
-from sitl.campaign.plan import SPEC, Plan, plan_from_files, read_files
+from sitl.campaign.plan import RESULTS, SPEC, Plan, plan_from_files, read_files
 from sitl.errors import SitlError
 from sitl.loop import Flight
 

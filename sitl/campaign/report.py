@@ -26,7 +26,7 @@ INTERVALS = (
 )
 
 
-def write_campaign_report(results: Results, summary: Summary, wanted_map: str | None = None) -> Path:
+def write_campaign_report(results: Results, summary: Summary, over: tuple[str, str] | None = None) -> Path:
     """Write `report.html` beside the results.
 
     Parameters
@@ -35,8 +35,8 @@ def write_campaign_report(results: Results, summary: Summary, wanted_map: str | 
         What was flown, and the table.
     summary : Summary
         Of it.
-    wanted_map : str, optional
-        See `sitl.campaign.figures.choose_map`.
+    over : (str, str), optional
+        The quantities of the survival map; by default `sitl.campaign.figures.choose_map`.
     """
     plan = results.plan
     d, stand = plan.description, stand_of(tuple(plan.files.items()))
@@ -60,7 +60,8 @@ def write_campaign_report(results: Results, summary: Summary, wanted_map: str | 
         Section("Summary", INTERVALS, tables=tables),
         Section(
             "Responses",
-            f"True angles of the first {min(d.runs, figures.ENVELOPE_RUNS)} runs that survived, and of the worst run.",
+            f"True angles of those of the first {min(d.runs, figures.ENVELOPE_RUNS)} runs that survived, and of the worst "
+            "run of all.",
             figures=envelopes,
         ),
         Section(
@@ -70,7 +71,7 @@ def write_campaign_report(results: Results, summary: Summary, wanted_map: str | 
             figures=[svg(figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes],
         ),
     ]
-    names = figures.choose_map(results, wanted_map)
+    names = over or figures.choose_map(results)
     if names:
         maps = [svg(figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
         sections.append(Section("Survival", "Over two of the quantities that vary.", figures=maps))

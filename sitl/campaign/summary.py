@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -75,7 +76,7 @@ class Summary:
 
 def replay_command(folder: str, run: int, gains: str, axis: str) -> str:
     """What flies a run again."""
-    return f"mimopilot replay {folder} --run {run} --gains {gains} --axis {axis}"
+    return shlex.join(["mimopilot", "replay", folder, "--run", str(run), "--gains", gains, "--axis", axis])
 
 
 class Results:
@@ -111,11 +112,6 @@ class Results:
         lost = np.isfinite(lost_at)
         order = np.lexsort((-np.where(lost, 0.0, badness), np.where(lost, lost_at, np.inf)))[:count]
         return [Worst(int(i), float(lost_at[i]) if lost[i] else None, float(badness[i])) for i in order]
-
-    def varied(self) -> list[str]:
-        """Columns that were drawn, in their order."""
-        names: list[str] = pq.read_schema(self.path).names
-        return names[names.index("rejected_draws") + 1 :]
 
     def summarise(self) -> Summary:
         """Sum up all groups."""

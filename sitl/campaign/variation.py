@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -189,6 +190,16 @@ class Variation(_Table):
     rates_deg_s: AngleVariation = AngleVariation()
     amplitude_deg: Distribution | None = None
     fault: tuple[FaultVariation, ...] = ()
+
+
+def read_variation(path: Path) -> dict[str, Any]:
+    """The table of a specification's file, checked; see `variation_from_toml`."""
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError as error:
+        raise SitlError(f"{path}: not a TOML file: {error}") from error
+    variation_from_toml(text, str(path))
+    return tomllib.loads(text)
 
 
 def variation_from_toml(text: str, where: str) -> Variation:

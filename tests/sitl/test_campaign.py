@@ -1,12 +1,14 @@
 """Campaigns: the same runs whatever flies them, begun again without loss, each flown again bit for bit."""
 
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ from sitl.airframe import load_airframe
 from sitl.autopilot import Autopilot
 from sitl.campaign.draws import Variator
 from sitl.campaign.execution import run_campaign
+from sitl.campaign.figures import choose_map, parse_map
 from sitl.campaign.flights import CHUNK, Stand
 from sitl.campaign.plan import make_plan
 from sitl.campaign.replay import fly_again
@@ -34,6 +37,7 @@ from sitl.plant import GRAVITY, checked_inertia
 from sitl.scenario import doublet
 from tests.conftest import assert_one_clear_line
 
+RUNS = 60 * CHUNK  # enough that what interrupts a campaign finds it under way
 VARY = """
 mass = { normal = [1.0, 0.05], relative = true }
 delay = { uniform = [0.5, 3.5] }
@@ -214,16 +218,30 @@ def test_the_summary_is_that_of_the_table(vehicle, tmp_path):
 
 
 def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campaigns(vehicle, tmp_path):
-    plan = plan_of(vehicle, runs=20 * CHUNK)
+    plan = plan_of(vehicle, runs=RUNS, axes=["roll"])
     whole = run_campaign(plan, tmp_path / "whole", 1).read_bytes()
     vary = tmp_path / "vary.toml"
     vary.write_text(VARY)
     out = tmp_path / "out"
-    command = [sys.executable, "-m", "mimopilot", "campaign", "adam0", "--runs", str(20 * CHUNK), "--seed", "3"]
+    command = [
+        sys.executable,
+        "-m",
+        "mimopilot",
+        "campaign",
+        "adam0",
+        "--runs",
+        str(RUNS),
+        "--seed",
+        "3",
+        "--axis",
+        "roll",
+    ]
     command += ["--vary", str(vary), "--out", str(out), "--workers", "2", "--json"]
 
     def begun(parts):
-        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        # A shell's background jobs, this one perhaps, ignore Ctrl-C, and so do their children.
+        heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+        process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heed)
         deadline = time.monotonic() + 60
         while len(list((out / "parts").glob("[0-9]*.parquet"))) < parts:
             assert time.monotonic() < deadline
@@ -235,7 +253,7 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
     process.send_signal(signal.SIGINT)
     _, message = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert f"of {20 * CHUNK} runs; give the same command again" in message
+    assert f"of {RUNS} runs; give the same command again" in message
     kept = {path: path.stat().st_mtime_ns for path in (out / "parts").glob("[0-9]*.parquet")}
     assert len(kept) >= 3
 
@@ -253,9 +271,8 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
     finished = subprocess.run(command, capture_output=True, text=True, check=True)
     assert (out / "results.parquet").read_bytes() == whole
     assert not (out / "parts").exists()
-    assert json.loads(finished.stdout)["runs"] == 20 * CHUNK
-    rows = pq.read_table(out / "results.parquet", columns=["run", "axis"])
-    assert rows["run"].to_pylist() == [run for run in range(20 * CHUNK) for _ in range(2)]
+    assert json.loads(finished.stdout)["runs"] == RUNS
+    assert pq.read_table(out / "results.parquet")["run"].to_pylist() == list(range(RUNS))
     assert "<svg" in (out / "report.html").read_text()
 
 
@@ -266,10 +283,20 @@ def alive(pid):
         return False
 
 
+@pytest.fixture
+def environment():
+    """Left as it was: a cluster writes the number of threads into it, and tests after this one would inherit it."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.mark.usefixtures("environment")
 def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(vehicle, tmp_path):
     from distributed import LocalCluster
 
-    plan = plan_of(vehicle, runs=40 * CHUNK, axes=["roll"])
+    plan = plan_of(vehicle, runs=RUNS, axes=["roll"])
     whole = run_campaign(plan, tmp_path / "whole", 1).read_bytes()
     with LocalCluster(
         n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, scheduler_port=0
@@ -279,7 +306,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(vehicle, tmp_path):
             [sys.executable, "-c", KILLER, str(tmp_path / "cluster" / "parts"), str(pids[0])], stdout=subprocess.PIPE
         )
         results = run_campaign(plan, tmp_path / "cluster", 1, cluster.scheduler_address)
-        assert 3 <= int(killer.communicate(timeout=60)[0]) < 40
+        assert 3 <= int(killer.communicate(timeout=60)[0]) < RUNS // CHUNK
     assert results.read_bytes() == whole
 
 
@@ -292,6 +319,28 @@ while (parts := len(list(Path(sys.argv[1]).glob("[0-9]*.parquet")))) < 3:
 os.kill(int(sys.argv[2]), signal.SIGKILL)
 print(parts)
 """
+
+
+def test_the_map_is_over_what_matters_and_over_nothing_that_does_not_vary(vehicle, tmp_path):
+    vary = """
+wind = { north = { normal = [0, 0.1] }, east = { normal = [0, 0.1] } }
+motors = { time_constant = { loguniform = [0.03, 0.5] }, effectiveness = { uniform = [0.99, 1.0] } }
+[[fault]]
+kind = "gain"
+size = { uniform = [0.5, 5.0] }
+at = 1.1
+"""
+    plan = plan_of(vehicle, vary=vary, axes=["roll"])
+    results = Results(plan, run_campaign(plan, tmp_path, 1))
+    survived = results.column("survived", "default", "roll")
+    assert 0.1 < survived.mean() < 0.9
+    assert set(choose_map(results)) == {"motors.time_constant", "fault.1.size"}
+    assert parse_map(plan, "wind.north,wind.east") == ("wind.north", "wind.east")
+    for wrong in ("mass,drag", "wind.north", "wind.north,wind.north"):
+        with pytest.raises(
+            SitlError, match=f"--map: got '{wrong}', expected two of those that vary: motors.time_constant"
+        ):
+            parse_map(plan, wrong)
 
 
 def test_another_campaign_in_the_same_folder_is_refused_by_what_differs(vehicle, tmp_path):
@@ -309,6 +358,9 @@ def test_another_campaign_in_the_same_folder_is_refused_by_what_differs(vehicle,
             run_campaign(plan, tmp_path, 1)
         assert words in str(error.value)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    (tmp_path / "spec.toml").unlink()
+    with pytest.raises(SitlError, match="holds results, but no spec"):
+        run_campaign(plan_of(vehicle, runs=2, axes=["roll"]), tmp_path, 1)
 
 
 def test_a_run_flown_again_has_the_figures_of_the_table_and_its_log_is_that_flight(vehicle, mimopilot, tmp_path):
