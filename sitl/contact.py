@@ -14,6 +14,7 @@ from sitl.plant import QUATERNION, ROTORS, PlantParameters
 
 FRICTION = 0.7  # of a foot on the ground
 SWEEPS = 10  # over all feet; each removes most of what the others have left
+SKIN = 1e-4  # m; a foot so near the ground stands on it
 
 
 def ground_state(plant: PlantParameters) -> NDArray[np.float64]:
@@ -79,6 +80,14 @@ def _push(state, foot, axis, R, plant, given, least, most):  # type: ignore[no-u
 
 
 @compiled
+def _stand(state):  # type: ignore[no-untyped-def]
+    """On all its feet it is level: without this it would rock on three of them like a table."""
+    scale = 1.0 / np.sqrt(state[6] * state[6] + state[9] * state[9])
+    state[6], state[7], state[8], state[9] = state[6] * scale, 0.0, 0.0, state[9] * scale
+    state[2] = 0.0
+
+
+@compiled
 def touch(state, plant, Ts):  # type: ignore[no-untyped-def]
     """Let the ground act on the vehicle at the end of a period of `Ts` s, in place.
 
@@ -114,8 +123,11 @@ def touch(state, plant, Ts):  # type: ignore[no-untyped-def]
         state[axis] += half * (state[3 + axis] - before[3 + axis])
     _turn(state, half * (state[10] - before[10]), half * (state[11] - before[11]), half * (state[12] - before[12]))
     _rotation(state[6:10], R)
-    deepest = 0.0
+    deepest, shallowest = 0.0, np.inf
     for i in range(n):
-        deepest = max(deepest, _depth(state, i, R, plant))
+        depth = _depth(state, i, R, plant)
+        deepest, shallowest = max(deepest, depth), min(shallowest, depth)
     state[2] -= deepest
+    if R[2, 2] > 0.0 and shallowest - deepest > -SKIN:
+        _stand(state)
     return closing

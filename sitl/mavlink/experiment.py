@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from codegen.parameters import EXCITATION
 from sitl.errors import SitlError
 from sitl.injector import AXIS, PAUSE_S
-from sitl.mavlink.exchange import FRESH_S, Conversation
+from sitl.mavlink.exchange import Conversation
 from sitl.mavlink.flight_modes import nav_state
 from sitl.mavlink.upload import apply, read
 from sitl.mavlink.words import Attitude, Excited, Landed, Request, Sight, Steps, Text
@@ -23,7 +23,8 @@ IN_AIR = 2  # MAV_LANDED_STATE
 TELL = {"ATTITUDE": (30, 50_000), "DEBUG_VECT": (250, 100_000), "EXTENDED_SYS_STATE": (245, 200_000)}
 SEEN_S, ASK_AGAIN_S = 5.0, 1.0  # how long these are waited for
 BEGIN_S = 5.0  # from the write to the first pulse: PX4 takes up parameters once a second
-SILENT_S = 1.0  # without ATTITUDE or DEBUG_VECT
+SILENT_S = 1.0  # without one of these
+DEAF_S = 5.0  # without HEARTBEAT, which comes once a second and may be lost
 MARGIN_S = 10.0  # beyond the planned end
 LEVEL = math.radians(15.0)  # a vehicle that hovers tilts less
 ENOUGH = 0.95  # share of the planned time that counts as the whole
@@ -219,8 +220,8 @@ def _danger(talk: Conversation, sights: Sights, mode: int, tilt: float) -> str:
         return "interrupted"
     if talk.closed:
         return "the link was lost"
-    if talk.silence > FRESH_S:
-        return f"no HEARTBEAT for {FRESH_S:g} s"
+    if talk.silence > DEAF_S:
+        return f"no HEARTBEAT for {DEAF_S:g} s"
     if not talk.vehicle.armed:
         return "the vehicle was disarmed"
     if talk.vehicle.mode != mode:

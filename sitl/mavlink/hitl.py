@@ -108,7 +108,7 @@ class SerialPlant:
 
     def _write(self, count: int) -> None:
         """Send what is due; a board that does not read misses it."""
-        data = self.vehicle.messages(truth=False)
+        data = self.vehicle.messages(estimate=False)
         if count % round(HEARTBEAT_S / self.vehicle.Ts) == 0:
             state = mavlink.MAV_STATE_ACTIVE
             beat = (0, mavlink.MAV_TYPE_GENERIC, mavlink.MAV_AUTOPILOT_INVALID, 0, state, 3)

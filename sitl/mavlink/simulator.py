@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.airframe import Airframe
@@ -66,6 +67,7 @@ class SimulatedVehicle:
     ) -> None:
         self.airframe, self.Ts, self.seed, self.altitude, self.tell = airframe, Ts, seed, altitude, tell
         self.faults = faults
+        self.rotors = len(airframe.rotors)
         self.field_every = max(1, round(FIELD_AND_AIR_PERIOD / Ts))
         self.fix_every = max(1, round(GPS_PERIOD / Ts))
         self.restart()
@@ -119,14 +121,12 @@ class SimulatedVehicle:
 
     def fly(self, controls: Sequence[float], mode: int) -> None:
         """Fly one period under HIL_ACTUATOR_CONTROLS: thrust fractions and the autopilot's mode bits."""
-        commands = np.array(controls, np.float32)
-        if not math.isfinite(sum(controls)):
-            if not self.odd:
-                self.tell("motor commands that are not finite came from the autopilot; those motors stop")
-            self.odd = True
-            commands = np.where(np.isfinite(commands), commands, np.float32(0.0))
-        if self.lost or not mode & ARMED:
-            commands[:] = 0.0
+        commands = np.zeros(MAX_ROTORS, np.float32)
+        if not self.lost and mode & ARMED:
+            used = controls[: self.rotors]
+            commands[: self.rotors] = used
+            if not math.isfinite(sum(used)):
+                self._stop_odd(commands)
         simulator = self.simulator
         simulator.advance(commands)
         speed = touch(simulator.state, simulator.plant, self.Ts)
@@ -135,6 +135,12 @@ class SimulatedVehicle:
         self.periods += 1
         self.flown += 1
         self._measure()
+
+    def _stop_odd(self, commands: NDArray[np.float32]) -> None:
+        commands[~np.isfinite(commands)] = 0.0
+        if not self.odd:
+            self.odd = True
+            self.tell("motor commands that are not finite came from the autopilot; those motors stop")
 
     def _judge_landing(self, speed: float) -> None:
         """Tell of a crash; the vehicle lies where it is, its motors stopped, until `restart`."""
@@ -156,7 +162,7 @@ class SimulatedVehicle:
         self.gyro = np.where(sensors.failed, np.nan, np.where(sensors.stuck, self.gyro, biased)).tolist()
         return self.gyro
 
-    def messages(self, truth: bool = True) -> bytes:
+    def messages(self, estimate: bool = True) -> bytes:
         """HIL_SENSOR, HIL_GPS when it is due and, if wanted, HIL_STATE_QUATERNION of now."""
         stamp, state = self.stamp, self.simulator.state
         readings = self.instruments.read(state)
@@ -168,7 +174,7 @@ class SimulatedVehicle:
             fix = self.instruments.fix(state)
             said = (fix.speed, fix.north, fix.east, fix.down, fix.course, FIX_3D, SATELLITES, 0, 0)
             data += self.codec.pack(GPS, stamp, *fix.place, GPS_EPH, GPS_EPV, *said)
-        if truth:
+        if estimate:
             seen = self.simulator.seen.tolist()
             x, y, z, vx, vy = state[:5].tolist()
             latitude, longitude, _ = place(x, y, z)

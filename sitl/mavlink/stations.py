@@ -16,9 +16,8 @@ from sitl.mavlink.link import COMPONENT, KINDS, LOOPBACK, SYSTEM, Codec, listen,
 from sitl.mavlink.signing import Signer
 
 TCP_PORT = 5760
-#: Time that one call of `Stations.receive` may take, and one of `Stations.deliver`, s: an eighth of a control period;
-#: and the time from one reading to the next, whatever the simulation's speed.
-BUDGET_S, PACE_S = 0.0005, 0.002
+#: Time that one call of `Stations.receive` may take, and one of `Stations.deliver`, s: an eighth of a control period.
+BUDGET_S = 0.0005
 #: Answers that a station is sent in one call, and how many may wait: what it asks then is not heard.
 SHARE, MAX_ANSWERS = 8, 100
 #: Most stations of one kind, and the silence (s) after which one of them gives way to another.
@@ -165,7 +164,6 @@ class Stations:
         self.by_address: dict[Address, UdpStation] = {self.first: UdpStation(self._codec(), self.udp, self.first)}
         self.connected: list[TcpStation] = []
         self.from_udp = self._read_udp()
-        self.next = 0.0
 
     def _codec(self) -> Codec:
         return Codec(signer=self.signer, wanted=self.wanted)
@@ -213,10 +211,7 @@ class Stations:
 
     def receive(self) -> Iterator[Heard]:
         """What stations say to this vehicle, one message of each in turn, until nothing is left or the time is up."""
-        now = time.perf_counter()
-        if now < self.next:
-            return
-        self.next, end = now + PACE_S, now + BUDGET_S
+        end = time.perf_counter() + BUDGET_S
         self._admit()
         busy = [self.from_udp, *(station.reader for station in self.connected)]
         while busy:

@@ -7,15 +7,13 @@ import os
 import re
 import signal
 import socket
-import subprocess
-import sys
 import time
 from typing import NamedTuple
 
 from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.mavlink.link import Codec
-from tests.sitl.clients import free_port
+from tests.sitl.running import running_sitl
 from tuning.output import print_table
 
 
@@ -62,23 +60,12 @@ def flood(port, sort, seconds):
 
 def measure(sort="", seconds=10.0):
     """Run a vehicle for so long, flooded or not."""
-    port = free_port(socket.SOCK_DGRAM)
-    ports = ["--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", port, "--tcp-port", 0]
-    command = [sys.executable, "-u", "-m", "mimopilot", "sitl", "adam0", *map(str, ports)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as vehicle:
-        try:
-            while "plant connected" not in vehicle.stdout.readline():
-                pass
-            sent = 0
-            if sort:
-                sent = flood(port, sort, seconds)
-            else:
-                time.sleep(seconds)
-            vehicle.send_signal(signal.SIGINT)
-            output = vehicle.communicate(timeout=20)[0]
-        finally:
-            vehicle.kill()
-    found = re.search(r"(\d+) periods, answered within ([\d.]+) ms, (\d+) of them", output)
+    with running_sitl() as sitl:
+        sitl.until("plant connected")
+        sent = flood(sitl.local, sort, seconds) if sort else time.sleep(seconds) or 0
+        sitl.process.send_signal(signal.SIGINT)
+        sitl.until("after more than")
+    found = re.search(r"(\d+) periods, answered within ([\d.]+) ms, (\d+) of them", sitl.output)
     return Lateness(int(found[1]), float(found[2]), int(found[3]), sent)
 
 

@@ -84,7 +84,6 @@ class InTheAir:
     def turn(self):
         """One turn of the control loop's ground part."""
         now = time.monotonic()
-        self.stations.next = 0.0
         begin = time.thread_time()
         self.ground.receive(now)
         self.slowest = max(self.slowest, time.thread_time() - begin)

@@ -67,7 +67,8 @@ class Program:
         self.process.stdout.close()
 
 
-def mimopilot(*arguments, **keywords):
+def start(*arguments, **keywords):
+    """A command of ours."""
     return Program(sys.executable, "-u", "-m", "mimopilot", *arguments, **keywords)
 
 
@@ -76,8 +77,8 @@ def running_sitl(*extra, **keywords):
     """`mimopilot sitl adam0` on ports of its own; yields the program, with its `ports`."""
     udp, local, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM), free_port()
     ports = ("--ground-port", udp, "--vehicle-port", local, "--tcp-port", tcp)
-    program = mimopilot("sitl", "adam0", *ports, *extra, **keywords)
-    program.udp, program.tcp = udp, tcp
+    program = start("sitl", "adam0", *ports, *extra, **keywords)
+    program.udp, program.local, program.tcp = udp, local, tcp
     try:
         program.until("Ctrl-C ends", 120)  # a first start compiles
         yield program

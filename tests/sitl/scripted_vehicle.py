@@ -21,6 +21,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from sitl.mavlink.words import Ack, Heartbeat, Read, Refusal, Store, Value, Write
 
 SYSTEM, COMPONENT = 1, 1
+TELL_S = 0.1
 #: Faults that must end in anything but success, whatever the link does.
 FAILING = (
     *("echoes", "echoes one", "ignores", "clamps", "rounds", "out of range", "read only", "denies"),
@@ -116,6 +117,8 @@ class SimulatedLink:
         self.noise = noise
         self.log = []
         self.schedule(self.random.random(), "beat", None)
+        if hasattr(vehicle, "tell"):
+            self.schedule(0.0, "tell", None)
 
     def now(self):
         return self.time
@@ -149,6 +152,9 @@ class SimulatedLink:
             if kind == "beat":
                 self.say(self.vehicle.heartbeat())
                 self.schedule(at + 1.0, "beat", None)
+            elif kind == "tell":
+                self.say(self.vehicle.tell(at))
+                self.schedule(at + TELL_S, "tell", None)
             elif self.up and kind == "to vehicle":
                 self.say(self.vehicle.answer(message))
             elif self.up:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sitl.airframe import load_airframe
+from sitl.airframe import known_airframes, load_airframe
 from sitl.contact import FRICTION, ground_state, touch
 from sitl.plant import GRAVITY, advance, hover_state
 from sitl.sensors import euler_angles
@@ -16,12 +16,12 @@ STILL = 1e-7  # m, m/s, rad/s
 HOVER = PLANT.mass * GRAVITY / (4 * PLANT.thrust_max)
 
 
-def fly(state, commands, seconds):
+def fly(state, commands, seconds, plant=PLANT):
     """Fly with the ground below; returns the states and the speeds at which feet came down."""
     states, speeds = [state.copy()], []
     for _ in range(round(seconds / TS)):
-        advance(state, np.asarray(commands, np.float32), PLANT, STEPS, TS / STEPS)
-        speeds.append(touch(state, PLANT, TS))
+        advance(state, np.asarray(commands, np.float32), plant, STEPS, TS / STEPS)
+        speeds.append(touch(state, plant, TS))
         states.append(state.copy())
     return np.array(states), np.array(speeds)
 
@@ -35,13 +35,15 @@ def energy_of_motion(state):
     return 0.5 * PLANT.mass * state[3:6] @ state[3:6] + 0.5 * state[10:13] @ J @ state[10:13]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
-def test_it_stands_still_on_the_ground_until_its_rotors_carry_it(share):
-    states, _ = fly(ground_state(PLANT), [share * HOVER] * 4, 10.0)
-    assert np.abs(states[:, :3]).max() < STILL
-    assert np.abs(states[:, 3:6]).max() < STILL
+@pytest.mark.parametrize(("name", "share"), [("adam0", 0.98), *((name, 0.5) for name in known_airframes())])
+def test_it_stands_still_on_the_ground_until_its_rotors_carry_it(name, share):
+    plant = load_airframe(name).airframe.plant()
+    hover = plant.mass * GRAVITY / (len(plant.rotors) * plant.thrust_max)
+    states, _ = fly(ground_state(plant), [share * hover] * len(plant.rotors), 10.0, plant)
+    assert np.abs(states[:, 2:6]).max() < STILL
+    assert np.abs(states[:, 7:9]).max() < STILL
     assert np.abs(states[:, 10:13]).max() < STILL
-    assert np.abs(states[:, 6:10] - [1, 0, 0, 0]).max() < STILL
+    assert np.abs(states[:, [0, 1, 9]]).max() < 1e-5  # m, and twice that in rad: nothing pulls it back
 
 
 def test_more_thrust_than_weight_takes_off():

@@ -125,10 +125,10 @@ def test_an_autopilot_that_boots_gets_a_running_clock_and_a_vehicle_that_waits()
     assert len(gyro) > 100  # its sensors are alive
     assert bench.vehicle.flown == 0
     pilot.frames.clear()
-    pilot.fly(200, 0.6)  # now it answers frame by frame, those first that have waited
+    while bench.vehicle.flown < 100:  # now it answers frame by frame, those first that have waited
+        assert pilot.fly(1, 0.6)[0] < stamps[-1] + 10_000_000
     stamps = [fields[0] for kind, fields in pilot.frames if kind is STATE]
     assert {b - a for a, b in pairwise(stamps)} == {4000}
-    assert 150 < bench.vehicle.flown <= 200
     pilot.close()
 
 
@@ -336,7 +336,8 @@ def test_a_board_on_a_serial_port_flies_in_real_time_and_its_silence_and_loss_ar
     begin, first = time.monotonic(), board.sensors[-1][0]
     time.sleep(1.0)
     elapsed, passed = time.monotonic() - begin, (board.sensors[-1][0] - first) / 1e6
-    assert passed == pytest.approx(elapsed, abs=0.15)
+    left_out = sum(float(line.split()[2]) for line in told if line.startswith("late by"))
+    assert passed + left_out == pytest.approx(elapsed, abs=0.15)
     assert vehicle.flown == 0  # held until the board speaks
     assert board.kinds == {SENSOR, GPS, mavlink.MAVLink_heartbeat_message}
     board.command = 0.6

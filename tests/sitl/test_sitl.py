@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+import socket
 import sys
 import threading
 import time
@@ -16,7 +17,7 @@ from pyulog import ULog
 from codegen.parameters import EXCITATION, IDENTITY, PARAMETERS
 from sitl.mavlink.flight_modes import custom_mode
 from sitl.modes import Mode
-from tests.sitl.running import Pilot, Program, free_port, mimopilot, running_sitl
+from tests.sitl.running import Pilot, Program, free_port, running_sitl, start
 
 ARM, TAKEOFF, LAND, SET_MODE = 400, 22, 21, 176
 ACCEPTED, TEMPORARILY_REJECTED = 0, 1
@@ -115,6 +116,21 @@ def test_a_plant_that_is_killed_in_flight_is_told_within_a_second_and_comes_back
     assert (tmp_path / "f-2.ulg").is_file()  # and what was on the way when it ended
 
 
+def test_a_scenario_is_flown_from_the_ground_to_the_ground_and_equal_seeds_give_equal_logs(mimopilot, tmp_path):
+    links = ("--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", 0, "--tcp-port", 0)
+    scenario = ("--scenario", "doublet", "--axis", "pitch", "--amplitude-deg", 15, "--speed", "max")
+    for name, seed in (("a.ulg", 3), ("b.ulg", 3), ("c.ulg", 4)):
+        result = mimopilot("sitl", "adam0", *links, *scenario, "--seed", seed, "--log", name)
+        assert result.returncode == 0, result.stderr
+        assert "disarmed: landed" in result.stdout
+    a, b, c = ((tmp_path / name).read_bytes() for name in ("a.ulg", "b.ulg", "c.ulg"))
+    assert a == b
+    assert a != c
+    attitude = ULog(str(tmp_path / "a.ulg")).get_dataset("vehicle_attitude_setpoint").data
+    pitch = np.degrees(2 * np.arcsin(attitude["q_d[2]"]))
+    assert (pitch.max(), pitch.min()) == (pytest.approx(15.0, abs=0.01), pytest.approx(-15.0, abs=0.01))
+
+
 def children(parent):
     found = []
     for stat in Path("/proc").glob("[0-9]*/stat"):
@@ -168,7 +184,7 @@ def test_somebody_elses_plant_is_waited_for_and_found_again():
         pilot.hears("no plant is connected")
         for _ in range(2):
             pilot.texts.clear()
-            plant = mimopilot("plant", "adam0", "--port", port)
+            plant = start("plant", "adam0", "--port", port)
             pilot.hears("plant connected")
             pilot.ready()
             plant.process.kill()
