@@ -16,21 +16,8 @@ from sitl.airframe import FOLDER
 from tests.conftest import assert_one_clear_line
 
 COMMANDS = [
-    *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise"),
-    *(
-        "generate",
-        "pil",
-        "fly",
-        "faults",
-        "campaign",
-        "replay",
-        "sitl",
-        "plant",
-        "convert",
-        "upload",
-        "restore",
-        "params",
-    ),
+    *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
+    *("fly", "faults", "campaign", "replay", "sitl", "plant", "convert", "upload", "restore", "params"),
 ]
 
 

@@ -60,8 +60,8 @@ def write_campaign_report(results: Results, summary: Summary, over: tuple[str, s
         Section("Summary", INTERVALS, tables=tables),
         Section(
             "Responses",
-            f"True angles of those of the first {min(d.runs, figures.ENVELOPE_RUNS)} runs that survived, and of the worst "
-            "run of all.",
+            f"True angles of those of the first {min(d.runs, figures.ENVELOPE_RUNS)} runs that survived, and of the "
+            "worst run of all.",
             figures=envelopes,
         ),
         Section(
