@@ -328,6 +328,7 @@ def sitl(
     period_s: PeriodOption = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
+    from sitl.errors import SitlError
     from sitl.faults import parse_fault
     from sitl.mavlink.sitl_console import Options, run
 
@@ -336,6 +337,8 @@ def sitl(
     if scenario is not None:
         task = scenario_of(scenario, axis, amplitude_deg, period_s, None, fault, controller.Ts)
         faults = task.faults
+    if plant and (port, speed, seed) != (0, "1", 0):
+        raise SitlError("--port, --speed and --seed belong to the plant: with --plant, say them where it was started")
     address = _address(plant) if plant else None
     links = (ground_port, vehicle_port, tcp_port, bind, signing_key)
     run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log, task, faults))

@@ -32,6 +32,7 @@ from sitl.scenario import doublet, excitation_flight
 from sitl.studies.faults import standard_faults
 from tests.bench_campaign import campaign_rows, rotorpy_rows
 from tests.bench_tuning import best, tuning_rows
+from tests.sitl import flood
 from tests.sitl.scripted_vehicle import ScriptedVehicle, UdpVehicle
 from tuning.controller import Controller
 from tuning.logs.reader import read_log
@@ -158,6 +159,7 @@ def main() -> None:
             slowest = max(upload_seconds(round_trip) for _ in range(3))
             title = f"upload of 25 parameters, verified and stored, round trip {round_trip * 1e3:.0f} ms"
             rows.append([title, f"{slowest:.2f} s", limit])
+        rows += flood.rows()
     print_table("mimopilot bench", ["what", "figure", "beside"], rows)
 
 

@@ -22,7 +22,8 @@ IN_AIR = 2  # MAV_LANDED_STATE
 #: Message -> (number, interval in us): what the vehicle is asked to tell.
 TELL = {"ATTITUDE": (30, 50_000), "DEBUG_VECT": (250, 100_000), "EXTENDED_SYS_STATE": (245, 200_000)}
 SEEN_S, ASK_AGAIN_S = 5.0, 1.0  # how long these are waited for
-BEGIN_S = 5.0  # from the write to the first pulse: PX4 takes up parameters once a second
+TAKEN_UP_S = 1.5  # a PX4 takes up parameters once a second
+BEGIN_S = 5.0  # from the write to the first pulse
 SILENT_S = 1.0  # without one of these
 DEAF_S = 5.0  # without HEARTBEAT, which comes once a second and may be lost
 MARGIN_S = 10.0  # beyond the planned end
@@ -166,6 +167,9 @@ def excite(talk: Conversation, sights: Sights, wanted: Mapping[str, float]) -> S
         raise SitlError(f"the vehicle excites already: set {AXIS} to 0 first; nothing was written", exit_code=1)
     if old[AXIS] != 0:  # left from an earlier flight; it must not be put back, which would start another
         yield from talk.tell({AXIS: 0.0}, "reading")
+        seen = talk.now + TAKEN_UP_S
+        while talk.now < seen:
+            yield from talk.turn([], seen)
         old = yield from read(talk, NAMES)
     new = {**wanted, AXIS: old[AXIS]}
     outcome = yield from apply(talk, new, old, store=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from sitl.airframe import Airframe
 from sitl.autopilot import RECORD
+from sitl.errors import SitlError
 from sitl.modes import Vehicle
 from sitl.recorder import vehicle_log
 from tuning.files import write_atomically
@@ -28,9 +30,17 @@ class FlightLog:
         The vehicle.
     Ts : float, s
         Control period.
+
+    Raises
+    ------
+    SitlError
+        When nothing can be written there.
     """
 
     def __init__(self, path: Path, airframe: Airframe, Ts: float) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir() or not os.access(path.parent, os.W_OK):
+            raise SitlError(f"--log {path}: a file cannot be written there")
         self.path, self.airframe, self.Ts = path, airframe, Ts
         self.flights = 0
         self._spare: NDArray[Any] = np.zeros(1, RECORD)

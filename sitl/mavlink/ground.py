@@ -69,7 +69,8 @@ class Ground:
                 self.stations.post(answer, None if for_all else station)
 
     def say(self, severity: Severity, text: str) -> None:
-        """STATUSTEXT to all."""
+        """STATUSTEXT to all; what is worth a word has most often changed the heartbeat, too."""
+        self.telemetry.hurry(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
         self._texts = self._texts % 65535 + 1
         for piece in texts(severity, text, self._texts):
             self.stations.post(piece)

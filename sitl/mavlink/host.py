@@ -68,6 +68,7 @@ class Host:
 
     def __init__(self, autopilot: Autopilot, plant: PlantLink, log: FlightLog | None = None) -> None:
         self.autopilot, self.plant, self.log = autopilot, plant, log
+        autopilot.controls["armed"] = 0
         self.vehicle = Vehicle(autopilot.hover)
         self.vehicle.obstacles["plant"] = "no plant is connected"
         self.situation = Situation(self.vehicle)
@@ -227,9 +228,13 @@ class Host:
             return
         if armed:
             self.log.begin(self.autopilot.controller.state["gains"][0])
-        elif (path := self.log.save()) is not None:
-            self.lateness.nothing_waits(0.0, time.monotonic())  # writing is not counted: nothing flies
-            self.vehicle.say(Severity.INFO, f"logged: {path.name}")
+            return
+        try:
+            path = self.log.save()
+            self.vehicle.say(Severity.INFO, f"logged: {path.name if path else 'nothing'}")
+        except OSError as error:
+            self.vehicle.say(Severity.CRITICAL, f"not logged: {error.filename}: {error.strerror}")
+        self.lateness.nothing_waits(0.0, time.monotonic())  # writing is not counted: nothing flies
 
     def _examine(self, fault: int) -> None:
         """What forbids arming and only we know."""

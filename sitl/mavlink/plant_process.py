@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from sitl.errors import SitlError
 from sitl.faults import Fault
 
-START_SECONDS = 60.0
+START_SECONDS = 120.0  # the first time everything is compiled
 
 
 class PlantProcess:

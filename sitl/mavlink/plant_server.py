@@ -3,7 +3,8 @@
 Each period the plant sends its messages, waits for HIL_ACTUATOR_CONTROLS, and only then steps. Until an autopilot
 has answered for the first time the vehicle is held at its start. The first frame is repeated, because an autopilot
 may miss it; one that says something else first (PX4 sends HEARTBEAT, boots for seconds, and needs the clock to run
-for that) gets new frames in real time.
+for that) gets new frames in real time. So does one that is disarmed and does not answer: without a rate controller PX4
+has nothing to say, and waits for the clock.
 """
 
 from __future__ import annotations
@@ -13,16 +14,19 @@ import select
 import socket
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
+from sitl.autopilot import MAX_ROTORS
 from sitl.mavlink.lean import ACTUATORS, SPIN_S, Message, receive
-from sitl.mavlink.simulator import FORGET_S, SimulatedVehicle
+from sitl.mavlink.simulator import ARMED, FORGET_S, SimulatedVehicle
 
 FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is answered
 LOOK_S = 0.2  # between looks at everything but the autopilot
 FROZEN_S = 1.0  # without an answer
 MUTE_S = 10.0  # without the first one
 LOCKSTEP = 1  # flag of HIL_ACTUATOR_CONTROLS
+NO_CONTROLS = (0.0,) * MAX_ROTORS
 
 
 class ParentGoneError(Exception):
@@ -113,6 +117,7 @@ class Lockstep:
     def __init__(self, server: PlantServer, connection: socket.socket) -> None:
         self.server, self.vehicle, self.connection = server, server.vehicle, connection
         self.spin = SPIN_S if server.speed is None else 0.0
+        self.begin = time.monotonic()
         self.told: set[str] = set()
         connection.setblocking(False)
 
@@ -140,54 +145,75 @@ class Lockstep:
             messages = vehicle.messages()
             if vehicle.copies:
                 self.connection.sendall(messages * vehicle.copies)
-                answer = self._answer()
+                answer = self._answer(armed=bool(answer[18] & ARMED))
 
     def _first_answer(self) -> tuple[Any, ...]:
         """Offer the start until it is answered."""
-        vehicle = self.vehicle
-        begin = time.monotonic()
-        booting = False
-        frame = vehicle.messages()
-        self.connection.sendall(frame)
-        pace = vehicle.Ts / (self.server.speed or 1.0)
-        due = begin + FIRST_ANSWER_S
-        while True:
+        frame, booting, due = self.vehicle.messages(), False, 0.0
+        while not booting:
+            if time.monotonic() >= due:
+                self._send(frame)
+                due = time.monotonic() + FIRST_ANSWER_S
             for kind, fields in self._receive(due):
                 if kind is not ACTUATORS:
                     booting = True
-                elif not fields[1] & LOCKSTEP:
-                    self._tell_once("motor commands came without the lockstep flag: the autopilot must keep lockstep")
-                elif fields[0] >= vehicle.stamp:
+                elif self._in_time(fields):
                     return fields
-            now = time.monotonic()
-            if now > begin + MUTE_S:
-                self._tell_once(f"no HIL_ACTUATOR_CONTROLS in {MUTE_S:g} s: is that an autopilot in simulation?")
-            if now >= due:
-                if booting:
-                    vehicle.stand()
-                    frame = vehicle.messages()
-                due = max(due, now - FORGET_S) + (pace if booting else FIRST_ANSWER_S)
-                if select.select([], [self.connection], [], 0)[1]:  # it may not read for as long as it boots
-                    self.connection.sendall(frame)
+            self._ask()
+        return self._run_on(self.vehicle.stand)
 
-    def _answer(self) -> tuple[Any, ...]:
-        """Wait for the commands of this period; answers to older frames are passed over."""
+    def _answer(self, armed: bool) -> tuple[Any, ...]:
+        """Wait for the commands of this period."""
         since = time.monotonic()
-        frozen = False
+        if (fields := self._wait(since + FROZEN_S)) is not None:
+            return fields
+        what = "time stands still until it does" if armed else "it is disarmed: time runs on, the motors stand"
+        when = f"at {self.vehicle.seconds:.2f} s of flight"
+        self.vehicle.tell(f"the autopilot has not answered for {FROZEN_S:g} s, {when}; {what}")
+        if armed:
+            while (fields := self._wait(time.monotonic() + LOOK_S)) is None:
+                pass
+        else:
+            fields = self._run_on(lambda: self.vehicle.fly(NO_CONTROLS, 0))
+        self.vehicle.tell(f"the autopilot answers again, after {time.monotonic() - since:.1f} s")
+        return fields
+
+    def _run_on(self, pass_period: Callable[[], None]) -> tuple[Any, ...]:
+        """Let time run at its pace until a frame is answered before the next: PX4 waits for the clock, not for us."""
+        pace = self.vehicle.Ts / (self.server.speed or 1.0)
+        due = time.monotonic()
         while True:
-            until = time.monotonic() + LOOK_S if frozen else since + FROZEN_S
+            due = max(due, time.monotonic() - FORGET_S) + pace
+            if (fields := self._wait(due)) is not None:
+                return fields
+            self._ask()
+            pass_period()
+            self._send(self.vehicle.messages())
+
+    def _wait(self, until: float) -> tuple[Any, ...] | None:
+        """The answer to the last frame, as soon as it comes; None when the time is over. Older ones are passed over."""
+        while True:
             for kind, fields in self._receive(until):
-                if kind is ACTUATORS and fields[0] >= self.vehicle.stamp:
-                    if frozen:
-                        waited = time.monotonic() - since
-                        self.vehicle.tell(f"the autopilot answers again, after {waited:.1f} s")
+                if kind is ACTUATORS and self._in_time(fields):
                     return fields
-            if not frozen and time.monotonic() >= since + FROZEN_S:
-                frozen = True
-                self.vehicle.tell(
-                    f"the autopilot has not answered for {FROZEN_S:g} s, at {self.vehicle.seconds:.2f} s of flight; "
-                    "time stands still until it does"
-                )
+            if time.monotonic() >= until:
+                return None
+
+    def _in_time(self, fields: tuple[Any, ...]) -> bool:
+        if not fields[1] & LOCKSTEP:
+            self._tell_once("motor commands came without the lockstep flag: the autopilot must keep lockstep")
+            return False
+        stamp: int = fields[0]
+        return stamp >= self.vehicle.stamp
+
+    def _send(self, data: bytes) -> None:
+        """Send to an autopilot that may not read for as long as it boots."""
+        if select.select([], [self.connection], [], 0)[1]:
+            self.connection.sendall(data)
+
+    def _ask(self) -> None:
+        if self.vehicle.flown == 0 and time.monotonic() > self.begin + MUTE_S:
+            self._tell_once(f"no HIL_ACTUATOR_CONTROLS in {MUTE_S:g} s: is that an autopilot in simulation?")
 
     def _receive(self, until: float) -> list[Message]:
         """What came, as soon as something comes; nothing when the time is over."""

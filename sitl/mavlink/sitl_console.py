@@ -108,6 +108,8 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
     signer = Signer(read_key(key)) if key else None
     stations = Stations(options.ground_port, options.vehicle_port, options.tcp_port, options.bind, signer)
     leaving.callback(stations.close)
+    if stations.exposed:
+        print("warning: whoever reaches this address commands the vehicle; give --signing-key to ask for a key")
     child = PlantProcess(options.name, options.port, gains.Ts, options.seed, options.speed, faults=outside)
     link = PlantLink(options.plant or child)
     leaving.callback(link.close)
@@ -118,6 +120,7 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
     autopilot.warm_up()
     log = FlightLog(options.log, options.airframe, gains.Ts) if options.log else None
     host = Host(autopilot, link, log)
+    leaving.callback(host.leave)
     if len(options.faults) > len(outside):
         host.faults = AutopilotFaults(options.faults, gains.Ts, autopilot)
     telemetry = Telemetry(host.situation)

@@ -6,6 +6,7 @@ slow reader is bounded in size, and a frame is only read when it is for this veh
 
 from __future__ import annotations
 
+import ipaddress
 import socket
 import time
 from collections import deque
@@ -167,6 +168,12 @@ class Stations:
 
     def _codec(self) -> Codec:
         return Codec(signer=self.signer, wanted=self.wanted)
+
+    @property
+    def exposed(self) -> bool:
+        """Whether other machines can reach them, and nothing asks who they are."""
+        address = ipaddress.ip_address(self.udp.getsockname()[0])
+        return self.signer is None and not address.is_loopback
 
     def __str__(self) -> str:
         """Where they find the vehicle."""

@@ -37,6 +37,11 @@ class Telemetry:
         if rate > 0:
             self.due[number] = self.next = 0.0
 
+    def hurry(self, number: int) -> None:
+        """Send a message at once that is sent anyway: something has changed."""
+        if number in self.due:
+            self.due[number] = self.next = 0.0
+
     def set_stream(self, stream: int, rate: float) -> None:
         """The same for all messages of a data stream; stream 0 is all of them."""
         for number, topic in TOPICS.items():

@@ -69,14 +69,18 @@ def measure(sort="", seconds=10.0):
     return Lateness(int(found[1]), float(found[2]), int(found[3]), sent)
 
 
-def main():
-    rows = []
+def rows():
+    """A row for each sort of flood, and one without."""
+    found = []
     for sort in ("", *SORTS):
-        found = measure(sort)
-        rows.append(
-            [sort or "calm", f"{found.sent / 10:.0f}", str(found.periods), f"{found.worst_ms:.2f}", str(found.late)]
-        )
-    print_table("10 s of real time", ["flood", "datagrams/s", "periods", "worst [ms]", "later than 1 ms"], rows)
+        seen = measure(sort)
+        title = f"control loop, 10 s of real time, {f'{seen.sent / 10:.0f} datagrams/s of {sort}' if sort else 'calm'}"
+        found.append([title, f"{seen.worst_ms:.1f} ms late at worst", f"{seen.late} of {seen.periods} above 1 ms"])
+    return found
+
+
+def main():
+    print_table("Flood from a ground station", ["what", "figure", "beside"], rows())
     print(f"load of this machine, {os.cpu_count()} cores: {os.getloadavg()[0]:.1f}")
 
 

@@ -201,6 +201,24 @@ def test_a_frozen_autopilot_is_told_once_and_kept(bench):
     pilot.close()
 
 
+def test_a_disarmed_autopilot_that_stops_answering_gets_a_running_clock(bench):
+    pilot = Pilot(bench.port)
+    for _ in range(100):
+        state = pilot.frame()
+        pilot.answer(state[0], mode=0)
+    begin, first = time.monotonic(), pilot.frame()[0]
+    bench.until_told("it is disarmed: time runs on", 2)
+    while (state := pilot.frame())[0] < first + 1_000_000:
+        pass
+    assert 1.9 < time.monotonic() - begin < 3.5  # one second of patience, one of real time
+    assert state[10] == 0
+    while not any("answers again" in line for line in bench.told):
+        pilot.answer(pilot.frame()[0])
+    stamps = [pilot.fly(1, 0.6)[0] for _ in range(50)]
+    assert {b - a for a, b in pairwise(stamps)} == {4000}
+    pilot.close()
+
+
 def test_garbage_and_other_messages_are_passed_over_told_once_and_stall_nothing(bench):
     pilot = Pilot(bench.port)
     pilot.fly(50, 0.6)

@@ -45,7 +45,7 @@ class Sender:
 
 
 def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logged(tmp_path):
-    with running_sitl("--speed", "4", "--log", tmp_path / "flight.ulg") as sitl:
+    with running_sitl("--speed", "2", "--log", tmp_path / "flight.ulg") as sitl:
         pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
         assert not pilot.armed()
         pilot.ready()
@@ -62,18 +62,11 @@ def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logg
         sender = Sender(pilot, 0.01)
         time.sleep(0.1)
         assert pilot.command(SET_MODE, 1, 6) == ACCEPTED
-        rolls = []
         pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, 10_000)
         for roll in (0.3, -0.3, 0.0):
             sender.roll = roll
-            end = time.monotonic() + 0.2
-            while time.monotonic() < end:
-                message = pilot.take()
-                if message is not None and message.get_type() == "ATTITUDE":
-                    rolls.append(message.roll)
+            pilot.wait(lambda roll=roll: abs(pilot.asks("ATTITUDE").roll - roll) < 0.05)
         sender.stop()
-        assert max(rolls) > 0.2
-        assert min(rolls) < -0.2
         # Nobody steers any more: level, then down.
         pilot.hears("no set-points for 0.5 s: level")
         pilot.hears("no set-points for 2.5 s: landing")
@@ -162,7 +155,7 @@ def test_a_host_that_is_killed_leaves_no_plant_behind():
         (plant,) = children(sitl.process.pid)
         sitl.process.kill()
         sitl.process.wait()
-        assert gone(plant, 2.0)
+        assert gone(plant, 10.0)
 
 
 def test_ctrl_c_ends_both_processes_and_says_how_late_the_loop_was():
@@ -172,7 +165,7 @@ def test_ctrl_c_ends_both_processes_and_says_how_late_the_loop_was():
         sitl.process.send_signal(signal.SIGINT)
         assert sitl.process.wait(timeout=10) == 0
         sitl.until("answered within")
-        assert gone(plant, 2.0)
+        assert gone(plant, 10.0)
 
 
 def test_somebody_elses_plant_is_waited_for_and_found_again():

@@ -72,7 +72,23 @@ def test_qgroundcontrols_start_sequence_is_answered_without_a_wait(pilot):
 def test_a_plant_port_in_use_is_one_clear_line(mimopilot):
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
-        free = ("--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", free_port(socket.SOCK_DGRAM))
+        free = ("--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", 0, "--tcp-port", 0)
         in_use = mimopilot("sitl", "adam0", "--port", port, *free)
         assert_one_clear_line(in_use, f"TCP port {port}", "--port")
         assert_one_clear_line(mimopilot("plant", "adam0", "--port", port), f"TCP port {port}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--speed", "fast"), ("--speed fast", "or max")),
+        (("--speed", "nan"), ("--speed nan",)),
+        (("--plant", "here"), ("--plant here", "HOST:PORT")),
+        (("--plant", "127.0.0.1:4560", "--speed", "max"), ("--speed", "belong to the plant")),
+        (("--scenario", "spin"), ("scenario: got 'spin'",)),
+        (("--log", "."), ("--log .", "cannot be written")),
+    ],
+)
+def test_mistakes_are_one_clear_line(mimopilot, arguments, words):
+    links = ("--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", 0, "--tcp-port", 0)
+    assert_one_clear_line(mimopilot("sitl", "adam0", *links, *arguments), *words)
