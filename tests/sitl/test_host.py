@@ -21,7 +21,7 @@ class FakePlant:
     def __init__(self):
         self.server = socket.create_server(("127.0.0.1", 0))
         self.port = self.server.getsockname()[1]
-        self.stamp, self.step = 1_000_000, TS_US
+        self.stamp, self.step = 10_000_000, TS_US
         self.silent = self.nonsense = self.over = False
         self.answers = []
         self.thread = threading.Thread(target=self._run)
@@ -104,5 +104,5 @@ def test_what_a_plant_does_is_noticed_told_and_survived(bench):
     # It runs at another rate than the gains are for.
     plant.step = 5000
     pilot.hears("ms, the gains are for 4 ms")
-    time.sleep(1.5)
-    refused("not armed: the plant's period is 5 ms, the gains are for 4 ms")
+    reason = "not armed: the plant's period is 5 ms, the gains are for 4 ms"
+    pilot.wait(lambda: pilot.command(400, 1) and reason in pilot.texts)
