@@ -7,6 +7,7 @@ import sys
 import typer
 
 import codegen.commands
+import sitl.campaign.commands
 import sitl.commands
 import sitl.mavlink.commands
 import sitl.studies.commands
@@ -23,7 +24,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for commands in (sitl.studies.commands, sitl.commands, tuning.commands, codegen.commands, sitl.mavlink.commands):
+for commands in (
+    sitl.studies.commands,
+    sitl.commands,
+    sitl.campaign.commands,
+    tuning.commands,
+    codegen.commands,
+    sitl.mavlink.commands,
+):
     commands.register(app)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -189,6 +190,19 @@ class Vehicle:
         beside, shipped = self.path.parent / self.airframe.gains, FOLDER / self.airframe.gains
         return load_gains(shipped if shipped.is_file() and not beside.is_file() else beside)
 
+    def gain_sets(self, files: Sequence[Path]) -> dict[str, Gains]:
+        """Gains files by their names, without the ending; `default_gains` when there are none.
+
+        Raises
+        ------
+        SitlError
+            When two have the same name.
+        """
+        names = [path.name.removesuffix(".toml").removesuffix(".gains") for path in files]
+        if len(set(names)) < len(names):
+            raise SitlError(f"--gains: two files have the same name ({', '.join(names)}); rename one")
+        return dict(zip(names, map(load_gains, files), strict=True)) or {"default": self.default_gains()}
+
 
 def known_airframes() -> list[str]:
     """Names of the airframes that come with mimopilot."""
@@ -211,16 +225,25 @@ def load_airframe(name_or_path: str) -> Vehicle:
                 f"unknown airframe {name_or_path!r}: neither a file nor one of {', '.join(known_airframes())}"
             )
     try:
-        airframe = Airframe.model_validate(tomllib.loads(path.read_text()))
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise SitlError(f"{path}: not an airframe file: {error}") from error
+    return Vehicle(airframe_from_toml(text, str(path)), path)
+
+
+def airframe_from_toml(text: str, where: str) -> Airframe:
+    """Parse the text of an airframe's file; `where` names it in messages. See `load_airframe`."""
+    try:
+        airframe = Airframe.model_validate(tomllib.loads(text))
         checked_inertia(airframe.inertia)
         airframe.allocation()
         _check_flies(airframe)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SitlError(f"{path}: not an airframe file: {error}") from error
+    except tomllib.TOMLDecodeError as error:
+        raise SitlError(f"{where}: not an airframe file: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise SitlError(f"{path}: {where}: {first['msg']}, got {first.get('input')!r}") from error
+        place = ".".join(str(part) for part in first["loc"])
+        raise SitlError(f"{where}: {place}: {first['msg']}, got {first.get('input')!r}") from error
     except SitlError as error:
-        raise SitlError(f"{path}: {error}") from error
-    return Vehicle(airframe, path)
+        raise SitlError(f"{where}: {error}") from error
+    return airframe

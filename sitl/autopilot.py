@@ -127,6 +127,12 @@ class Autopilot:
         self.controls: NDArray[Any] = np.zeros(1, INPUT)
         self.controls["armed"] = 1
         self.outputs: NDArray[Any] = np.zeros(1, OUTPUT)
+        self._fresh = self.controller.state.copy()
+
+    def restart(self) -> None:
+        """As it was when it was made, for another flight."""
+        self.controller.state[:] = self._fresh
+        self.controls["saturation"] = 0
 
     def warm_up(self) -> None:
         """Compile `tick` now, so that the first period in flight is no slower than the others."""

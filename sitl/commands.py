@@ -12,10 +12,17 @@ AirframeArgument = Annotated[
     str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file.")
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
+FaultOption = Annotated[
+    list[str] | None,
+    typer.Option("--fault", help="KIND[:TARGET][=SIZE]@AT[+DURATION], seconds; see mimopilot faults --kinds."),
+]
+AxisOption = Annotated[str | None, typer.Option(help="roll or pitch.", show_default="roll")]
+AmplitudeOption = Annotated[float | None, typer.Option(help="Of the doublet or step, degrees.", show_default="22.5")]
+PeriodOption = Annotated[
+    float | None, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.", show_default="0.42")
+]
+TailOption = Annotated[float | None, typer.Option(help="Level flight after a doublet, s.", show_default="1.5")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
-AxisOption = Annotated[str, typer.Option(help="roll or pitch.")]
-AmplitudeOption = Annotated[float, typer.Option(help="Of the doublet or step, degrees.")]
-PeriodOption = Annotated[float, typer.Option(help="Length of the whole doublet, of the step or of the hover, s.")]
 SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast as it goes.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
@@ -26,10 +33,19 @@ UNITS = {
     "J_M_i": "J_M,i [rad^2/s^2]",
     "J_r_o": "J_r,o [rad^2]",
     "J_r_i": "J_r,i [rad^2/s^2]",
+    "peak_deg": "peak [deg]",
     "offaxis_peak_deg": "off-axis peak [deg]",
     "offaxis_rms_deg": "off-axis RMS [deg]",
     "effort_rms": "effort, RMS of u [-]",
+    "saturated": "saturated samples",
     "crashed_at_s": "lost at [s]",
+    "deviation_peak_deg": "peak, from the flight without faults [deg]",
+    "deviation_rms_deg": "RMS, from the same [deg]",
+    "saturated_since": "saturated samples since the fault",
+    "recovery_s": "recovered after [s]",
+    "detected_s": "detected after [s]",
+    "detected_by": "detected by",
+    "nonfinite": "non-finite outputs",
 }
 
 
@@ -67,9 +83,16 @@ def _load(airframe: str, gains: Path | None) -> tuple[Any, Any]:
     return vehicle.airframe, load_gains(gains) if gains else vehicle.default_gains()
 
 
+def _text(value: Any) -> str:
+    """A figure in a table."""
+    return "-" if value in (None, "") else value if isinstance(value, str) else f"{value:.5g}"
+
+
 def experiment(
     airframe: Annotated[str | None, typer.Argument(help="Airframe to simulate; or give --connect.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Log to write (ULog, .ulg); of a simulated flight.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Log to write (ULog, .ulg), of a simulated flight; a folder for --runs.")
+    ] = None,
     connect: Annotated[
         str | None, typer.Option(help="Link to a vehicle that hovers under our controller; see upload.")
     ] = None,
@@ -79,6 +102,13 @@ def experiment(
     amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
     bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,
     seed: SeedOption = 0,
+    runs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Fly it so many times, seed by seed: flight-SEED.ulg, for tune --campaign."),
+    ] = None,
+    excitation_seed: Annotated[
+        int | None, typer.Option(min=0, help="Inject the same moment in every run; by default each has its own.")
+    ] = None,
     mode: Annotated[
         str, typer.Option(help="Flight mode to excite in: hold, position, altitude, offboard; with --connect.")
     ] = "hold",
@@ -101,10 +131,14 @@ def experiment(
     if airframe is not None:
         if out is None:
             raise SitlError("--out: name the log to write, FILE.ulg")
-        _simulated_experiment(airframe, out, gains, seconds_per_axis, amplitude, bandwidth, seed)
+        plan = (seconds_per_axis, amplitude, bandwidth, excitation_seed)
+        _simulated_experiment(airframe, out, gains, plan, seed, runs)
         return
-    if out is not None or gains is not None:
-        raise SitlError("--out, --gains: are of a simulated flight; a vehicle has its gains and writes its own log")
+    if (out, gains, runs, excitation_seed) != (None,) * 4:
+        raise SitlError(
+            "--out, --gains, --runs, --excitation-seed: are of a simulated flight; a vehicle has its gains and writes "
+            "its own log"
+        )
     from sitl.mavlink.experiment_console import Choice
     from sitl.mavlink.experiment_console import experiment as fly_experiment
     from sitl.mavlink.session import Options
@@ -114,40 +148,84 @@ def experiment(
 
 
 def _simulated_experiment(
-    airframe: str, out: Path, gains: Path | None, seconds: float, amplitude: float, bandwidth: float, seed: int
+    airframe: str,
+    out: Path,
+    gains: Path | None,
+    excitation: tuple[float, float, float, int | None],
+    seed: int,
+    runs: int | None,
 ) -> None:
     import numpy as np
 
-    from sitl.autopilot import Autopilot
     from sitl.errors import SitlError
-    from sitl.loop import fly as fly_scenario
-    from sitl.recorder import save_flight
-    from sitl.scenario import excitation_flight
+    from sitl.experiments import ExperimentPlan, repeat_experiment
 
     body, controller = _load(airframe, gains)
-    scenario = excitation_flight(seconds, amplitude, bandwidth, controller.Ts, np.random.default_rng(seed))
-    flight = fly_scenario(body, Autopilot(body, controller), scenario, seed)
-    save_flight(out, flight, body, controller)
+    plan = ExperimentPlan(body, controller, *excitation)
+    if runs is not None:
+        from rich.progress import Progress
+
+        from tuning.output import progress_console
+        from tuning.parallel import cores
+
+        with Progress(console=progress_console(), transient=True) as bar:
+            task = bar.add_task("flying", total=runs)
+            lost = repeat_experiment(plan, out, range(seed, seed + runs), cores(), lambda: bar.advance(task))
+        print(f"{out}: {runs} logs of {2 * excitation[0]:.1f} s")
+        if lost:
+            names = ", ".join(f"{one} at {when:.2f} s" for one, when in list(lost.items())[:5])
+            raise SitlError(f"{len(lost)} of {runs} vehicles were lost (seed {names}); lower --amplitude", exit_code=1)
+        return
+    flight = plan.record(out, seed)
     tilt = np.degrees(np.abs(flight.truth["attitude"][:, :2]).max(axis=0))
     print(f"{out}: {len(flight.record) * controller.Ts:.1f} s, largest roll {tilt[0]:.1f} deg, pitch {tilt[1]:.1f} deg")
     if flight.crashed_at is not None:
         raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s; lower --amplitude", exit_code=1)
 
 
+def scenario_of(
+    name: str,
+    axis: str | None,
+    amplitude_deg: float | None,
+    period_s: float | None,
+    tail_s: float | None,
+    faults: list[str] | None,
+    Ts: float,
+) -> Any:
+    """The scenario that the options of a command ask for, with its faults."""
+    from dataclasses import replace
+
+    from sitl.errors import SitlError
+    from sitl.faults import parse_fault
+    from sitl.scenario import AMPLITUDE_DEG, PERIOD_S, TAIL_S, load_scenario, make_scenario
+
+    if name.endswith(".toml"):
+        if (axis, amplitude_deg, period_s, tail_s) != (None,) * 4:
+            raise SitlError(f"--axis, --amplitude-deg, --period-s, --tail-s: {name} says them; change them there")
+        task = load_scenario(Path(name), Ts)
+    else:
+        values = zip((amplitude_deg, period_s, tail_s), (AMPLITUDE_DEG, PERIOD_S, TAIL_S), strict=True)
+        amplitude, period, tail = (default if value is None else value for value, default in values)
+        task = make_scenario(name, axis or "roll", amplitude, period, Ts, tail)
+    return replace(task, faults=(*task.faults, *map(parse_fault, faults or ())))
+
+
 def fly(
     airframe: AirframeArgument,
     gains: GainsOption = None,
-    scenario: Annotated[str, typer.Option(help="doublet, step or hover.")] = "doublet",
-    axis: AxisOption = "roll",
-    amplitude_deg: AmplitudeOption = 22.5,
-    period_s: PeriodOption = 0.42,
+    scenario: Annotated[str, typer.Option(help="doublet, step, hover, or a scenario file (TOML).")] = "doublet",
+    axis: AxisOption = None,
+    amplitude_deg: AmplitudeOption = None,
+    period_s: PeriodOption = None,
+    tail_s: TailOption = None,
+    fault: FaultOption = None,
     seed: SeedOption = 0,
     out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
     on: Annotated[str, typer.Option(help="native, or cortex-m4: the emulated processor of the vehicle.")] = "native",
     as_json: JsonOption = False,
 ) -> None:
-    """Fly the generated C++ in process and print how well it followed."""
-    from dataclasses import asdict
+    """Fly the generated C++ in process and print how well it followed; with faults also what they did."""
+    from dataclasses import asdict, replace
 
     from codegen.cortex_m4 import load_emulated
     from sitl.autopilot import Autopilot
@@ -156,25 +234,31 @@ def fly(
     from sitl.metrics import performance
     from sitl.models import reference_models
     from sitl.recorder import save_flight
-    from sitl.scenario import make_scenario
+    from sitl.recovery import recovery
+    from sitl.scenario import AXES
     from tuning.output import print_json, print_table
 
     body, controller = _load(airframe, gains)
-    task = make_scenario(scenario, axis, amplitude_deg, period_s, controller.Ts)
+    task = scenario_of(scenario, axis, amplitude_deg, period_s, tail_s, fault, controller.Ts)
     if on not in ("native", "cortex-m4"):
         raise SitlError(f"--on: got {on!r}, expected native or cortex-m4")
     processor = load_emulated(controller) if on == "cortex-m4" else None
     flight = fly_scenario(body, Autopilot(body, controller, processor), task, seed)
     inner, outer = reference_models(controller, task.axis)
     figures: dict[str, Any] = {**asdict(performance(flight, inner, outer)), "crashed_at_s": flight.crashed_at}
+    if task.faults:
+        sound = fly_scenario(body, Autopilot(body, controller), replace(task, faults=()), seed)
+        figures |= {"faults": list(map(str, task.faults)), **asdict(recovery(flight, sound))}
     if out is not None:
         save_flight(out, flight, body, controller)
     if as_json:
-        print_json({"airframe": body.name, "scenario": scenario, "axis": axis, "seed": seed, **figures})
+        print_json({"airframe": body.name, "scenario": task.name, "axis": AXES[task.axis], "seed": seed, **figures})
     else:
-        rows = [[UNITS.get(name, name), "-" if value is None else f"{value:.5g}"] for name, value in figures.items()]
-        title = f"{body.name}, {scenario} on {axis}, against {inner.label} (inner) and {outer.label} (outer)"
-        print_table(title, ["figure", "value"], rows)
+        rows = [[UNITS[name], _text(value)] for name, value in figures.items() if name in UNITS]
+        title = (
+            f"{body.name}, {task.name} on {AXES[task.axis]}, against {inner.label} (inner) and {outer.label} (outer)"
+        )
+        print_table(", ".join([title, *map(str, task.faults)]), ["figure", "value"], rows)
     if flight.crashed_at is not None:
         raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s", exit_code=1)
     if flight.record["fault"].any():
@@ -232,28 +316,32 @@ def sitl(
     ] = None,
     speed: SpeedOption = "1",
     seed: SeedOption = 0,
+    fault: FaultOption = None,
     log: Annotated[
         Path | None, typer.Option(help="Log each flight, arming to disarming, at full rate: FILE.ulg, FILE-2.ulg ...")
     ] = None,
     scenario: Annotated[
-        str | None, typer.Option(help="Take off, fly doublet, step or hover, land and end; the same for equal seeds.")
+        str | None, typer.Option(help="Take off, fly doublet, step, hover or a scenario file, land and end.")
     ] = None,
-    axis: AxisOption = "roll",
-    amplitude_deg: AmplitudeOption = 22.5,
-    period_s: PeriodOption = 0.42,
+    axis: AxisOption = None,
+    amplitude_deg: AmplitudeOption = None,
+    period_s: PeriodOption = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
     from sitl.errors import SitlError
+    from sitl.faults import parse_fault
     from sitl.mavlink.sitl_console import Options, run
-    from sitl.scenario import make_scenario
 
     body, controller = _load(airframe, gains)
-    task = make_scenario(scenario, axis, amplitude_deg, period_s, controller.Ts) if scenario else None
+    task, faults = None, tuple(map(parse_fault, fault or ()))
+    if scenario is not None:
+        task = scenario_of(scenario, axis, amplitude_deg, period_s, None, fault, controller.Ts)
+        faults = task.faults
     if plant and (port, speed, seed) != (0, "1", 0):
         raise SitlError("--port, --speed and --seed belong to the plant: with --plant, say them where it was started")
     address = _address(plant) if plant else None
     links = (ground_port, vehicle_port, tcp_port, bind, signing_key)
-    run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log, task))
+    run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log, task, faults))
 
 
 def plant(
@@ -265,6 +353,7 @@ def plant(
         float, typer.Option(min=0, max=1000, help="Where it starts hovering, m; 0: on the ground, rotors standing.")
     ] = 0.0,
     seed: SeedOption = 0,
+    fault: FaultOption = None,
     child: Annotated[bool, typer.Option("--child", help="End when standard input is closed.")] = False,
     serial: Annotated[
         str | None, typer.Option(help="DEVICE,BAUD of a board in HITL mode, in place of the TCP port; in real time.")
@@ -273,6 +362,7 @@ def plant(
     """Serve the plant alone over PX4's simulator API to one autopilot after another, in lockstep over TCP."""
     from sitl.airframe import load_airframe
     from sitl.errors import SitlError
+    from sitl.faults import parse_faults
     from sitl.mavlink.hitl import SerialPlant
     from sitl.mavlink.link import LOOPBACK, listen
     from sitl.mavlink.plant_server import PlantServer
@@ -287,7 +377,8 @@ def plant(
 
     if serial and times != 1.0:
         raise SitlError(f"--speed {speed}: a board on a serial port flies in real time")
-    vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell)
+    faults = parse_faults(fault or (), ("plant", "link"), "the plant")
+    vehicle = SimulatedVehicle(load_airframe(airframe).airframe, round(1 / rate, 9), seed, altitude, tell, faults)
     try:
         if serial:
             board = SerialPlant(vehicle, serial)

@@ -1,33 +1,22 @@
-"""Figures as a control engineer draws them, as self-contained SVG. Colours survive colour-blindness and print."""
+"""Figures of flights, as a control engineer draws them."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
 from sitl.loop import Flight
 from sitl.metrics import reference_responses
+from tuning.drawing import STYLES as STYLES
+from tuning.drawing import svg as svg
 from tuning.reference import ReferenceModel
 
 AXES = ("roll", "pitch")
-#: Okabe-Ito colours, each with a line style of its own.
-STYLES: tuple[tuple[str, str], ...] = (("#D55E00", ":"), ("#0072B2", "--"), ("#009E73", "-"), ("#CC79A7", "-."))
 MODEL = {"color": "#888888", "linewidth": 3.0, "alpha": 0.6}
 SETPOINT = {"color": "black", "linewidth": 1.0}
-
-
-def svg(figure: Figure, name: str) -> str:
-    """The figure as SVG text; the same data give the same bytes. `name` keeps ids apart within one page."""
-    buffer = io.StringIO()
-    with matplotlib.rc_context({"svg.hashsalt": f"mimopilot {name}"}):
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
 
 
 def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer: ReferenceModel) -> Figure:

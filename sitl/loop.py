@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from sitl.airframe import Airframe
 from sitl.autopilot import RECORD, Autopilot, tick
 from sitl.compiled import compiled
-from sitl.plant import STEP, advance, hover_state
+from sitl.injection import Injection
+from sitl.plant import HISTORY, ROTORS, STEP, advance, hover_state
 from sitl.scenario import Scenario
 from sitl.sensors import NOISES, SIZE, Sensors, euler_angles, low_pass, measure
 
 CRASH_ANGLE = np.radians(60.0)
 CRASH_SECONDS = 0.3
-HISTORY = 256  # control periods that a command can be late, at most
 
 #: The true state at each sample.
 TRUTH = np.dtype([("position", "f8", 3), ("velocity", "f8", 3), ("attitude", "f8", 3), ("rates", "f8", 3)])
@@ -35,31 +35,47 @@ class Flight:
         What the autopilot saw and did.
     truth : (N,) array of `TRUTH`
         What the plant did.
+    runs : (N,) array, optional
+        How often the autopilot ran in each period; by default once.
     """
 
     scenario: Scenario
     record: NDArray[Any]
     truth: NDArray[Any]
+    runs: NDArray[np.int64] | None = None
 
     @property
     def crashed_at(self) -> float | None:
         """Time (s) of the loss: more than 60 degrees for 0.3 s, the ground, or a value that is not finite."""
-        samples = max(1, round(CRASH_SECONDS / self.scenario.Ts))
-        first = _first_loss(self.truth, self.record, samples)
+        first = first_loss(self.truth, self.record, self.scenario.Ts)
         return None if first < 0 else float(first * self.scenario.Ts)
 
 
+def first_loss(truth: NDArray[Any], record: NDArray[Any], Ts: float) -> int:
+    """Sample at which the vehicle counts as lost, see `Flight.crashed_at`; -1: it is not.
+
+    Parameters
+    ----------
+    truth, record : (N,) arrays of `TRUTH` and of `sitl.autopilot.RECORD`
+        What the plant and what the autopilot did.
+    Ts : float, s
+        Control period.
+    """
+    samples = max(1, round(CRASH_SECONDS / Ts))
+    return int(_first_loss(truth["attitude"], truth["position"], record["moment"], samples))
+
+
 @compiled
-def _first_loss(truth, record, samples):  # type: ignore[no-untyped-def]
+def _first_loss(attitude, position, moment, samples):  # type: ignore[no-untyped-def]
     run = 0
-    for k in range(truth.shape[0]):
-        roll, pitch = truth[k].attitude[0], truth[k].attitude[1]
+    for k in range(attitude.shape[0]):
+        roll, pitch = attitude[k, 0], attitude[k, 1]
         tilted = not (abs(roll) <= CRASH_ANGLE and abs(pitch) <= CRASH_ANGLE)
         finite = np.isfinite(roll) and np.isfinite(pitch)
         for i in range(3):
-            finite = finite and np.isfinite(record[k].moment[i])
+            finite = finite and np.isfinite(moment[k, i])
         run = run + 1 if tilted else 0
-        if run >= samples or not finite or truth[k].position[2] > 0.0:
+        if run >= samples or not finite or position[k, 2] > 0.0:
             return k
     return -1
 
@@ -132,19 +148,26 @@ class Simulator:
         self, airframe: Airframe, Ts: float, seed: int | list[int], noise: bool = True, altitude: float = 10.0
     ) -> None:
         self.plant = airframe.plant()
-        self.state = hover_state(self.plant, altitude)
         self.steps = max(1, int(np.ceil(Ts / STEP - 1e-9)))
         self.step = Ts / self.steps
         self.delay = airframe.computing_delay
-        hover = self.state[13] ** 2 * self.plant.thrust_coefficient / self.plant.thrust_max
-        self.history = np.full((HISTORY, RECORD["commands"].shape[0]), hover, np.float32)
-        self.count = 0
+        self.history = np.zeros((HISTORY, RECORD["commands"].shape[0]), np.float32)
         self.generator = np.random.default_rng(seed)
         scale = 1.0 if noise else 0.0
         gyro = low_pass(airframe.gyro_cutoff_hz, Ts)
         self.sensors = Sensors.sound(scale * airframe.noise.angle, scale * airframe.noise.rate, gyro)
         self.seen = np.zeros(SIZE)
         self.before: NDArray[Any] = np.zeros(1, RECORD)
+        self.restart(hover_state(self.plant, altitude))
+
+    def restart(self, state: NDArray[np.float64]) -> None:
+        """Begin a flight in a state (13 + n,), its rotors turning as they were told to; nothing is left of the last."""
+        self.state = state
+        self.history[:] = state[ROTORS] ** 2 * self.plant.thrust_coefficient / self.plant.thrust_max
+        self.count = 0
+        self.seen[:], self.before[:] = 0, np.zeros(1, RECORD)
+        sensors = self.sensors
+        sensors.memory[:], sensors.bias[:], sensors.stuck[:], sensors.failed[:] = 0, 0, False, False
 
     def noise(self, samples: int) -> NDArray[np.float64]:
         """The next standard normal numbers of the noise, (samples, 6); the same whatever the block size."""
@@ -214,7 +237,7 @@ class Simulator:
 
 
 def fly(airframe: Airframe, autopilot: Autopilot, scenario: Scenario, seed: int = 0, noise: bool = True) -> Flight:
-    """Fly a scenario, starting from hover.
+    """Fly a scenario with its faults, starting from hover.
 
     Parameters
     ----------
@@ -228,10 +251,19 @@ def fly(airframe: Airframe, autopilot: Autopilot, scenario: Scenario, seed: int 
         Of the measurement noise.
     noise : bool
         False: exact measurements.
+
+    Raises
+    ------
+    SitlError
+        When a fault is not possible on this vehicle or in this flight.
     """
+    samples = len(scenario.setpoint)
     simulator = Simulator(airframe, scenario.Ts, seed, noise, autopilot.altitude)
-    record = np.zeros(len(scenario.setpoint), RECORD)
-    record["setpoint"], record["excitation"] = scenario.setpoint, scenario.excitation
-    truth = np.zeros(len(record), TRUTH)
-    simulator.fly(autopilot, simulator.noise(len(record)), record, truth)
-    return Flight(scenario, record, truth)
+    injection = Injection(scenario.faults, airframe, simulator, scenario.Ts, seed, autopilot, samples * scenario.Ts)
+    record, truth, runs = np.zeros(samples, RECORD), np.zeros(samples, TRUTH), np.ones(samples, np.int64)
+    record["setpoint"], record["excitation"] = injection.setpoints(scenario.setpoint), scenario.excitation
+    draws = simulator.noise(samples)
+    for piece, ran, delays in injection.stretches(0, samples):
+        simulator.fly(autopilot, draws[piece], record[piece], truth[piece], ran, delays)
+        runs[piece] = 1 if ran is None else ran
+    return Flight(scenario, record, truth, runs)

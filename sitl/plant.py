@@ -16,6 +16,7 @@ from sitl.errors import SitlError
 
 GRAVITY = 9.80665  # m/s^2, standard gravity
 STEP = 1e-3  # s, of the Runge-Kutta scheme
+HISTORY = 256  # control periods that a command can be late, at most
 
 POSITION, QUATERNION, ROTORS = 0, 6, 13
 
@@ -300,13 +301,19 @@ def checked_inertia(inertia: ArrayLike) -> NDArray[np.float64]:
     J = np.array(inertia, dtype=np.float64)
     if J.shape != (3, 3) or not np.isfinite(J).all() or not np.allclose(J, J.T, rtol=1e-9, atol=0):
         raise SitlError(f"inertia: got {J.tolist()}, expected a symmetric 3x3 tensor, kg m^2")
-    principal = np.linalg.eigvalsh(J)
-    if principal[0] <= 0 or principal[2] > (principal[0] + principal[1]) * (1 + 1e-9):
+    if not is_of_a_body(J):
+        principal = np.linalg.eigvalsh(J)
         raise SitlError(
             f"inertia: principal moments {', '.join(f'{v:.4g}' for v in principal)} kg m^2 are of no real body: "
             "each must be positive and at most the sum of the other two"
         )
     return J
+
+
+def is_of_a_body(inertia: NDArray[np.float64]) -> bool:
+    """Whether a symmetric (3, 3) tensor has positive principal moments that obey the triangle inequality."""
+    smallest, middle, largest = np.linalg.eigvalsh(inertia)
+    return bool(smallest > 0 and largest <= (smallest + middle) * (1 + 1e-9))
 
 
 def hover_state(plant: PlantParameters, altitude: float = 10.0) -> NDArray[np.float64]:

@@ -1,18 +1,39 @@
-"""What a flight is asked to do: attitude set-points and injected moments over time."""
+"""What a flight is asked to do, and what goes wrong on the way: set-points, injected moments and faults over time.
+
+A scenario file names a manoeuvre and its faults:
+
+    manoeuvre = "doublet"       # doublet, step or hover
+    axis = "roll"
+    amplitude_deg = 15
+    period_s = 0.42
+    tail_s = 1.5                # level flight after a doublet
+
+    [[fault]]
+    kind = "motor"
+    motor = 3
+    size = 0.7
+    at = 1.2
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from sitl.errors import SitlError
+from sitl.faults import Fault, complaint, make_fault
 from tuning.excitation import hold_from_bandwidth, prbs
 
 AXES = ("roll", "pitch")
 LEAD = 1.0  # s of hover before a manoeuvre
 MAX_ANGLE = np.radians(60.0)  # a vehicle that tilts further counts as lost
+AMPLITUDE_DEG, PERIOD_S, TAIL_S = 22.5, 0.42, 1.5  # of a manoeuvre that says nothing else
 MIN_SAMPLES, MAX_SECONDS = 10, 3600.0
 
 
@@ -34,6 +55,8 @@ class Scenario:
         Axis of the manoeuvre: 0 roll, 1 pitch.
     window : (start, stop)
         Samples over which the manoeuvre is judged.
+    faults : tuple of Fault
+        What goes wrong on the way.
     """
 
     name: str
@@ -42,6 +65,7 @@ class Scenario:
     excitation: NDArray[np.float64]
     axis: int
     window: tuple[int, int]
+    faults: tuple[Fault, ...] = ()
 
 
 def _axis_index(axis: str) -> int:
@@ -61,7 +85,7 @@ def _check_angle(amplitude: float) -> None:
         raise SitlError(f"amplitude: got {got:.6g} degrees, expected above 0 and at most {limit:.0f}")
 
 
-def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float = 1.5) -> Scenario:
+def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float = TAIL_S) -> Scenario:
     """Set-point +A for half of `period`, -A for the other half, then level.
 
     Parameters
@@ -79,6 +103,8 @@ def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float =
     """
     _check_angle(amplitude)
     _check_length("period", period, Ts)
+    if not 0 <= tail <= MAX_SECONDS:
+        raise SitlError(f"tail: got {tail} s, expected 0 to {MAX_SECONDS:g} s")
     column = _axis_index(axis)
     start, half = round(LEAD / Ts), round(period / 2 / Ts)
     setpoint = np.zeros((start + 2 * half + round(tail / Ts), 3))
@@ -105,15 +131,74 @@ def hover(axis: str, period: float, Ts: float) -> Scenario:
     return Scenario("hover", Ts, setpoint, np.zeros_like(setpoint), _axis_index(axis), (0, len(setpoint)))
 
 
-def make_scenario(name: str, axis: str, amplitude_deg: float, period: float, Ts: float) -> Scenario:
-    """A scenario by name: ``doublet``, ``step`` or ``hover``; amplitude in degrees, period in seconds."""
+def make_scenario(
+    name: str, axis: str, amplitude_deg: float, period: float, Ts: float, tail: float = TAIL_S
+) -> Scenario:
+    """A scenario by name: ``doublet``, ``step`` or ``hover``; amplitude in degrees, period and tail in seconds."""
     if name == "doublet":
-        return doublet(axis, float(np.radians(amplitude_deg)), period, Ts)
+        return doublet(axis, float(np.radians(amplitude_deg)), period, Ts, tail)
+    if tail != TAIL_S:
+        raise SitlError(f"tail: belongs to a doublet, not to {name}")
     if name == "step":
         return step(axis, float(np.radians(amplitude_deg)), period, Ts)
     if name == "hover":
         return hover(axis, period, Ts)
     raise SitlError(f"scenario: got {name!r}, expected doublet, step or hover")
+
+
+class Task(BaseModel):
+    """The manoeuvre of a scenario file; arguments of `make_scenario`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    manoeuvre: Literal["doublet", "step", "hover"]
+    axis: Literal["roll", "pitch"] = "roll"
+    amplitude_deg: float = AMPLITUDE_DEG
+    period_s: float = PERIOD_S
+    tail_s: float = TAIL_S
+
+
+def read_scenario(path: Path) -> tuple[Task, tuple[Fault, ...]]:
+    """What a scenario file says: the manoeuvre and its faults.
+
+    Parameters
+    ----------
+    path : Path
+        See the module's text for an example; `sitl.faults.Fault` for the fields of a fault.
+
+    Raises
+    ------
+    SitlError
+        When the file is not TOML, or an entry is unknown or wrong.
+    """
+    try:
+        table = tomllib.loads(path.read_text())
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise SitlError(f"{path}: not a TOML file: {error}") from error
+    faults = table.pop("fault", [])
+    if not (isinstance(faults, list) and all(isinstance(fault, dict) for fault in faults)):
+        raise SitlError(f"{path}: fault: expected [[fault]] tables")
+    try:
+        task = Task.model_validate(table)
+    except ValidationError as error:
+        raise SitlError(f"{path}: {complaint(error)}") from error
+    return task, tuple(make_fault(fault, f"{path}: fault {i + 1}") for i, fault in enumerate(faults))
+
+
+def load_scenario(path: Path, Ts: float) -> Scenario:
+    """The scenario of a file, see `read_scenario`; its control period in s.
+
+    Raises
+    ------
+    SitlError
+        As `read_scenario` and `make_scenario`.
+    """
+    task, faults = read_scenario(path)
+    try:
+        scenario = make_scenario(task.manoeuvre, task.axis, task.amplitude_deg, task.period_s, Ts, task.tail_s)
+    except SitlError as error:
+        raise SitlError(f"{path}: {error}") from error
+    return replace(scenario, faults=faults)
 
 
 def excitation_flight(

@@ -38,15 +38,17 @@ class Pose(NamedTuple):
 
 
 class Stream(Generic[T]):
-    """The latest of what arrives again and again, and when (s) it did."""
+    """The latest of what arrives again and again, and when (s) it did; nothing arrives while it is cut."""
 
     def __init__(self, value: T) -> None:
         self.value = value
         self.time = -math.inf
+        self.cut = False
 
     def put(self, value: T, now: float) -> None:
         """A new one."""
-        self.value, self.time = value, now
+        if not self.cut:
+            self.value, self.time = value, now
 
     def fresh(self, now: float) -> bool:
         """Whether it still counts."""

@@ -29,6 +29,8 @@ from sitl.mavlink.upload import apply, read
 from sitl.mavlink.words import drive, single
 from sitl.plant import GRAVITY
 from sitl.scenario import doublet, excitation_flight
+from sitl.studies.faults import standard_faults
+from tests.bench_campaign import campaign_rows, rotorpy_rows
 from tests.bench_tuning import best, tuning_rows
 from tests.sitl import flood
 from tests.sitl.scripted_vehicle import ScriptedVehicle, UdpVehicle
@@ -60,6 +62,14 @@ def upload_seconds(round_trip: float) -> float:
     if (outcome.state, outcome.storage, vehicle.values) != ("verified", "acknowledged", new):
         raise RuntimeError(f"the upload ended as {outcome}")
     return seconds
+
+
+def fault_rows() -> list[list[str]]:
+    """How long the table of faults takes, by its command."""
+    runs, faults = 40, len(standard_faults(load_airframe("adam0").airframe))
+    seconds = best(command("faults", "adam0", "--runs", str(runs)), 2)
+    title = f"mimopilot faults, {runs * faults} flights with faults and {runs} without, start included"
+    return [[title, f"{seconds:.1f} s", "1000 runs under 60 s"]]
 
 
 def plant_rows(airframe: Airframe) -> list[list[str]]:
@@ -115,7 +125,11 @@ def main() -> None:
 
         flight()
         speed = 40.0 / best(flight)
-        rows.append(["flight in process, 6 degrees of freedom, RK4 at 1 kHz", f"{speed:.0f} x real time", ""])
+        title = "flight in process, one core, 6 degrees of freedom, RK4 at 1 kHz"
+        rows.append([title, f"{speed:.0f} x real time", "over 5000"])
+        rows += rotorpy_rows(speed)
+        rows += campaign_rows(folder)
+        rows += fault_rows()
         processor = load_emulated(gains)
         emulated = 40.0 / best(lambda: fly(airframe, Autopilot(airframe, gains, processor), scenario, 0), 2)
         rows.append(["the same on the emulated Cortex-M4", f"{emulated:.0f} x real time", f"1/{speed / emulated:.0f}"])

@@ -16,8 +16,8 @@ from sitl.airframe import FOLDER
 from tests.conftest import assert_one_clear_line
 
 COMMANDS = [
-    *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise"),
-    *("generate", "pil", "fly", "sitl", "plant", "convert", "upload", "restore", "params"),
+    *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
+    *("fly", "faults", "campaign", "replay", "sitl", "plant", "convert", "upload", "restore", "params"),
 ]
 
 
@@ -278,6 +278,8 @@ def test_the_demo_does_the_whole_way(mimopilot, tmp_path):
                 "offaxis_peak_deg",
                 "offaxis_rms_deg",
                 "effort_rms",
+                "peak_deg",
+                "saturated",
             }
         # What multivariable tuning is for: the coupling is answered before it is felt.
         assert methods["mimo"]["offaxis_peak_deg"] < methods["siso"]["offaxis_peak_deg"] / 3

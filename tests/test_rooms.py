@@ -8,7 +8,7 @@ import pytest
 TOP = Path(__file__).resolve().parents[1]
 FORBIDDEN = {"tuning": {"codegen", "sitl"}, "codegen": {"sitl"}}
 #: What the bench may know of tuning, outside of its studies.
-BENCH_MAY_USE = {"errors", "excitation", "files", "flown", "gains", "output", "reference"}
+BENCH_MAY_USE = {"drawing", "errors", "excitation", "files", "flown", "gains", "output", "parallel", "reference"}
 
 
 def imports(path):

@@ -13,7 +13,10 @@ def register(app: typer.Typer) -> None:
     """Add this room's commands to the front door."""
     app.command(epilog="Example: mimopilot inspect flight.ulg")(inspect)
     app.command(epilog="Example: mimopilot identify flight.ulg --order 4 --out plant.toml")(identify)
-    app.command(epilog="Example: mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out my.gains.toml")(tune)
+    app.command(
+        epilog="Example: mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out my.gains.toml; "
+        "mimopilot tune logs --campaign --out tuned"
+    )(tune)
     app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
     app.command(epilog="Example: mimopilot advise flight.ulg --outer 10,0.7,0 --out my.gains.toml")(advise)
 
@@ -29,8 +32,8 @@ SHOWN = 24
 
 
 def tune(
-    log: LOG,
-    out: Annotated[Path, typer.Option(help="Where the gains are written: FILE.gains.toml.")],
+    logs: Annotated[list[Path], typer.Argument(help="Flight log; with --campaign many, or folders of them.")],
+    out: Annotated[Path, typer.Option(help="Where the gains are written: FILE.gains.toml; a folder with --campaign.")],
     method: Annotated[
         str | None, typer.Option(help="mimo (full matrices, the default) or siso (each axis by itself).")
     ] = None,
@@ -58,10 +61,14 @@ def tune(
         Path | None, typer.Option(help="Specification (TOML): the above, and what the log does not say.")
     ] = None,
     columns: COLUMNS = None,
+    campaign: Annotated[
+        bool, typer.Option("--campaign", help="Tune each of many logs, and show how gains and certificates spread.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Find the gains of the attitude cascade from one flight."""
     from tuning.cascade import tune as tune_cascade
+    from tuning.errors import TuningError
     from tuning.gains import MATRICES
     from tuning.logs.columns import load_columns
     from tuning.logs.reader import read_log
@@ -78,6 +85,12 @@ def tune(
         window=window,
     )
     named = load_columns(columns) if columns else None
+    if campaign:
+        tune_campaign(logs, task, out, named, as_json)
+        return
+    if len(logs) > 1:
+        raise TuningError(f"{len(logs)} logs: gains are tuned from one; --campaign tunes each by itself")
+    log = logs[0]
     gains = tune_cascade(read_log(log, named), task, repeat=read_log(repeat, named) if repeat else None)
     gains.save(out)
     deviations = gains.provenance["standard_deviation"]
@@ -90,6 +103,31 @@ def tune(
         return
     print_gains(f"{task.method.upper()} gains from {log.name} (standard deviation)", gains, deviations)
     print_certificate(gains)
+    print(f"written to {out}")
+
+
+def tune_campaign(logs: list[Path], task: Any, out: Path, columns: Any, as_json: bool) -> None:
+    """`tune --campaign`: every log by itself, and the distributions."""
+    from tuning.campaign import find_logs, tune_all
+    from tuning.output import print_json, print_table
+    from tuning.parallel import cores
+
+    found = tune_all(find_logs(logs), task, out, cores(), columns)
+    if as_json:
+        print_json({"out": str(out), **found.as_json()})
+        return
+    rows = [
+        [f"{e.matrix} {e.pair}", *(f"{v:.4g}" for v in (e.mean, e.deviation, e.predicted, *e.quantiles))]
+        for e in found.elements()
+    ]
+    columns_shown = ["gain", "mean", "deviation", "predicted", "5 %", "median", "95 %"]
+    print_table(
+        f"{task.method.upper()} gains from {len(found.tuned)} of {len(found.outcomes)} logs", columns_shown, rows
+    )
+    for verdict, count in found.verdicts.items():
+        print(f"{verdict}: {count} of {len(found.tuned)}")
+    for name, reason in found.refusals.items():
+        print(f"refused: {name}: {reason}")
     print(f"written to {out}")
 
 

@@ -10,7 +10,12 @@ from typing import Any
 
 def print_json(value: Mapping[str, Any]) -> None:
     """One JSON object on standard output; a number that is not finite becomes null."""
-    print(json.dumps(_finite(value), indent=2))
+    print(json_text(value), end="")
+
+
+def json_text(value: Mapping[str, Any]) -> str:
+    """What `print_json` prints, for files."""
+    return json.dumps(_finite(value), indent=2) + "\n"
 
 
 def _finite(value: Any) -> Any:

@@ -114,4 +114,4 @@ class SerialPlant:
             beat = (0, mavlink.MAV_TYPE_GENERIC, mavlink.MAV_AUTOPILOT_INVALID, 0, state, 3)
             data = self.vehicle.codec.pack(mavlink.MAVLink_heartbeat_message, *beat) + data
         if select.select([], [self.port], [], 0)[1]:
-            self.port.write(data)
+            self.port.write(data * self.vehicle.copies)

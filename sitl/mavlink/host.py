@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from codegen.parameters import PARAMETERS
 from sitl.autopilot import RECORD, Autopilot, tick
+from sitl.autopilot_faults import AutopilotFaults
 from sitl.errors import SitlError
 from sitl.lift import Estimate
 from sitl.mavlink.flight_log import FlightLog
@@ -59,6 +60,8 @@ class Host:
         May be replaced.
     pilot : ScriptedPilot or None
         Flies in place of a ground station.
+    faults : AutopilotFaults or None
+        Of this autopilot, in seconds from the first frame of a plant.
     lateness : Lateness
         How long frames of the plant wait.
     """
@@ -71,10 +74,11 @@ class Host:
         self.situation = Situation(self.vehicle)
         self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
         self.pilot: ScriptedPilot | None = None
+        self.faults: AutopilotFaults | None = None
         self.lateness = Lateness()
         self.measurement = np.zeros(SIZE)
         euler_angles(*self.measurement[:4])  # compiled now, not in flight
-        self.stamp = -1
+        self.stamp = self._zero = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
         self.fixed = autopilot.arguments()[:5]
         self.heard = self._news = self._turn = 0.0
@@ -130,7 +134,7 @@ class Host:
     def _begin(self, now: float) -> None:
         """A plant that may know nothing of what was before."""
         self.heard = now
-        self.stamp = -1
+        self.stamp = self._zero = -1
         self._periods = 0
         self.situation.home = self.situation.imu = self.situation.fix = ()
         self.vehicle.plant_back()
@@ -181,7 +185,17 @@ class Host:
         self.lateness.answered()
         self.situation.load = self.lateness.load
 
+    def _break(self) -> None:
+        """Put the faults of now into the controller, and stop what steers."""
+        assert self.faults is not None
+        self._zero = self.stamp if self._zero < 0 else self._zero
+        k = round(1e-6 * (self.stamp - self._zero) / self.faults.Ts)
+        self.faults.apply(k)
+        self.vehicle.attitude.cut = self.vehicle.sticks.cut = self.faults.stale(k)
+
     def _compute(self, state: PlantState) -> None:
+        if self.faults is not None:
+            self._break()
         state.measure(self.measurement)
         now = 1e-6 * self.stamp
         autopilot, m = self.autopilot, self.measurement

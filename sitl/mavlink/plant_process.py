@@ -6,10 +6,11 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from sitl.errors import SitlError
+from sitl.faults import Fault
 
 START_SECONDS = 120.0  # the first time everything is compiled
 
@@ -31,14 +32,24 @@ class PlantProcess:
         Times real time; None: as fast as it is answered.
     altitude : float, m
         Where it starts, hovering; 0: on the ground, rotors standing.
+    faults : sequence of Fault
+        Of the plant and of its link, see `sitl.mavlink.simulator.SimulatedVehicle`.
     """
 
     def __init__(
-        self, airframe: str, port: int, Ts: float, seed: int, speed: float | None, altitude: float = 0.0
+        self,
+        airframe: str,
+        port: int,
+        Ts: float,
+        seed: int,
+        speed: float | None,
+        altitude: float = 0.0,
+        faults: Sequence[Fault] = (),
     ) -> None:
         self.command = [sys.executable, "-m", "mimopilot", "plant", airframe, "--port", str(port), "--seed", str(seed)]
         self.command += ["--rate", repr(1 / Ts), "--speed", "max" if speed is None else repr(speed)]
         self.command += ["--altitude", repr(altitude), "--child"]
+        self.command += [word for fault in faults for word in ("--fault", str(fault))]
         self.child: subprocess.Popen[bytes] | None = None
         self._forget()
 
@@ -123,7 +134,13 @@ class PlantProcess:
 
 @contextmanager
 def plant_process(
-    airframe: str, port: int, Ts: float, seed: int, speed: float | None, altitude: float = 10.0
+    airframe: str,
+    port: int,
+    Ts: float,
+    seed: int,
+    speed: float | None,
+    altitude: float = 10.0,
+    faults: Sequence[Fault] = (),
 ) -> Iterator[int]:
     """Run a plant for as long as a block lasts; yields the port that it listens on. Arguments as `PlantProcess`.
 
@@ -132,7 +149,7 @@ def plant_process(
     SitlError
         When it does not come up, with its own message.
     """
-    process = PlantProcess(airframe, port, Ts, seed, speed, altitude)
+    process = PlantProcess(airframe, port, Ts, seed, speed, altitude, faults)
     process.start()
     try:
         yield process.wait()

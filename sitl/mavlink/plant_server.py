@@ -142,8 +142,10 @@ class Lockstep:
                     time.sleep(ahead)
                 elif ahead < -FORGET_S:
                     begin, count = now, 0
-            self.connection.sendall(vehicle.messages())
-            answer = self._answer(armed=bool(answer[18] & ARMED))
+            messages = vehicle.messages()
+            if vehicle.copies:
+                self.connection.sendall(messages * vehicle.copies)
+                answer = self._answer(armed=bool(answer[18] & ARMED))
 
     def _first_answer(self) -> tuple[Any, ...]:
         """Offer the start until it is answered."""

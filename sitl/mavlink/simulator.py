@@ -15,6 +15,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from sitl.airframe import Airframe
 from sitl.autopilot import MAX_ROTORS
 from sitl.contact import ground_state, touch
+from sitl.faults import Fault
+from sitl.injection import Injection
 from sitl.instruments import FIX_3D, GPS_EPH, GPS_EPV, GPS_PERIOD, SATELLITES, Instruments, centi, place
 from sitl.loop import Simulator
 from sitl.mavlink.lean import GPS, SENSOR, STATE, LeanCodec
@@ -47,17 +49,24 @@ class SimulatedVehicle:
         Where it starts, hovering; 0: on the ground, with standing rotors.
     tell : callable
         Called with each thing that a user must know.
+    faults : sequence of Fault
+        What goes wrong, in seconds from the first answer of an autopilot.
 
     Attributes
     ----------
+    copies : int
+        How often the messages of now reach the autopilot: 0 when they are lost, 2 when they are duplicated.
     periods : int
         What the simulated clock has counted.
     codec : LeanCodec
         Of the plant's end of the link.
     """
 
-    def __init__(self, airframe: Airframe, Ts: float, seed: int, altitude: float, tell: Tell) -> None:
+    def __init__(
+        self, airframe: Airframe, Ts: float, seed: int, altitude: float, tell: Tell, faults: Sequence[Fault] = ()
+    ) -> None:
         self.airframe, self.Ts, self.seed, self.altitude, self.tell = airframe, Ts, seed, altitude, tell
+        self.faults = faults
         self.rotors = len(airframe.rotors)
         self.field_every = max(1, round(FIELD_AND_AIR_PERIOD / Ts))
         self.fix_every = max(1, round(GPS_PERIOD / Ts))
@@ -75,15 +84,17 @@ class SimulatedVehicle:
             self.simulator.state[:] = ground_state(self.simulator.plant)
             self.simulator.history[:] = 0.0
         self.instruments = Instruments(self.simulator.state, self.Ts, self.seed)
+        self.injection = Injection(self.faults, self.airframe, self.simulator, self.Ts, self.seed)
         self.codec = LeanCodec(1, mavlink.MAV_COMP_ID_USER1)
         self.periods = self.flown = 0
         self.lost = self.odd = False
+        self.copies, self.gyro = 1, [0.0, 0.0, 0.0]
         self._measure()
 
     @property
     def stamp(self) -> int:
         """The simulated clock, us."""
-        return EPOCH_US + round(self.periods * self.Ts * 1e6)
+        return EPOCH_US + round((self.periods * self.Ts - self.injection.clock_back(self.flown)) * 1e6)
 
     @property
     def seconds(self) -> float:
@@ -91,9 +102,18 @@ class SimulatedVehicle:
         return self.flown * self.Ts
 
     def _measure(self) -> None:
+        if self.faults:
+            self._break()
         if self.flown % NOISE_BLOCK == 0:
             self.noise = self.simulator.noise(NOISE_BLOCK)
         self.simulator.measure(self.noise[self.flown % NOISE_BLOCK])
+
+    def _break(self) -> None:
+        """Put the faults of this period into the vehicle and into its link."""
+        for _, runs, delays in self.injection.stretches(self.flown, self.flown + 1):
+            self.copies = 1 if runs is None else int(runs[0])
+            if delays is not None:
+                self.simulator.delay = int(delays[0])
 
     def stand(self) -> None:
         """Let a period pass without flying: the clock and the instruments run, the vehicle stays where it is."""
@@ -135,10 +155,19 @@ class SimulatedVehicle:
             f"tilted by {tilt:.0f} deg (at most 60); it lies there with stopped motors until an autopilot connects anew"
         )
 
+    def _gyro(self, rates: list[float]) -> list[float]:
+        """What is left of the gyro's reading."""
+        sensors = self.simulator.sensors
+        biased = rates + sensors.bias
+        self.gyro = np.where(sensors.failed, np.nan, np.where(sensors.stuck, self.gyro, biased)).tolist()
+        return self.gyro
+
     def messages(self, estimate: bool = True) -> bytes:
         """HIL_SENSOR, HIL_GPS when it is due and, if wanted, HIL_STATE_QUATERNION of now."""
         stamp, state = self.stamp, self.simulator.state
         readings = self.instruments.read(state)
+        if self.faults:
+            readings[3:6] = self._gyro(readings[3:6])
         fields = INERTIAL | (FIELD_AND_AIR if self.periods % self.field_every == 0 else 0)
         data = self.codec.pack(SENSOR, stamp, *readings[:10], 0.0, *readings[10:12], fields, 0)
         if self.periods % self.fix_every == 0:

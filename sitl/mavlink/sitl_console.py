@@ -10,6 +10,10 @@ from pathlib import Path
 
 from sitl.airframe import Airframe
 from sitl.autopilot import Autopilot
+from sitl.autopilot_faults import AutopilotFaults
+from sitl.errors import SitlError
+from sitl.faults import Fault
+from sitl.injection import check_fault
 from sitl.injector import Injector
 from sitl.mavlink.excitation import Excitation
 from sitl.mavlink.flight_log import FlightLog
@@ -55,6 +59,8 @@ class Options:
         Where the first flight is logged.
     scenario : Scenario or None
         Flown at once, in place of waiting for a ground station.
+    faults : tuple of Fault
+        In seconds from the first frame of the plant.
     """
 
     name: str
@@ -72,6 +78,7 @@ class Options:
     seed: int
     log: Path | None
     scenario: Scenario | None
+    faults: tuple[Fault, ...]
 
 
 def run(options: Options) -> None:
@@ -97,12 +104,14 @@ def run(options: Options) -> None:
 
 def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
     gains, key = options.gains, options.signing_key
+    outside = _faults_of_the_plant(options)
     signer = Signer(read_key(key)) if key else None
     stations = Stations(options.ground_port, options.vehicle_port, options.tcp_port, options.bind, signer)
     leaving.callback(stations.close)
     if stations.exposed:
         print("warning: whoever reaches this address commands the vehicle; give --signing-key to ask for a key")
-    link = PlantLink(options.plant or PlantProcess(options.name, options.port, gains.Ts, options.seed, options.speed))
+    child = PlantProcess(options.name, options.port, gains.Ts, options.seed, options.speed, faults=outside)
+    link = PlantLink(options.plant or child)
     leaving.callback(link.close)
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # what Ctrl-C leaves in order, this does, too
     if link.child is not None:
@@ -112,6 +121,8 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
     log = FlightLog(options.log, options.airframe, gains.Ts) if options.log else None
     host = Host(autopilot, link, log)
     leaving.callback(host.leave)
+    if len(options.faults) > len(outside):
+        host.faults = AutopilotFaults(options.faults, gains.Ts, autopilot)
     telemetry = Telemetry(host.situation)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
     injector = Injector(gains.Ts)
@@ -127,3 +138,13 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
     if link.child is not None:
         link.child.wait()
     return host, Ground(server, commands, telemetry, stations)
+
+
+def _faults_of_the_plant(options: Options) -> list[Fault]:
+    """What happens in the plant and in its link, for a plant of ours."""
+    for fault in options.faults:
+        check_fault(fault, options.airframe, options.gains.Ts, None)
+    outside = [fault for fault in options.faults if fault.place != "autopilot"]
+    if options.plant and outside:
+        raise SitlError(f"fault {str(outside[0])!r}: happens in the plant that runs already: give it to that one")
+    return outside

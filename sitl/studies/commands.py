@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from sitl.commands import AirframeArgument, AxisOption, FaultOption, JsonOption, SeedOption
+
 
 class Study(StrEnum):
     """What can be reproduced."""
@@ -19,6 +21,9 @@ class Study(StrEnum):
 def register(app: typer.Typer) -> None:
     """Add the studies' commands to the front door."""
     app.command(epilog="Example: mimopilot demo --out demo --seed 0")(demo)
+    app.command(epilog="Example: mimopilot faults adam0 --gains siso.gains.toml --gains mimo.gains.toml --runs 50")(
+        faults
+    )
     app.command(epilog="Example: mimopilot reproduce lv100 --out reproduction")(reproduce)
 
 
@@ -36,6 +41,49 @@ def demo(
         print_json(summary.as_json())
     else:
         print_summary(summary)
+
+
+def _print_kinds(wanted: bool) -> None:
+    if wanted:
+        from sitl.faults import fault_help
+
+        print(fault_help())
+        raise typer.Exit
+
+
+def faults(
+    airframe: AirframeArgument,
+    gains: Annotated[
+        list[Path] | None, typer.Option(help="Gains file; may be repeated. By default the airframe's own.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Seeds of each fault.")] = 20,
+    fault: FaultOption = None,
+    axis: AxisOption = None,
+    amplitude_deg: Annotated[float, typer.Option(help="Of the doublet, degrees.")] = 15.0,
+    period_s: Annotated[float, typer.Option(help="Length of the whole doublet, s.")] = 0.42,
+    seed: SeedOption = 0,
+    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes; by default all cores.")] = None,
+    kinds: Annotated[
+        bool, typer.Option("--kinds", callback=_print_kinds, is_eager=True, help="List all kinds of faults and end.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly a doublet with each of the standard faults (or those given), many seeds, gain sets side by side."""
+    from sitl.errors import SitlError
+    from sitl.faults import parse_fault
+    from sitl.studies.faults import Request, fault_table, print_fault_table
+    from tuning.output import print_json
+    from tuning.parallel import cores
+
+    wanted = tuple(map(parse_fault, fault or ()))
+    request = Request(airframe, tuple(gains or ()), axis or "roll", amplitude_deg, period_s, wanted)
+    table = fault_table(request, range(seed, seed + runs), workers or cores())
+    if as_json:
+        print_json(table.as_json())
+    else:
+        print_fault_table(table)
+    if table.nonfinite:
+        raise SitlError(f"{table.nonfinite} outputs of the controller were not finite", exit_code=1)
 
 
 def reproduce(

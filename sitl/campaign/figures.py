@@ -1,0 +1,235 @@
+"""Figures of a campaign: envelopes of the responses, distributions of the figures, a map of survival."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
+from sitl.campaign.draws import Variator
+from sitl.campaign.flights import Stand
+from sitl.campaign.plan import Plan
+from sitl.campaign.summary import Results
+from sitl.campaign.variation import UNITS
+from sitl.commands import UNITS as FIGURES
+from sitl.errors import SitlError
+from sitl.faults import KINDS
+from sitl.figures import SETPOINT, STYLES
+from sitl.scenario import AXES
+
+ENVELOPE_RUNS = 400  # flown again for the envelopes: the first ones, which are as random as any
+CELLS, A_CELL = 16, 8  # of the map: at most so many on each side, with so many flights in each on average
+POINTS = 300  # of a distribution's curve
+CROSSES = 200  # lost flights that the map shows one by one
+LARGEST = 75.0  # deg, that the envelopes show
+VERMILLION = "#D55E00"
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """The first runs of a campaign, flown again; memory does not grow with the campaign.
+
+    Attributes
+    ----------
+    angles : dict
+        (gain set, index of the scenario) -> (runs, N, 2) array: true roll and pitch, deg.
+    survived : dict
+        The same -> (runs,) array.
+    """
+
+    angles: dict[tuple[str, int], NDArray[np.float32]]
+    survived: dict[tuple[str, int], NDArray[np.bool_]]
+
+
+def fly_sample(stand: Stand) -> Sample:
+    """Fly the runs of the envelopes."""
+    plan, runs = stand.plan, min(stand.plan.description.runs, ENVELOPE_RUNS)
+    keys = [(name, index) for name in plan.gains for index in range(len(plan.scenarios))]
+    angles = {key: np.empty((runs, len(stand.truth), 2), np.float32) for key in keys}
+    survived = {key: np.empty(runs, np.bool_) for key in keys}
+    for run in range(runs):
+        draw = stand.draw(run)
+        for key in keys:
+            flight = stand.fly(draw, *key)
+            angles[key][run] = np.degrees(flight.truth["attitude"][:, :2])
+            survived[key][run] = flight.crashed_at is None
+    return Sample(angles, survived)
+
+
+def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) -> Figure:
+    """Responses of all gain sets on one axis: median, 5 to 95 %, and the worst flight; rows are gain sets.
+
+    Parameters
+    ----------
+    stand : Stand
+        Flies the worst again.
+    sample : Sample
+        From `fly_sample`.
+    results : Results
+        Knows the worst flights.
+    index : int
+        Of the scenario.
+    """
+    plan = stand.plan
+    scenario, axis = plan.scenarios[index], plan.scenarios[index].axis
+    time = (np.arange(len(scenario.setpoint)) - scenario.window[0]) * scenario.Ts
+    figure = Figure(figsize=(9, 0.9 + 2.6 * len(plan.gains)), layout="constrained")
+    panels: Any = figure.subplots(len(plan.gains), 2, sharex=True, sharey="col", squeeze=False)
+    for row, name, (colour, _) in zip(panels, plan.gains, cycle(STYLES), strict=False):
+        angles, survived = sample.angles[name, index], sample.survived[name, index]
+        bad = results.worst(name, AXES[axis], 1)[0].run
+        worst = np.degrees(stand.fly(stand.draw(bad), name, index).truth["attitude"][:, :2])
+        for panel, shown in zip(row, (axis, 1 - axis), strict=True):
+            if shown == axis:
+                panel.step(time, np.degrees(scenario.setpoint[:, axis]), where="post", label="set-point", **SETPOINT)
+            if survived.any():
+                low, median, high = np.percentile(angles[survived, :, shown], (5, 50, 95), axis=0)
+                panel.fill_between(time, low, high, color=colour, alpha=0.3, linewidth=0, label="5 to 95 %")
+                panel.plot(time, median, color=colour, linewidth=1.8, label="median")
+            panel.plot(time, worst[:, shown], color="black", linestyle=":", linewidth=1.2, label=f"worst: run {bad}")
+            panel.grid(alpha=0.3)
+            panel.set_title(f"{name}: {AXES[shown]}{'' if shown == axis else ', off-axis'}", loc="left", fontsize=10)
+            panel.set_ylabel("angle [deg]")
+        row[0].legend(fontsize=8, loc="upper right", ncols=2)
+        if not survived.all():
+            row[1].set_title(f"{int((~survived).sum())} of {len(survived)} lost: not shown", loc="right", fontsize=8)
+    for panel in panels[0]:  # a vehicle that tumbles must not flatten the other curves; room for the legend
+        low, high = panel.get_ylim()
+        low, high = max(low, -LARGEST), min(high, LARGEST)
+        panel.set_ylim(low, high + 0.3 * (high - low))
+    for panel in panels[-1]:
+        panel.set_xlabel("time from the start of the manoeuvre [s]")
+        panel.set_xlim(max(-0.1, time[0]), time[-1])
+    figure.suptitle(f"{AXES[axis].capitalize()} {scenario.name}", x=0.02, ha="left")
+    return figure
+
+
+def distribution_figure(results: Results, axis: str) -> Figure:
+    """Share of the flights whose figure is at most x, one curve a gain set; lost flights never are."""
+    plan, names = results.plan, ("J_M_o", "offaxis_peak_deg", "peak_deg", "effort_rms")
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    panels: Any = figure.subplots(2, 2, sharey=True)
+    for panel, name in zip(panels.flat, names, strict=True):
+        for gains, (colour, style) in zip(plan.gains, cycle(STYLES), strict=False):
+            survived = results.column("survived", gains, axis)
+            ordered = np.sort(results.column(name, gains, axis)[survived])
+            if not len(ordered):
+                continue
+            at = np.unique(np.linspace(0, len(ordered) - 1, POINTS).astype(int))
+            share = (at + 1) / len(survived)
+            panel.step(ordered[at], share, where="post", color=colour, linestyle=style, linewidth=1.8, label=gains)
+        if name == "J_M_o":
+            panel.set_xscale("log")
+        panel.set_xlabel(FIGURES[name])
+        panel.set_ylim(0, 1.02)
+        panel.grid(alpha=0.3, which="both")
+    for row in panels:
+        row[0].set_ylabel("share of flights [-]")
+    if panels[0, 0].lines:
+        panels[0, 0].legend(fontsize=8, loc="lower right")
+    figure.suptitle(f"Distributions, {axis}", x=0.02, ha="left")
+    return figure
+
+
+def varied(plan: Plan) -> list[str]:
+    """Columns of the results that are drawn, in their order."""
+    variator = Variator(plan.airframe, plan.description.vary, plan.scenarios[0])
+    return [quantity.name for quantity in variator.quantities]
+
+
+def parse_map(plan: Plan, text: str) -> tuple[str, str]:
+    """The two quantities of a survival map, from NAME,NAME.
+
+    Raises
+    ------
+    SitlError
+        When there are not two of those that vary.
+    """
+    known = varied(plan)
+    first, _, second = text.partition(",")
+    if first == second or not {first, second} <= set(known):
+        raise SitlError(f"--map: got {text!r}, expected two of those that vary: {', '.join(known) or 'none'}")
+    return first, second
+
+
+def choose_map(results: Results) -> tuple[str, str] | None:
+    """The two quantities that have most to do with survival, or with J_M,o where all survive, by rank.
+
+    None when fewer than two vary.
+    """
+    plan, known = results.plan, varied(results.plan)
+    if len(known) < 2:
+        return None
+    strength = dict.fromkeys(known, 0.0)
+    for gains in plan.gains:
+        for axis in plan.description.axes:
+            survived = results.column("survived", gains, axis)
+            badness = ~survived if not survived.all() else rankdata(results.column("J_M_o", gains, axis))
+            for name in known:
+                strength[name] = max(strength[name], _correlation(results.column(name, gains, axis), badness))
+    first, second = sorted(known, key=lambda name: -strength[name])[:2]
+    return first, second
+
+
+def _correlation(value: NDArray[Any], other: NDArray[Any]) -> float:
+    """Absolute rank correlation of a quantity, also of its distance from its median."""
+    if np.ptp(value) == 0 or np.ptp(other.astype(float)) == 0:
+        return 0.0
+    both = (rankdata(value), rankdata(np.abs(value - np.median(value))))
+    return max(abs(float(np.corrcoef(one, other)[0, 1])) for one in both)
+
+
+def survival_figure(results: Results, axis: str, names: tuple[str, str]) -> Figure:
+    """Share of the flights that survived, over two varied quantities; one panel a gain set."""
+    plan = results.plan
+    columns = min(len(plan.gains), 3)
+    lines = -(-len(plan.gains) // columns)
+    figure = Figure(figsize=(max(3.2 * columns + 0.8, 5), 3.0 * lines + 0.6), layout="constrained")
+    panels: Any = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
+    image: Any = None
+    for panel, gains in zip(panels.flat, plan.gains, strict=False):
+        x, y, survived = (results.column(name, gains, axis) for name in (*names, "survived"))
+        cells = int(np.clip(np.sqrt(len(x) / A_CELL), 4, CELLS))
+        edges = [_edges(x, cells), _edges(y, cells)]
+        all_flights, _, _ = np.histogram2d(x, y, edges)
+        good, _, _ = np.histogram2d(x[survived], y[survived], edges)
+        share = np.divide(good, all_flights, out=np.full_like(good, np.nan), where=all_flights > 0)
+        image = panel.pcolormesh(*edges, share.T, cmap="cividis", vmin=0, vmax=1, rasterized=True)
+        lost = np.flatnonzero(~survived)[:CROSSES]
+        panel.plot(x[lost], y[lost], "x", color=VERMILLION, markersize=3, markeredgewidth=0.8)
+        panel.set_title(f"{gains}: {int(survived.sum())} of {len(survived)} survived", loc="left", fontsize=10)
+        panel.set_facecolor("white")
+    for panel in panels[-1]:
+        panel.set_xlabel(label(plan, names[0]))
+    for row in panels:
+        row[0].set_ylabel(label(plan, names[1]))
+    for panel in list(panels.flat)[len(plan.gains) :]:
+        panel.set_visible(False)
+    figure.colorbar(image, ax=panels, label="share survived [-]  (white: not flown; x: lost)")
+    figure.suptitle(f"Survived, {axis}", x=0.02, ha="left")
+    return figure
+
+
+def _edges(value: NDArray[Any], cells: int) -> NDArray[np.float64]:
+    """Cells over a quantity: its own values where they are few."""
+    few = np.unique(value)
+    if len(few) <= CELLS:
+        middle = (few[1:] + few[:-1]) / 2
+        step = np.diff(few).min() if len(few) > 1 else 1.0
+        return np.concatenate([[few[0] - step / 2], middle, [few[-1] + step / 2]])
+    return np.linspace(value.min(), value.max(), cells + 1)
+
+
+def label(plan: Plan, name: str) -> str:
+    """A varied quantity with its unit."""
+    if name.startswith("fault."):
+        _, number, field = name.split(".")
+        kind = plan.description.vary.fault[int(number) - 1].kind
+        unit = {"size": KINDS[kind].unit, "motor": "-"}.get(field, "s")
+        return f"{kind}: {field} [{unit}]"
+    return f"{name} [{next(unit for start, unit in UNITS.items() if name.startswith(start))}]"

@@ -1,0 +1,154 @@
+"""The flights of a campaign, chunk by chunk: what every worker does, on this machine or another."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from dataclasses import fields
+from functools import lru_cache
+from threading import Lock
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from codegen.render import generator_version
+from sitl.autopilot import RECORD, Autopilot
+from sitl.campaign.draws import Draw, Variator
+from sitl.campaign.plan import Plan, plan_from_files
+from sitl.errors import SitlError
+from sitl.injection import Injection
+from sitl.loop import TRUTH, Flight, Simulator, first_loss
+from sitl.metrics import Performance, performance
+from sitl.models import reference_models
+
+CHUNK = 64  # runs: what is lost of a worker that dies
+FIGURES = tuple(field.name for field in fields(Performance))
+_one_at_a_time = Lock()
+
+
+class Stand:
+    """A vehicle, its gain sets and buffers for one flight, used again and again.
+
+    Parameters
+    ----------
+    plan : Plan
+        What is flown.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan = plan
+        first = next(iter(plan.gains.values()))
+        self.autopilots = {name: Autopilot(plan.airframe, gains) for name, gains in plan.gains.items()}
+        self.models = {
+            (name, scenario.axis): reference_models(gains, scenario.axis)
+            for name, gains in plan.gains.items()
+            for scenario in plan.scenarios
+        }
+        self.simulator = Simulator(plan.airframe, first.Ts, 0)
+        samples = len(plan.scenarios[0].setpoint)
+        self.noise = np.empty((samples, self.simulator.noise(1).shape[1]))
+        self.truth = np.zeros(samples, TRUTH)
+        self.record = np.zeros(samples, RECORD)
+        self.runs = np.ones(samples, np.int64)
+        self.variator = Variator(plan.airframe, plan.description.vary, plan.scenarios[0])
+
+    def draw(self, run: int) -> Draw:
+        """Everything random of a run: what varies, and the noise, which is the same for all its flights."""
+        seed = self.plan.description.seed
+        np.random.default_rng([seed, run, 1]).standard_normal(out=self.noise)
+        return self.variator.draw(seed, run)
+
+    def fly(self, draw: Draw, gains: str, index: int) -> Flight:
+        """One flight of the run that was drawn last, on the axis of the scenario `index`; the next overwrites it."""
+        simulator, autopilot, record = self.simulator, self.autopilots[gains], self.record
+        scenario = self.plan.scenarios[index]
+        simulator.plant, simulator.delay = draw.plant, draw.delay
+        simulator.sensors = simulator.sensors._replace(
+            angle_deviation=draw.angle_deviation, rate_deviation=draw.rate_deviation
+        )
+        simulator.restart(draw.state.copy())
+        autopilot.restart()
+        seed = [self.plan.description.seed, draw.run, 1]
+        injection = Injection(draw.faults, self.plan.airframe, simulator, scenario.Ts, seed, autopilot)
+        record["setpoint"] = injection.setpoints(draw.factor * scenario.setpoint)
+        self.runs[:] = 1
+        for piece, runs, delays in injection.stretches(0, len(record)):
+            simulator.fly(autopilot, self.noise[piece], record[piece], self.truth[piece], runs, delays)
+            if runs is not None:
+                self.runs[piece] = runs
+        return Flight(scenario, record, self.truth, self.runs)
+
+    def flights(self, run: int) -> Iterator[tuple[dict[str, Any], Flight]]:
+        """All flights of a run, each with its row of the results."""
+        draw = self.draw(run)
+        for name in self.plan.gains:
+            for index, axis in enumerate(self.plan.description.axes):
+                flight = self.fly(draw, name, index)
+                yield self.row(run, draw, name, axis, flight), flight
+
+    def row(self, run: int, draw: Draw, name: str, axis: str, flight: Flight) -> dict[str, Any]:
+        """What the results say of a flight."""
+        lost = first_loss(flight.truth, flight.record, flight.scenario.Ts)
+        figures = performance(flight, *self.models[name, flight.scenario.axis])
+        return {
+            "run": run,
+            "gains": name,
+            "axis": axis,
+            "survived": lost < 0,
+            "lost_at_s": lost * flight.scenario.Ts if lost >= 0 else np.nan,
+            **vars(figures),
+            "rejected_draws": draw.rejected,
+            **draw.values,
+        }
+
+
+def chunks(plan: Plan) -> int:
+    """In how many chunks a campaign is flown."""
+    return -(-plan.description.runs // CHUNK)
+
+
+def fly_chunk(files: dict[str, str], chunk: int) -> bytes:
+    """Fly the runs of a chunk.
+
+    Parameters
+    ----------
+    files : dict
+        Of the `Plan`.
+    chunk : int
+        From 0.
+
+    Returns
+    -------
+    bytes
+        A Parquet file: a row for each flight, by run, gain set and axis.
+
+    Raises
+    ------
+    SitlError
+        When this machine has another version of mimopilot than the one that leads.
+    """
+    with _one_at_a_time:  # a cluster's worker may have several threads, the stand is one
+        stand = stand_of(tuple(files.items()))
+        version = stand.plan.description.mimopilot
+        if version != generator_version():
+            raise SitlError(f"a worker has mimopilot {generator_version()}, the campaign is one of {version}")
+        first = chunk * CHUNK
+        last = min(first + CHUNK, stand.plan.description.runs)
+        rows = [row for run in range(first, last) for row, _ in stand.flights(run)]
+    stream = io.BytesIO()
+    pq.write_table(pa.Table.from_pylist(rows, schema(rows[0])), stream)
+    return stream.getvalue()
+
+
+def schema(row: dict[str, Any]) -> pa.Schema:
+    """Types of the results' columns."""
+    types = {int: pa.int64(), bool: pa.bool_(), str: pa.dictionary(pa.int32(), pa.string())}
+    return pa.schema([(name, types.get(type(value), pa.float64())) for name, value in row.items()])
+
+
+@lru_cache(maxsize=1)
+def stand_of(files: tuple[tuple[str, str], ...]) -> Stand:
+    """The stand of a plan, kept for the next chunk of the same."""
+    return Stand(plan_from_files(dict(files)))

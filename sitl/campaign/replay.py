@@ -1,0 +1,89 @@
+"""One flight of a campaign, flown again from what lies in its folder."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from sitl.campaign.flights import Stand
+from sitl.campaign.plan import RESULTS, SPEC, Plan, plan_from_files, read_files
+from sitl.errors import SitlError
+from sitl.loop import Flight
+
+
+@dataclass(frozen=True, eq=False)
+class Again:
+    """The flight, its row of figures, and the row that the results have for it (None before they are merged)."""
+
+    plan: Plan
+    flight: Flight
+    row: dict[str, Any]
+    flown: dict[str, Any] | None
+
+    def compare(self) -> None:
+        """Check that it was the same flight, bit for bit.
+
+        Raises
+        ------
+        SitlError
+            When a figure differs from that in the results.
+        """
+        for name, value in (self.flown or {}).items():
+            if not _same(value, self.row.get(name)):
+                raise SitlError(
+                    f"{name} is {self.row.get(name)!r}, in the results {value!r}: the campaign was flown by another "
+                    "version, compiler or processor",
+                    exit_code=1,
+                )
+
+
+def fly_again(folder: Path, run: int, gains: str | None, axis: str | None) -> Again:
+    """Fly a run again.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the campaign.
+    run : int
+    gains, axis : str or None
+        The first of the campaign when not given.
+
+    Raises
+    ------
+    SitlError
+        When the campaign has no such run, or the folder no campaign.
+    """
+    files = read_files(folder)
+    if not files:
+        raise SitlError(f"{folder}: no campaign is here, {SPEC} is missing")
+    plan = plan_from_files(files, str(folder))
+    d = plan.description
+    gains, axis = gains or d.gains[0], axis or d.axes[0]
+    if run >= d.runs or gains not in d.gains or axis not in d.axes:
+        raise SitlError(
+            f"--run {run} --gains {gains} --axis {axis}: the campaign has runs 0 to {d.runs - 1}, gains "
+            f"{', '.join(d.gains)} and axes {', '.join(d.axes)}"
+        )
+    stand = Stand(plan)
+    draw = stand.draw(run)
+    flight = stand.fly(draw, gains, d.axes.index(axis))
+    return Again(plan, flight, stand.row(run, draw, gains, axis, flight), _flown(folder / RESULTS, run, gains, axis))
+
+
+def _flown(results: Path, run: int, gains: str, axis: str) -> dict[str, Any] | None:
+    if not results.is_file():
+        return None
+    chosen = (pc.field("run") == run) & (pc.field("gains") == gains) & (pc.field("axis") == axis)
+    (row,) = pq.read_table(results, filters=chosen).to_pylist()
+    return dict(row)
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, float) and isinstance(b, float):
+        return np.float64(a).tobytes() == np.float64(b).tobytes() or (a != a and b != b)
+    return bool(a == b)

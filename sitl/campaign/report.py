@@ -1,0 +1,83 @@
+"""The report of a campaign: tables and figures in one page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sitl.campaign import figures
+from sitl.campaign.flights import stand_of
+from sitl.campaign.plan import SPEC
+from sitl.campaign.summary import (
+    FIGURE_COLUMNS,
+    SURVIVAL_COLUMNS,
+    WORST_COLUMNS,
+    Results,
+    Summary,
+    figure_rows,
+    survival_rows,
+    worst_rows,
+)
+from sitl.figures import svg
+from sitl.report import Section, Table, write_report
+
+INTERVALS = (
+    "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "
+    "counts as worse than every other."
+)
+
+
+def write_campaign_report(results: Results, summary: Summary, over: tuple[str, str] | None = None) -> Path:
+    """Write `report.html` beside the results.
+
+    Parameters
+    ----------
+    results : Results
+        What was flown, and the table.
+    summary : Summary
+        Of it.
+    over : (str, str), optional
+        The quantities of the survival map; by default `sitl.campaign.figures.choose_map`.
+    """
+    plan = results.plan
+    d, stand = plan.description, stand_of(tuple(plan.files.items()))
+    what = [f"{d.amplitude_deg:g} degrees", f"{d.period_s:g} s", *d.faults]
+    lead = (
+        f"{plan.airframe.name}: {d.runs} runs, seed {d.seed}, each a {d.manoeuvre} on {' and '.join(d.axes)} "
+        f"({', '.join(what)}) under {', '.join(plan.gains)}. All fly the same vehicles with the same noise. "
+        f"{summary.rejected} draws of no vehicle that flies were drawn again."
+    )
+    tables = [
+        Table("Survived", SURVIVAL_COLUMNS, survival_rows(summary)),
+        Table("Figures", FIGURE_COLUMNS, figure_rows(summary)),
+        Table("Worst flights; the commands are for this folder", WORST_COLUMNS, worst_rows(summary, ".")),
+    ]
+    sample = figures.fly_sample(stand)
+    envelopes = [
+        svg(figures.envelope_figure(stand, sample, results, index), f"envelope {axis}")
+        for index, axis in enumerate(d.axes)
+    ]
+    sections = [
+        Section("Summary", INTERVALS, tables=tables),
+        Section(
+            "Responses",
+            f"True angles of those of the first {min(d.runs, figures.ENVELOPE_RUNS)} runs that survived, and of the "
+            "worst run of all.",
+            figures=envelopes,
+        ),
+        Section(
+            "Distributions",
+            "Share of all flights whose figure is at most that of the abscissa: left is better, and a curve that ends "
+            "below 1 has lost the rest.",
+            figures=[svg(figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes],
+        ),
+    ]
+    names = over or figures.choose_map(results)
+    if names:
+        maps = [svg(figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
+        sections.append(Section("Survival", "Over two of the quantities that vary.", figures=maps))
+    sections.append(
+        Section("What was flown", "", tables=[Table(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])])
+    )
+    path = results.path.with_name("report.html")
+    write_report(path, f"mimopilot campaign: {plan.airframe.name}", lead, sections)
+    return path

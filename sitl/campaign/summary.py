@@ -1,0 +1,173 @@
+"""What a campaign shows: survival and figures with their intervals, and the worst flights."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from sitl.campaign.plan import Plan
+from sitl.commands import UNITS
+from sitl.intervals import quantile, wilson
+
+#: Figures that are summed up.
+SHOWN = ("J_M_o", "peak_deg", "offaxis_peak_deg", "effort_rms", "saturated")
+QUANTILES = (0.5, 0.95)
+WORST = 3
+BATCH = 1 << 14  # rows
+
+
+@dataclass(frozen=True)
+class Worst:
+    """A bad flight and what became of it."""
+
+    run: int
+    lost_at_s: float | None
+    J_M_o: float
+
+
+@dataclass(frozen=True)
+class Group:
+    """All flights of one gain set on one axis.
+
+    Attributes
+    ----------
+    gains, axis : str
+    flights, survived : int
+    survived_share : (low, high)
+        Wilson's 95 % interval of the probability to survive.
+    quantiles : dict
+        Figure -> {"0.5": (value, low, high), ...}, 95 % intervals; a lost flight counts as worse than all others:
+        infinity.
+    worst : tuple of Worst
+        Lost ones first, by time; then by J_M,o.
+    """
+
+    gains: str
+    axis: str
+    flights: int
+    survived: int
+    survived_share: tuple[float, float]
+    quantiles: dict[str, dict[str, tuple[float, float, float]]]
+    worst: tuple[Worst, ...]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Of a whole campaign; `rejected` impossible draws were replaced."""
+
+    runs: int
+    rejected: int
+    groups: tuple[Group, ...]
+
+    def as_json(self, folder: str) -> dict[str, Any]:
+        """The object that ``--json`` prints and `summary.json` holds; commands are for a campaign in `folder`."""
+        table = asdict(self)
+        for group in table["groups"]:
+            for one in group["worst"]:
+                one["replay"] = replay_command(folder, one["run"], group["gains"], group["axis"])
+        return table
+
+
+def replay_command(folder: str, run: int, gains: str, axis: str) -> str:
+    """What flies a run again."""
+    return shlex.join(["mimopilot", "replay", folder, "--run", str(run), "--gains", gains, "--axis", axis])
+
+
+class Results:
+    """The table of a campaign, column by column: 8 bytes a flight are in memory at a time.
+
+    Parameters
+    ----------
+    plan : Plan
+        What was flown: rows stand by run, gain set and axis.
+    path : Path
+        Parquet file.
+    """
+
+    def __init__(self, plan: Plan, path: Path) -> None:
+        self.plan, self.path = plan, path
+
+    def column(self, name: str, gains: str, axis: str) -> NDArray[Any]:
+        """One column of the flights of a gain set on an axis, (runs,)."""
+        axes = self.plan.description.axes
+        stride = len(self.plan.gains) * len(axes)
+        offset = list(self.plan.gains).index(gains) * len(axes) + axes.index(axis)
+        parts, start = [], 0
+        with pq.ParquetFile(self.path) as table:
+            for batch in table.iter_batches(BATCH, columns=[name]):
+                values = batch.column(0).to_numpy(zero_copy_only=False)
+                parts.append(values[(offset - start) % stride :: stride].copy())
+                start += len(values)
+        return np.concatenate(parts)
+
+    def worst(self, gains: str, axis: str, count: int) -> list[Worst]:
+        """The worst flights of a group: lost ones first, by time; then by J_M,o."""
+        badness, lost_at = self.column("J_M_o", gains, axis), self.column("lost_at_s", gains, axis)
+        lost = np.isfinite(lost_at)
+        order = np.lexsort((-np.where(lost, 0.0, badness), np.where(lost, lost_at, np.inf)))[:count]
+        return [Worst(int(i), float(lost_at[i]) if lost[i] else None, float(badness[i])) for i in order]
+
+    def summarise(self) -> Summary:
+        """Sum up all groups."""
+        d = self.plan.description
+        groups = tuple(self._group(gains, axis) for gains in d.gains for axis in d.axes)
+        return Summary(d.runs, int(self.column("rejected_draws", d.gains[0], d.axes[0]).sum()), groups)
+
+    def _group(self, gains: str, axis: str) -> Group:
+        survived = self.column("survived", gains, axis)
+        n, k = len(survived), int(survived.sum())
+        quantiles = {}
+        for name in SHOWN:
+            ordered = np.sort(np.where(survived, self.column(name, gains, axis), np.inf))
+            quantiles[name] = {f"{p:g}": quantile(ordered, p) for p in QUANTILES}
+        return Group(gains, axis, n, k, wilson(k, n), quantiles, tuple(self.worst(gains, axis, WORST)))
+
+
+SURVIVAL_COLUMNS = ("gains, axis", "survived", "95 % interval")
+FIGURE_COLUMNS = ("figure", "gains, axis", "median", "95 % interval", "95 % quantile", "95 % interval")
+WORST_COLUMNS = ("gains, axis", "run", "lost at [s]", "J_M,o [rad^2]", "flown again by")
+
+
+def survival_rows(summary: Summary) -> list[list[str]]:
+    """A row for each gain set and axis."""
+    return [
+        [f"{g.gains}, {g.axis}", f"{g.survived}/{g.flights}", "{:.2%} to {:.2%}".format(*g.survived_share)]
+        for g in summary.groups
+    ]
+
+
+def figure_rows(summary: Summary) -> list[list[str]]:
+    """A row for each figure of each gain set and axis: quantiles with their intervals."""
+    return [
+        [UNITS[name], f"{group.gains}, {group.axis}", *(cell for p in QUANTILES for cell in _cells(group, name, p))]
+        for name in SHOWN
+        for group in summary.groups
+    ]
+
+
+def _cells(group: Group, name: str, p: float) -> tuple[str, str]:
+    """A quantile and its interval; a bound that the sample is too small for is a dash."""
+    found = group.quantiles[name][f"{p:g}"]
+    value, low, high = ("lost" if v == np.inf else "-" if np.isnan(v) else f"{v:.3g}" for v in found)
+    return value, f"{low} to {high}"
+
+
+def worst_rows(summary: Summary, folder: str) -> list[list[str]]:
+    """A row for each of the worst flights."""
+    return [
+        [
+            f"{group.gains}, {group.axis}",
+            str(one.run),
+            "-" if one.lost_at_s is None else f"{one.lost_at_s:.2f}",
+            f"{one.J_M_o:.4g}",
+            replay_command(folder, one.run, group.gains, group.axis),
+        ]
+        for group in summary.groups
+        for one in group.worst
+    ]

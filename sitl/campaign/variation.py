@@ -1,0 +1,239 @@
+"""What varies from run to run: distributions of the vehicle, its sensors, the weather, the start and the faults.
+
+A specification is TOML. Each entry is a distribution, ``{ uniform = [low, high] }``, ``{ normal = [mean, deviation] }``
+or ``{ loguniform = [low, high] }``, in SI units; with ``relative = true`` it is a factor on the airframe's own value.
+Whole numbers of samples are rounded, so that ``delay = { uniform = [0.5, 3.5] }`` draws 1, 2 and 3 alike.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sitl.airframe import Vector
+from sitl.errors import SitlError
+from sitl.faults import complaint
+
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Pair = tuple[Finite, Finite]
+
+
+class Distribution(BaseModel):
+    """One quantity: exactly one of the three kinds."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    uniform: Pair | None = None
+    normal: Pair | None = None
+    loguniform: Pair | None = None
+    relative: bool = False
+
+    @model_validator(mode="after")
+    def _is_one_distribution(self) -> Distribution:
+        kinds = [name for name in ("uniform", "normal", "loguniform") if getattr(self, name) is not None]
+        if len(kinds) != 1:
+            raise ValueError("expected exactly one of uniform, normal and loguniform")
+        first, second = getattr(self, kinds[0])
+        if kinds == ["normal"] and second < 0:
+            raise ValueError("normal: expected [mean, deviation], the deviation not negative")
+        if kinds != ["normal"] and not first <= second:
+            raise ValueError(f"{kinds[0]}: expected [low, high] in this order")
+        if kinds == ["loguniform"] and first <= 0:
+            raise ValueError("loguniform: expected bounds above 0")
+        return self
+
+    def draw(self, generator: np.random.Generator, own: float = 0.0) -> float:
+        """A number; `own` is the airframe's value, for relative ones."""
+        if self.normal is not None:
+            mean, deviation = self.normal
+            value = mean + deviation * generator.standard_normal()
+        elif self.uniform is not None:
+            low, high = self.uniform
+            value = low + (high - low) * generator.random()
+        else:
+            assert self.loguniform is not None
+            low, high = self.loguniform
+            value = low * (high / low) ** generator.random()
+        return value * own if self.relative else value
+
+
+Number = Finite | Distribution
+
+
+def _absolute(value: Distribution) -> Distribution:
+    if value.relative:
+        raise ValueError("the airframe has no value of its own that this could be relative to")
+    return value
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    def entries(self) -> Iterator[tuple[str, Distribution]]:
+        """Names and distributions of what varies."""
+        for name in type(self).model_fields:
+            if isinstance(value := getattr(self, name), Distribution):
+                yield name, value
+
+
+class InertiaVariation(_Table):
+    """Moments of inertia, kg m^2: each axis is scaled, the share of coupling (product over their root) stays."""
+
+    xx: Distribution | None = None
+    yy: Distribution | None = None
+    zz: Distribution | None = None
+
+
+class ProductVariation(_Table):
+    """Off-diagonal elements of the tensor, kg m^2 (minus the products of inertia), in place of the airframe's."""
+
+    xy: Distribution | None = None
+    xz: Distribution | None = None
+    yz: Distribution | None = None
+
+
+class MotorVariation(_Table):
+    """Constants of all motors, as in the airframe's file; `effectiveness` (share of thrust) is drawn for each motor."""
+
+    thrust_max: Distribution | None = None
+    time_constant: Distribution | None = None
+    torque_ratio: Distribution | None = None
+    effectiveness: Distribution | None = None
+
+
+class NoiseVariation(_Table):
+    """Standard deviation of the state estimate: angle (rad), rate (rad/s)."""
+
+    angle: Distribution | None = None
+    rate: Distribution | None = None
+
+
+class _AbsoluteTable(_Table):
+    @model_validator(mode="after")
+    def _is_absolute(self) -> Any:
+        for _, value in self.entries():
+            _absolute(value)
+        return self
+
+
+class WindVariation(_AbsoluteTable):
+    """Constant wind, m/s: velocity of the air."""
+
+    north: Distribution | None = None
+    east: Distribution | None = None
+    down: Distribution | None = None
+
+
+class AngleVariation(_AbsoluteTable):
+    """Three angles or body rates at the start."""
+
+    roll: Distribution | None = None
+    pitch: Distribution | None = None
+    yaw: Distribution | None = None
+
+
+class FaultVariation(_Table):
+    """A fault, see `sitl.faults.Fault`, whose numbers may be distributions; a drawn motor is a whole number."""
+
+    kind: str
+    at: Number
+    duration: Number | None = None
+    size: Number | None = None
+    motor: Number | None = None
+    axis: str | None = None
+    position: Vector | None = None
+    matrix: str | None = None
+
+    @model_validator(mode="after")
+    def _is_absolute(self) -> Any:
+        for _, value in self.entries():
+            _absolute(value)
+        return self
+
+
+class Variation(_Table):
+    """A specification; what is not named stays as the airframe has it.
+
+    Attributes
+    ----------
+    mass : kg
+        Of the whole vehicle.
+    inertia, products, motors, noise, wind
+        See their classes.
+    attitude_deg, rates_deg_s : degrees, deg/s
+        At the start.
+    rate_damping : 1/s
+    drag : N s/m
+    delay : samples
+        Whole control periods between a measurement and the motor command made from it.
+    amplitude_deg : degrees
+        Largest angle of the set-points.
+    fault
+        What goes wrong, beside the faults of the scenario.
+    """
+
+    mass: Distribution | None = None
+    inertia: InertiaVariation = InertiaVariation()
+    products: ProductVariation = ProductVariation()
+    motors: MotorVariation = MotorVariation()
+    rate_damping: Distribution | None = None
+    drag: Distribution | None = None
+    delay: Distribution | None = None
+    noise: NoiseVariation = NoiseVariation()
+    wind: WindVariation = WindVariation()
+    attitude_deg: AngleVariation = AngleVariation()
+    rates_deg_s: AngleVariation = AngleVariation()
+    amplitude_deg: Distribution | None = None
+    fault: tuple[FaultVariation, ...] = ()
+
+
+def read_variation(path: Path) -> dict[str, Any]:
+    """The table of a specification's file, checked; see `variation_from_toml`."""
+    try:
+        text = path.read_text()
+    except UnicodeDecodeError as error:
+        raise SitlError(f"{path}: not a TOML file: {error}") from error
+    variation_from_toml(text, str(path))
+    return tomllib.loads(text)
+
+
+def variation_from_toml(text: str, where: str) -> Variation:
+    """Parse a specification; `where` names it in messages.
+
+    Raises
+    ------
+    SitlError
+        When it is not TOML, or an entry is unknown or impossible.
+    """
+    try:
+        return Variation.model_validate(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise SitlError(f"{where}: not a TOML file: {error}") from error
+    except ValidationError as error:
+        raise SitlError(f"{where}: {complaint(error)}") from error
+
+
+#: Beginning of a drawn quantity's name -> its unit.
+UNITS = {
+    "mass": "kg",
+    "inertia": "kg m^2",
+    "products": "kg m^2",
+    "motors.thrust_max": "N",
+    "motors.time_constant": "s",
+    "motors.torque_ratio": "m",
+    "motors.effectiveness": "-",
+    "rate_damping": "1/s",
+    "drag": "N s/m",
+    "delay": "samples",
+    "noise.angle": "rad",
+    "noise.rate": "rad/s",
+    "wind": "m/s",
+    "attitude_deg": "deg",
+    "rates_deg_s": "deg/s",
+    "amplitude_deg": "deg",
+}

@@ -1,0 +1,100 @@
+"""The closed-loop experiment that gains are tuned from, once or many times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sitl.airframe import Airframe
+from sitl.autopilot import Autopilot
+from sitl.loop import Flight, fly
+from sitl.recorder import save_flight
+from sitl.scenario import excitation_flight
+from tuning.gains import Gains
+from tuning.parallel import processes, run_all
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentPlan:
+    """An experiment.
+
+    Attributes
+    ----------
+    airframe : Airframe
+    gains : Gains
+        Under which it is flown.
+    seconds_per_axis, amplitude, bandwidth : float
+        See `sitl.scenario.excitation_flight`.
+    excitation_seed : int or None
+        Of the injected moment; None: that of the flight, so that each has another excitation.
+    """
+
+    airframe: Airframe
+    gains: Gains
+    seconds_per_axis: float
+    amplitude: float
+    bandwidth: float
+    excitation_seed: int | None
+
+    def fly(self, seed: int) -> Flight:
+        """Fly it; the seed is that of the measurement noise."""
+        generator = np.random.default_rng(seed if self.excitation_seed is None else self.excitation_seed)
+        scenario = excitation_flight(self.seconds_per_axis, self.amplitude, self.bandwidth, self.gains.Ts, generator)
+        return fly(self.airframe, Autopilot(self.airframe, self.gains), scenario, seed)
+
+    def record(self, path: Path, seed: int) -> Flight:
+        """Fly it and write its log."""
+        flight = self.fly(seed)
+        save_flight(path, flight, self.airframe, self.gains)
+        return flight
+
+
+def repeat_experiment(
+    plan: ExperimentPlan, folder: Path, seeds: range, workers: int, done: Callable[[], Any]
+) -> dict[int, float]:
+    """Write the log of an experiment for each seed: `flight-SEED.ulg`.
+
+    Parameters
+    ----------
+    plan : ExperimentPlan
+        What to fly.
+    folder : Path
+        Where the logs go.
+    seeds : range
+        One flight each.
+    workers : int
+        Processes.
+    done : callable
+        Called after each flight.
+
+    Returns
+    -------
+    dict
+        Seeds of the vehicles that were lost -> when, s. Their logs are written too.
+    """
+    lost: dict[int, float] = {}
+    first = plan.record(log_name(folder, seeds[0]), seeds[0])  # compiles before workers are forked
+
+    def keep(seed: int, crashed_at: float | None) -> None:
+        if crashed_at is not None:
+            lost[seed] = crashed_at
+        done()
+
+    keep(seeds[0], first.crashed_at)
+    with processes(workers) as executor:
+        run_all(executor, 2 * workers, partial(_record, plan, folder), seeds[1:], keep)
+    return dict(sorted(lost.items()))
+
+
+def log_name(folder: Path, seed: int) -> Path:
+    """Where the log of a seed lies."""
+    return folder / f"flight-{seed:04d}.ulg"
+
+
+def _record(plan: ExperimentPlan, folder: Path, seed: int) -> float | None:
+    return plan.record(log_name(folder, seed), seed).crashed_at

@@ -1,0 +1,325 @@
+"""The table of faults: every standard fault, many seeds, several gain sets side by side."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from codegen.native import NativeController, NativeLibrary, load_native
+from sitl.airframe import Airframe, load_airframe
+from sitl.autopilot import Autopilot
+from sitl.faults import Fault, parse_fault
+from sitl.intervals import wilson
+from sitl.loop import Flight, fly
+from sitl.recovery import Recovery, recovery
+from sitl.scenario import Scenario, make_scenario
+from tuning.output import print_table, progress_console
+from tuning.parallel import processes, run_all
+
+AT = 1.1  # s: a tenth of a second into the manoeuvre
+TAIL_S = 5.0  # of level flight after it: what is lost in the end shall be lost in the flight
+COLUMNS = (
+    *("fault", "gains", "survived", "95 %", "peak [deg]", "worst", "RMS", "recovered [s]"),
+    *("saturated", "detected [s]", "non-finite"),
+)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked: everything that a worker process needs to know.
+
+    Attributes
+    ----------
+    airframe : str
+        Name or path.
+    gains : tuple of Path
+        See `sitl.airframe.Vehicle.gain_sets`.
+    axis : str
+    amplitude_deg, period_s : float
+        Of the doublet.
+    faults : tuple of Fault
+        Each is flown by itself; empty: `standard_faults`.
+    """
+
+    airframe: str
+    gains: tuple[Path, ...]
+    axis: str
+    amplitude_deg: float
+    period_s: float
+    faults: tuple[Fault, ...] = ()
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fault under one gain set, over all seeds; medians unless the name says otherwise.
+
+    Attributes
+    ----------
+    fault, gains : str
+    runs, survived : int
+    survival_interval : (low, high)
+        Wilson's, 95 %.
+    peak_deg, worst_peak_deg, rms_deg : float, deg
+        From the flight without faults, see `sitl.recovery.Recovery`; the worst is that of `worst_seed`.
+    recovered : int
+    recovery_s : float or None, s
+        Of those that recovered.
+    saturated : float
+        Samples.
+    detected : int
+    detected_s : float or None, s
+        Of those that were detected.
+    detected_by : str
+        What told it, by commas.
+    nonfinite : int
+        Of all seeds together.
+    worst_seed : int
+        The one that was lost first, else the one with the largest peak.
+    replay : str
+        The command that flies it again.
+    """
+
+    fault: str
+    gains: str
+    runs: int
+    survived: int
+    survival_interval: tuple[float, float]
+    peak_deg: float
+    worst_peak_deg: float
+    rms_deg: float
+    recovered: int
+    recovery_s: float | None
+    saturated: float
+    detected: int
+    detected_s: float | None
+    detected_by: str
+    nonfinite: int
+    worst_seed: int
+    replay: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """What was found.
+
+    Attributes
+    ----------
+    title : str
+    rows : tuple of Row
+        By fault, then by gain set.
+    lost_without, alarms_without : dict of int
+        Gain set -> of the flights without faults, those that were lost, and those in which something was detected.
+    """
+
+    title: str
+    rows: tuple[Row, ...]
+    lost_without: dict[str, int]
+    alarms_without: dict[str, int]
+
+    def as_json(self) -> dict[str, Any]:
+        """The object that ``--json`` prints."""
+        return asdict(self)
+
+    @property
+    def nonfinite(self) -> int:
+        """Outputs of all flights that were not finite numbers."""
+        return sum(row.nonfinite for row in self.rows)
+
+
+def standard_faults(airframe: Airframe) -> tuple[Fault, ...]:
+    """The faults that every vehicle is asked to survive, or to notice, with their sizes."""
+    x, y, z = (0.8 * place for place in airframe.rotors[2].position)
+    load = round(0.11 * airframe.mass, 3)
+    tick = "0.001"  # shorter than a period: one sample
+    texts = (
+        *(f"motor:3={share}@{AT}" for share in (0.9, 0.7, 0.5, 0)),
+        f"battery=0.8@{AT}+0.5",
+        f"mass:{x:.4g},{y:.4g},{z:.4g}={load}@{AT}",
+        *(f"delay={size}@{AT}" for size in (0.02, 0.028, 0.036)),
+        f"jitter=0.02@{AT}",
+        f"loss=0.5@{AT}",
+        f"duplicate=0.5@{AT}",
+        f"skip=5@{AT}",
+        f"clock=0.1@{AT}",
+        f"link@{AT}+0.2",
+        f"stale@{AT}+1",
+        *(f"gyro-stuck@{AT}+{length}" for length in (0.1, 0.2, 0.4)),
+        f"gyro-bias:roll=0.2@{AT}",
+        f"gyro-noise=0.1@{AT}",
+        f"gyro-nan@{AT}+{tick}",
+        f"gyro-nan@{AT}+0.2",
+        *(f"gain:Kp_i={factor}@{AT}" for factor in (0.25, 0.5, 2, 4)),
+    )
+    return tuple(map(parse_fault, texts))
+
+
+class Bench:
+    """A vehicle, its gain sets and what is flown with them: made once in each process."""
+
+    def __init__(self, request: Request) -> None:
+        vehicle = load_airframe(request.airframe)
+        self.airframe: Airframe = vehicle.airframe
+        self.gains = vehicle.gain_sets(request.gains)
+        self.libraries: dict[str, NativeLibrary] = {name: load_native(gains) for name, gains in self.gains.items()}
+        self.tasks: dict[str, Scenario] = {
+            name: make_scenario("doublet", request.axis, request.amplitude_deg, request.period_s, gains.Ts, TAIL_S)
+            for name, gains in self.gains.items()
+        }
+        self.faults = request.faults or standard_faults(self.airframe)
+
+    def fly(self, name: str, faults: tuple[Fault, ...], seed: int) -> Flight:
+        """One flight under a gain set."""
+        gains = self.gains[name]
+        autopilot = Autopilot(self.airframe, gains, NativeController(self.libraries[name], gains))
+        return fly(self.airframe, autopilot, replace(self.tasks[name], faults=faults), seed)
+
+    def fly_all(self, seed: int) -> dict[str, list[Recovery]]:
+        """Gain set -> the flight without faults, then one with each fault."""
+        found = {}
+        for name in self.gains:
+            sound = self.fly(name, (), seed)
+            found[name] = [recovery(sound, sound)]
+            found[name] += [recovery(self.fly(name, (fault,), seed), sound) for fault in self.faults]
+        return found
+
+
+@lru_cache(maxsize=1)
+def _bench(request: Request) -> Bench:
+    return Bench(request)
+
+
+def _fly_all(request: Request, seed: int) -> dict[str, list[Recovery]]:
+    return _bench(request).fly_all(seed)
+
+
+def fault_table(request: Request, seeds: Sequence[int], workers: int) -> Table:
+    """Fly every fault with every seed under every gain set.
+
+    Parameters
+    ----------
+    request : Request
+        What to fly.
+    seeds : sequence of int
+        Of the measurement noise and of what is random in a fault.
+    workers : int
+        Processes; the table is the same whatever their number.
+
+    Raises
+    ------
+    SitlError
+        When a file, an option or a fault is wrong.
+    """
+    from rich.progress import Progress
+
+    bench = _bench(request)
+    found: dict[int, dict[str, list[Recovery]]] = {seeds[0]: bench.fly_all(seeds[0])}  # compiles; finds what is wrong
+    with Progress(console=progress_console(), transient=True) as bar:
+        task = bar.add_task("flying", total=len(seeds), completed=1)
+
+        def keep(seed: int, flights: dict[str, list[Recovery]]) -> None:
+            found[seed] = flights
+            bar.advance(task)
+
+        if workers == 1:
+            for seed in seeds[1:]:
+                keep(seed, bench.fly_all(seed))
+        else:
+            with processes(workers) as executor:
+                run_all(executor, 2 * workers, partial(_fly_all, request), seeds[1:], keep)
+    flown = {name: [found[seed][name] for seed in seeds] for name in bench.gains}
+    paths = dict(zip(bench.gains, request.gains or (None,), strict=True))
+    rows = tuple(
+        _row(request, fault, name, paths[name], seeds, [flights[i + 1] for flights in flown[name]])
+        for i, fault in enumerate(bench.faults)
+        for name in bench.gains
+    )
+    title = f"{bench.airframe.name}, doublet on {request.axis}, {request.amplitude_deg:g} deg, {request.period_s:g} s"
+    return Table(
+        f"{title}, {len(seeds)} seeds from {seeds[0]}",
+        rows,
+        {name: sum(flights[0].lost_at_s is not None for flights in flown[name]) for name in bench.gains},
+        {name: sum(flights[0].detected_s is not None for flights in flown[name]) for name in bench.gains},
+    )
+
+
+def _row(
+    request: Request, fault: Fault, name: str, path: Path | None, seeds: Sequence[int], found: list[Recovery]
+) -> Row:
+    survived = sum(one.lost_at_s is None for one in found)
+    worst = max(range(len(found)), key=lambda i: _badness(found[i]))
+    return Row(
+        fault=str(fault),
+        gains=name,
+        runs=len(found),
+        survived=survived,
+        survival_interval=wilson(survived, len(found)),
+        peak_deg=float(np.median([one.deviation_peak_deg for one in found])),
+        worst_peak_deg=found[worst].deviation_peak_deg,
+        rms_deg=float(np.median([one.deviation_rms_deg for one in found])),
+        recovered=sum(one.recovery_s is not None for one in found),
+        recovery_s=_median([one.recovery_s for one in found]),
+        saturated=float(np.median([one.saturated_since for one in found])),
+        detected=sum(one.detected_s is not None for one in found),
+        detected_s=_median([one.detected_s for one in found]),
+        detected_by=", ".join(sorted({one.detected_by for one in found} - {""})),
+        nonfinite=sum(one.nonfinite for one in found),
+        worst_seed=seeds[worst],
+        replay=_replay(request, fault, path, seeds[worst]),
+    )
+
+
+def _badness(one: Recovery) -> tuple[float, float]:
+    """Sorts what was lost first to the end, then the larger peaks."""
+    return -np.inf if one.lost_at_s is None else -one.lost_at_s, one.deviation_peak_deg
+
+
+def _median(values: list[float | None]) -> float | None:
+    there = [value for value in values if value is not None]
+    return float(np.median(there)) if there else None
+
+
+def _replay(request: Request, fault: Fault, path: Path | None, seed: int) -> str:
+    """The command line that flies one flight of the table again."""
+    words = ["mimopilot", "fly", request.airframe, *(() if path is None else ("--gains", str(path)))]
+    words += ["--axis", request.axis, "--amplitude-deg", repr(request.amplitude_deg)]
+    words += ["--period-s", repr(request.period_s), "--tail-s", repr(TAIL_S)]
+    words += ["--fault", str(fault), "--seed", str(seed)]
+    return shlex.join(words)
+
+
+def print_fault_table(table: Table) -> None:
+    """The table, what happened without faults, and how to fly each worst case again."""
+    print_table(table.title, COLUMNS, [_cells(row) for row in table.rows])
+    for name, lost in table.lost_without.items():
+        runs = next(row.runs for row in table.rows if row.gains == name)
+        print(f"without faults, {name}: {lost} of {runs} lost, {table.alarms_without[name]} with a false alarm")
+    print("worst seeds again:")
+    for row in table.rows:
+        print(f"  {row.replay}")
+
+
+def _cells(row: Row) -> list[str]:
+    low, high = row.survival_interval
+
+    def some(value: float | None, count: int) -> str:
+        return "-" if value is None else f"{value:.3f}" + ("" if count == row.runs else f" ({count})")
+
+    return [
+        row.fault,
+        row.gains,
+        f"{row.survived}/{row.runs}",
+        f"{low:.2f}-{high:.2f}",
+        f"{row.peak_deg:.2f}",
+        f"{row.worst_peak_deg:.2f}",
+        f"{row.rms_deg:.2f}",
+        some(row.recovery_s, row.recovered),
+        f"{row.saturated:g}",
+        some(row.detected_s, row.detected) + f" {row.detected_by}".rstrip(),
+        str(row.nonfinite),
+    ]
