@@ -86,6 +86,8 @@ def tune(
     )
     named = load_columns(columns) if columns else None
     if campaign:
+        if repeat is not None:
+            raise TuningError("--repeat: belongs to one log, --campaign tunes many; leave it out")
         tune_campaign(logs, task, out, named, as_json)
         return
     if len(logs) > 1:

@@ -70,6 +70,8 @@ def test_many_logs_without_campaign_and_a_campaign_without_logs_are_refused(logs
     assert_one_clear_line(
         mimopilot("tune", logs / "notes.ulg", "--campaign", "--out", "t"), "all 1 logs were refused", "notes.ulg"
     )
+    both = mimopilot("tune", logs, "--campaign", "--repeat", two[0], "--out", "t")
+    assert_one_clear_line(both, "--repeat: belongs to one log")
     assert not (tmp_path / "t").exists()
     with pytest.raises(TuningError, match="two logs are called flight-0003"):
         find_logs([logs, log_name(logs, 3)])
