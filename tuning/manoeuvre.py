@@ -1,0 +1,217 @@
+"""Gains for a manoeuvre: the whole cascade refined on a model that the same log gives.
+
+A rate-loop model is a means: what is flown is the attitude, and how well it follows is bounded by what the rate loop
+was asked for. Here a plant identified from the log (PBSID) flies the doublet in the flown difference equation,
+saturation included, and a Gauss-Newton iteration goes from VRFT's gains to those that follow the attitude model best
+within an effort. The measured frequency response keeps the margins: what it does not allow is not gone to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
+from tuning.closed_loop import ACCURATE, MIN_FREQUENCIES, PlantResponse, cascade_loop
+from tuning.errors import TuningError
+from tuning.experiment import Experiment
+from tuning.gains import Gains
+from tuning.identification import identify_rates
+from tuning.reference import ReferenceModel
+from tuning.spec import Manoeuvre
+from tuning.statespace import StateSpace
+
+#: The certificate's limits with some room: peak of the sensitivity, share of the gain allowed above the band.
+PEAK, SHARE = 2.0, 0.85
+#: The integral term keeps this share of what VRFT gave it, in every direction.
+INTEGRAL = 0.3
+#: Weight of the other axis' error: what decoupling costs in following is little.
+OTHER_AXIS = 2.0
+#: Weight of what must not be: a per cent too much counts as much as 0.6 degrees of following error.
+EXCESS = 1.0
+STEP, EVALUATIONS = 1e-4, 60
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DoubletModel:
+    """A doublet around an identified plant.
+
+    Attributes
+    ----------
+    plant : StateSpace
+        From moment to body rates.
+    trim : (2,) array
+        Moment that holds the vehicle level.
+    setpoint : (N,) array, rad
+        Of the axis that moves; the other's is zero.
+    """
+
+    plant: StateSpace
+    trim: Signal
+    setpoint: Signal
+
+    def fly(self, candidates: Sequence[Gains]) -> tuple[Signal, Signal]:
+        """Doublets on roll and on pitch under several gain sets of one vehicle, without noise.
+
+        Returns
+        -------
+        angles, moments : (2, len(candidates), N, 2) arrays, rad, dimensionless
+            First index: the axis that moves.
+        """
+        first = candidates[0]
+        Ts, a = first.Ts, first.derivative_pole
+        rate_max, moment_max = first.limits.rate_max[:2], np.array(first.limits.moment_max[:2])
+        Kp_o, Kp_i, Ki_i, Kd_i, Kff_i = (
+            np.stack([getattr(gains, name) for gains in candidates])
+            for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i")
+        )
+        shape = (2, len(candidates), 2)
+        angle, rate, integral, slope = (np.zeros(shape) for _ in range(4))
+        state = np.zeros((*shape[:2], len(self.plant.A)))
+        angles, moments = (np.zeros((*shape[:2], len(self.setpoint), 2)) for _ in range(2))
+        direction = np.eye(2)[:, None, :]
+
+        def times(matrices: Signal, vectors: Signal) -> Signal:
+            return np.asarray(np.einsum("cij,acj->aci", matrices, vectors))
+
+        for k, height in enumerate(self.setpoint):
+            now = state @ self.plant.C.T
+            angle = angle + Ts / 2 * (now + rate)
+            wanted = np.clip(times(Kp_o, height * direction - angle), np.negative(rate_max), rate_max)
+            slope = a * slope + (1 - a) / Ts * (now - rate)
+            integral = integral + Ts * times(Ki_i, wanted - now)
+            moment = times(Kp_i, wanted - now) + integral - times(Kd_i, slope) + times(Kff_i, wanted)
+            moment = np.clip(moment, -moment_max - self.trim, moment_max - self.trim)
+            angles[:, :, k], moments[:, :, k] = angle, moment + self.trim
+            rate, state = now, state @ self.plant.A.T + moment @ self.plant.B.T
+        return angles, moments
+
+
+def doublet_model(experiment: Experiment, manoeuvre: Manoeuvre) -> DoubletModel:
+    """The manoeuvre around the plant that PBSID finds in an experiment.
+
+    Raises
+    ------
+    TuningError
+        When the log is too short or not excited.
+    """
+    half = round(manoeuvre.period_s / 2 / experiment.Ts)
+    height = np.radians(manoeuvre.amplitude_deg) * np.ones(half)
+    u = np.concatenate([experiment.u[start:stop] for start, stop in experiment.segments])
+    plant = identify_rates(experiment)[0].plant
+    return DoubletModel(plant, np.median(u, axis=0), np.concatenate([height, -height]))
+
+
+def effort(gains: Gains, model: DoubletModel) -> tuple[float, float]:
+    """Predicted RMS of both moments together over the roll and over the pitch doublet."""
+    return tuple(float(v) for v in _effort(model.fly([gains])[1])[:, 0])  # type: ignore[return-value]
+
+
+def _effort(moments: Signal) -> Signal:
+    power: Signal = np.sqrt(np.mean(np.sum(moments**2, axis=-1), axis=-1))
+    return power
+
+
+def refine_cascade(
+    gains: Gains,
+    model: DoubletModel,
+    response: PlantResponse,
+    outer: Sequence[ReferenceModel],
+    *,
+    terms: Sequence[str],
+    full: bool,
+    limit: Sequence[float] | None = None,
+) -> Gains:
+    """Gains that follow the attitude model best in the manoeuvre.
+
+    Parameters
+    ----------
+    gains : Gains
+        Where to start: VRFT's.
+    model : DoubletModel
+    response : PlantResponse
+        From the same experiment.
+    outer : sequence of 2 ReferenceModel
+        Of the attitude loop.
+    terms : sequence of str
+        Names of the matrices that are free.
+    full : bool
+        False: their diagonals only (SISO).
+    limit : sequence of 2 float, optional
+        Effort allowed in the roll and the pitch doublet; by default what `gains` need.
+
+    Raises
+    ------
+    TuningError
+        When the measured response is known at too few frequencies.
+    """
+    known = response.at(response.coherent() & (response.relative_error() < ACCURATE))
+    if len(known.omega) < MIN_FREQUENCIES:
+        raise TuningError(f"only {len(known.omega)} frequencies of the measured response are known to 10 %")
+    coherent = response.at(response.coherent())
+    allowed = np.array(limit if limit is not None else effort(gains, model))
+    wanted = np.zeros((2, 1, len(model.setpoint), 2))
+    for axis, reference in enumerate(outer):
+        wanted[axis, 0, :, axis] = reference.response(model.setpoint)
+    weight = np.where(np.eye(2, dtype=bool), 1.0, OTHER_AXIS)[:, None, None, :] / np.sqrt(len(model.setpoint))
+    where = np.tile(np.ones(4, bool) if full else np.eye(2, dtype=bool).ravel(), len(terms))
+    sizes = _sizes(gains)
+    scale = np.repeat([sizes[name] for name in terms], 4)[where]
+    start = np.concatenate([getattr(gains, name).ravel() for name in terms])
+    floor = INTEGRAL * _integral(gains, gains)
+
+    def placed(values: Signal) -> Gains:
+        every = start.copy()
+        every[where] = values * scale
+        parts = np.split(every, len(terms))
+        return replace(gains, certificate=None, **{n: p.reshape(2, 2) for n, p in zip(terms, parts, strict=True)})
+
+    def excess(candidate: Gains) -> list[float]:
+        S = np.linalg.inv(np.eye(2) + cascade_loop(candidate, known).L_u)
+        peak = float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
+        above = float(loop_above(candidate, coherent)[-1]) / HIGH_FREQUENCY_LOOP
+        return [peak / PEAK - 1, above / SHARE - 1, (1 - _integral(candidate, gains) / floor) if floor > 0 else 0.0]
+
+    def residuals(points: Signal) -> Signal:
+        """One row a point."""
+        candidates = [placed(values) for values in points]
+        angles, moments = model.fly(candidates)
+        follow = (angles - wanted) * weight
+        rows = follow.transpose(1, 0, 2, 3).reshape(len(points), -1)
+        spent = _effort(moments).T / allowed - 1
+        too_much = np.hstack([spent, np.array([excess(candidate) for candidate in candidates])])
+        return np.nan_to_num(np.hstack([rows, EXCESS * np.maximum(too_much, 0)]), nan=1e3, posinf=1e3, neginf=-1e3)
+
+    def derivative(values: Signal) -> Signal:
+        found = residuals(np.vstack([values, values + STEP * np.eye(len(values))]))
+        slopes: Signal = ((found[1:] - found[0]) / STEP).T
+        return slopes
+
+    found = least_squares(
+        lambda values: residuals(values[None])[0], start[where] / scale, derivative, max_nfev=EVALUATIONS
+    )
+    return placed(found.x)
+
+
+def _sizes(gains: Gains) -> dict[str, float]:
+    """A typical change of each matrix' elements: the starting point of some may be zero."""
+    proportional = float(np.abs(gains.Kp_i).max())
+    return {
+        "Kp_o": float(np.abs(gains.Kp_o).max()),
+        "Kp_i": proportional,
+        "Ki_i": 2.0 * proportional,
+        "Kd_i": 0.02 * proportional,
+        "Kff_i": proportional,
+    }
+
+
+def _integral(gains: Gains, of: Gains) -> float:
+    """Least integral action in any direction: VRFT's Kp_i is nearly the inverse of the plant's gain."""
+    action = gains.Ki_i @ np.linalg.inv(of.Kp_i)
+    return float(np.linalg.eigvalsh((action + action.T) / 2)[0])
