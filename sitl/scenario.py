@@ -61,9 +61,7 @@ def _check_angle(amplitude: float) -> None:
         raise SitlError(f"amplitude: got {got:.6g} degrees, expected above 0 and at most {limit:.0f}")
 
 
-def doublet(
-    axis: str, amplitude: float, period: float, Ts: float, tail: float = 1.5, lead: float = LEAD
-) -> Scenario:
+def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float = 1.5, lead: float = LEAD) -> Scenario:
     """Set-point +A for half of `period`, -A for the other half, then level.
 
     Parameters

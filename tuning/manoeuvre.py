@@ -30,7 +30,7 @@ PEAK, SHARE = 2.3, 0.9
 #: The integral term keeps this share of what VRFT gave it, in every direction.
 INTEGRAL = 0.2
 #: Weight of the other axis' error: what decoupling costs in following is little.
-OTHER_AXIS = 1.4
+OTHER_AXIS = 2.0
 #: Order of the norm over frequencies that stands for the peak: smooth, and a little more than the peak itself.
 SMOOTH = 24
 STEP = 1e-4

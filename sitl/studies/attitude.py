@@ -32,7 +32,7 @@ DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, pertur
 MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same without limits"
 #: Effort over SISO's that is asked of the refined gains, as predicted, and allowed to the best on the true plant, as
 #: flown: the 10 % of the expectation less what a prediction may miss.
-EFFORT = 1.08
+EFFORT = 1.06
 #: Hover before a doublet; a mass at one motor takes longer to be trimmed out.
 LEAD_S, TRIM_S = 1.0, 6.0
 

@@ -94,9 +94,11 @@ def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None)
     from rich.progress import Progress
 
     count = workers or os.cpu_count() or 1
-    with _one_thread(), ProcessPoolExecutor(count, get_context("spawn")) as pool, Progress(
-        console=progress_console(), transient=True
-    ) as bar:
+    with (
+        _one_thread(),
+        ProcessPoolExecutor(count, get_context("spawn")) as pool,
+        Progress(console=progress_console(), transient=True) as bar,
+    ):
         task = bar.add_task("experiments", total=len(chosen) * (seeds + 1))
 
         def counted(futures: Sequence[Future[Any]]) -> list[Any]:
