@@ -7,11 +7,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
 from sitl.figures import STYLES
+from sitl.loop import Flight
+from sitl.metrics import reference_responses
 from sitl.scenario import AXES
-from sitl.studies.attitude import MIMO, REFINED, SISO, Run
+from sitl.studies.attitude import MIMO, REFINED, SISO, Run, Study
 from sitl.studies.attitude_runs import Statistics
 
 #: A colour, a line and a marker of its own for each method that is compared everywhere.
@@ -31,18 +34,52 @@ COSTS = {
 LOW, HIGH = 5, 95
 
 
+def tracking_figure(found: Run, study: Study) -> Figure:
+    """Distance of angle and rate to the reference models, driven by their own set-points, in both doublets."""
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
+    panels: Any = figure.subplots(2, 2, sharex=True, sharey="row")
+    for method, ((colour, style), _) in LOOK.items():
+        for column, (axis, flight) in enumerate(zip(AXES, found.flights[method], strict=True)):
+            scenario, record = flight.scenario, flight.record
+            models = reference_responses(flight, *study.models(method, scenario.Ts))
+            shown = _shown(flight)
+            for panel, name, model in zip(panels[:, column], ("attitude", "rates"), models, strict=True):
+                line = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": method}
+                panel.plot(_time(flight)[shown], np.degrees(record[name][shown, column] - model[shown]), **line)
+            panels[0, column].set_title(f"{axis} doublet", loc="left", fontsize=10)
+            panels[1, column].set_xlabel("time from the start of the doublet [s]")
+    for panel, text in zip(panels[:, 0], ("angle - model [deg]", "rate - model [deg/s]"), strict=True):
+        panel.set_ylabel(text)
+    for panel in panels.flat:
+        panel.grid(alpha=0.3)
+        panel.axhline(0, color="black", linewidth=0.6)
+    _legend(figure, panels[0, 0])
+    figure.suptitle(f"{study.title}: measured minus reference model", x=0.02, ha="left")
+    return figure
+
+
+def _time(flight: Flight) -> NDArray[np.float64]:
+    """From the start of the doublet, s."""
+    return np.asarray((np.arange(len(flight.record)) - flight.scenario.window[0]) * flight.scenario.Ts, np.float64)
+
+
+def _shown(flight: Flight) -> NDArray[np.bool_]:
+    """From shortly before the doublet to its length after it."""
+    start, stop = flight.scenario.window
+    return np.asarray((_time(flight) >= -0.1) & (_time(flight) <= 2 * (stop - start) * flight.scenario.Ts))
+
+
 def motors_figure(found: Run, rotors: int, title: str) -> Figure:
     """Commands of all motors in both doublets, one row a motor."""
     figure = Figure(figsize=(9, 1.5 + 1.5 * rotors), layout="constrained")
     panels: Any = figure.subplots(rotors, 2, sharex=True, sharey=True)
     for method, ((colour, style), _) in LOOK.items():
         for column, flight in enumerate(found.flights[method]):
-            scenario = flight.scenario
-            time = (np.arange(len(flight.record)) - scenario.window[0]) * scenario.Ts
-            shown = (time >= -0.1) & (time <= 2 * (scenario.window[1] - scenario.window[0]) * scenario.Ts)
+            shown = _shown(flight)
             for motor in range(rotors):
                 line = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": method}
-                panels[motor, column].step(time[shown], flight.record["commands"][shown, motor], where="post", **line)
+                command = flight.record["commands"][shown, motor]
+                panels[motor, column].step(_time(flight)[shown], command, where="post", **line)
     for panel in panels.flat:
         panel.grid(alpha=0.3)
         panel.set_ylim(-0.05, 1.05)
@@ -51,7 +88,7 @@ def motors_figure(found: Run, rotors: int, title: str) -> Figure:
     for column, axis in enumerate(AXES):
         panels[0, column].set_title(f"{axis} doublet", loc="left", fontsize=10)
         panels[-1, column].set_xlabel("time from the start of the doublet [s]")
-    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3, fontsize=9)
+    _legend(figure, panels[0, 0])
     figure.suptitle(f"{title}: motor commands (thrust, 0 to 1)", x=0.02, ha="left")
     return figure
 
@@ -105,7 +142,9 @@ def costs_figure(found: Statistics, methods: Sequence[str], printed: Mapping[str
                 )
                 if axis == axis_printed and name in printed.get(method, {}):
                     panel.plot(printed[method][name], place + shift, label="printed, real flight", **PRINTED)
-        panel.set_xscale("log" if name.startswith(("J", "off")) else "linear")
+        low, high = panel.dataLim.x0, panel.dataLim.x1
+        panel.set_xscale("log" if high > 10 * low else "linear")
+        panel.xaxis.set_minor_formatter(NullFormatter())
         panel.set_xlabel(text)
         panel.set_yticks(places, methods)
         panel.grid(alpha=0.3, axis="x")
@@ -124,6 +163,6 @@ def _spread(panel: Any, place: float, values: NDArray[np.float64], look: Any, la
 
 
 def _legend(figure: Figure, panel: Any) -> None:
-    """One entry for each label of a panel, above the figure."""
+    """One entry for each label of a panel, below the figure."""
     handles = dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside upper right", ncols=4, fontsize=9)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=9)

@@ -21,6 +21,7 @@ from sitl.studies.attitude_figures import (
     costs_figure,
     gains_figure,
     motors_figure,
+    tracking_figure,
 )
 from sitl.studies.attitude_runs import Statistics
 
@@ -37,7 +38,8 @@ METHODS = (
     "moments together."
 )
 SPREAD_COLUMNS = ("gain", *ELEMENTS)
-COST_COLUMNS = ("doublet", "method", *COSTS.values(), "certificate (of the seeds)", "Ms")
+COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].partition(":")[0] for text in COSTS.values()))
+CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms")
 
 
 def study_sections(found: Statistics) -> list[Section]:
@@ -73,11 +75,12 @@ def study_sections(found: Statistics) -> list[Section]:
             f"{name}: doublets",
             f"Doublet of {study.amplitude_deg:g} degrees, {study.period_s:g} s. J over the doublet, each method beside "
             f"the models that it was tuned for. {METHODS} {IN_KIND if costs else ''}",
-            [costs_table(found)],
+            [costs_table(found), certificates_table(found)],
             [
                 svg(costs_figure(found, study.methods(), costs, axis), f"{name} costs"),
                 *doublets((SISO, MIMO, REFINED), "ours"),
                 *doublets((DEFAULT, AUTOTUNE, REFINED, BEST), "others"),
+                svg(tracking_figure(found.shown, study), f"{name} tracking"),
                 svg(motors_figure(found.shown, rotors, study.title), f"{name} motors"),
             ],
         ),
@@ -88,8 +91,8 @@ def _lead(study: Study, inner: str, outer: str) -> str:
     seconds, amplitude, bandwidth = study.excitation
     text = (
         f"{load_airframe(study.airframe).airframe.description}. PRBS of amplitude {amplitude:g} and {bandwidth:g} "
-        f"rad/s for {seconds:g} s on each axis under the default gains. Reference models (rad/s, damping, delay in samples): "
-        f"rate loop {inner}; attitude loop {outer}."
+        f"rad/s for {seconds:g} s on each axis under the default gains. Reference models (rad/s, damping, delay "
+        f"in samples): rate loop {inner}; attitude loop {outer}."
     )
     (omega, zeta, delay), (omega_o, zeta_o, delay_o) = study.siso_models
     if study.siso_models != (study.inner, study.outer):
@@ -110,9 +113,8 @@ def gains_table(found: Statistics) -> Table:
         for method in found.study.methods():
             values = found.gains(method, matrix).reshape(-1, 4)
             low, middle, high = np.percentile(values, [LOW, 50, HIGH], axis=0)
-            spread = np.any(high - low > 1e-9)
             cells = [
-                _plain(f"{m:.4f}") + (f" ({_plain(f'{a:.4f}')} to {_plain(f'{b:.4f}')})" if spread else "")
+                _plain(f"{m:.4f}") + (f" ({_plain(f'{a:.4f}')} to {_plain(f'{b:.4f}')})" if b - a > 1e-9 else "")
                 for a, m, b in zip(low, middle, high, strict=True)
             ]
             rows.append([f"{matrix}  {method}", *cells])
@@ -128,13 +130,22 @@ def costs_table(found: Statistics) -> Table:
     for axis in AXES:
         for method in found.study.methods():
             medians = [_figure(name, found.median(method, axis, name)) for name in COSTS]
-            verdicts = ", ".join(f"{count} {verdict}" for verdict, count in found.verdicts(method).items())
-            peaks = [run[method]["Ms"] for run in found.runs if run[method]["Ms"] is not None]
-            rows.append([axis, method, *medians, verdicts, f"{np.median(peaks):.2f}" if peaks else ""])
+            rows.append([f"{axis}, {method}", *medians])
             if axis == axis_printed and method in printed:
                 flown = [_figure(name, printed[method][name]) if name in printed[method] else "" for name in COSTS]
-                rows.append([axis, f"{method}, {number} (real flight)", *flown, "", ""])
-    return Table(f"{found.study.name}: medians of {len(found.runs)} seeds", COST_COLUMNS, rows)
+                rows.append([f"{axis}, {method}, {number} (real flight)", *flown])
+    caption = f"{found.study.name}: medians of {len(found.runs)} seeds; J in rad^2 and rad^2/s^2, peak in deg"
+    return Table(caption, COST_COLUMNS, rows)
+
+
+def certificates_table(found: Statistics) -> Table:
+    """What the certificate says of every method, from the log that this vehicle flew."""
+    rows = []
+    for method in found.study.methods():
+        verdicts = ", ".join(f"{count}: {verdict}" for verdict, count in found.verdicts(method).items())
+        peaks = [run[method]["Ms"] for run in found.runs if run[method]["Ms"] is not None]
+        rows.append([method, verdicts, f"{np.median(peaks):.2f}" if peaks else ""])
+    return Table(f"{found.study.name}: certificates, and the median peak of the sensitivity", CERTIFICATE_COLUMNS, rows)
 
 
 def study_figures(found: Statistics) -> dict[str, Any]:

@@ -23,10 +23,10 @@ STUDIES = (*BENCHMARKS, *studies())
 ALL = "all"
 
 UNMET = (
-    "Where J_M,o misses the best possible, the doublet drives the motors to their limits (coupled, adam0-sim, adam0). A "
-    "rotor's lag acts on its speed, thrust goes with the square: at the limits moments come faster than in the small "
-    "motions of the log, so a model from that log overrates the effort of brisk gains, and the budget is spent before "
-    "it is used up. adam0-small is the same vehicle with a doublet that stays away from the limits."
+    "Where J_M,o misses the best possible, the doublet drives the motors to their limits (coupled, adam0-sim, adam0). "
+    "A rotor's lag acts on its speed, thrust goes with the square: at the limits moments come faster than in the small "
+    "motions of the log, so a model from that log overrates the effort of brisk gains and asks for less than is "
+    "allowed. adam0-small is the same vehicle with a doublet that stays away from the limits."
 )
 
 
