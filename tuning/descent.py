@@ -12,11 +12,15 @@ from scipy.optimize import minimize
 ITERATIONS = 60
 #: A descent ends where one step gains less than this share of the cost that it began with.
 TOLERANCE = 1e-4
+#: It begins again from its end, its picture of the curvature forgotten, while that gains this share.
+WORTH = 0.02
 
 Signal = NDArray[np.float64]
 
 
-def descend(examine: Callable[[Signal], tuple[Signal, Signal]], first: Signal, step: float) -> tuple[Signal, float]:
+def descend(
+    examine: Callable[[Signal], tuple[Signal, Signal]], first: Signal, step: float, again: int = 0
+) -> tuple[Signal, float]:
     """The point of least cost within the limits, near a first one.
 
     Parameters
@@ -27,6 +31,8 @@ def descend(examine: Callable[[Signal], tuple[Signal, Signal]], first: Signal, s
         Where to begin; every number of about the size 1.
     step : float
         Of the differences.
+    again : int
+        How often it may begin again from its end, at most.
 
     Returns
     -------
@@ -34,7 +40,16 @@ def descend(examine: Callable[[Signal], tuple[Signal, Signal]], first: Signal, s
     cost : float
         Its cost, in the unit of `examine`.
     """
+    point, cost = _descent(examine, first, step)
+    for _ in range(again):
+        following, lower = _descent(examine, point, step)
+        if not lower < (1 - WORTH) * cost:
+            break
+        point, cost = following, lower
+    return point, cost
 
+
+def _descent(examine: Callable[[Signal], tuple[Signal, Signal]], first: Signal, step: float) -> tuple[Signal, float]:
     @lru_cache(maxsize=8)
     def around(point: bytes) -> tuple[float, Signal, Signal, Signal]:
         values = np.frombuffer(point)

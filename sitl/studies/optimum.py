@@ -28,7 +28,7 @@ from tuning.reference import ReferenceModel
 #: Every gain of the structure that the thesis' tables have.
 FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
 #: Relative step of the differences: the flown controller is single precision.
-STEP = 1e-3
+STEP, AGAIN = 1e-3, 3
 #: Limits of `Task.examine`, what a gain set that cannot fly costs (rad^2), and by what a limit may be missed.
 LIMITS, LOST, TOLERATED = 5, 10.0, 2e-3
 
@@ -123,7 +123,7 @@ def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
             every = [task.examine(at(values)) for values in points]
             return np.array([cost for cost, _ in every]), np.array([left for _, left in every])
 
-        found = at(descend(examine, first, STEP)[0])
+        found = at(descend(examine, first, STEP, AGAIN)[0])
         cost, left = task.examine(found)
         ends.append((min(left) < -TOLERATED, cost, found))
     return min(ends, key=lambda end: end[:2])[2]
