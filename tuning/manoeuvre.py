@@ -76,6 +76,7 @@ class DoubletModel:
         state = np.zeros((*shape[:2], len(self.plant.A)))
         angles, moments = (np.zeros((*shape[:2], len(self.setpoint), 2)) for _ in range(2))
         direction = np.eye(2)[:, None, :]
+        lowest, highest = -moment_max - self.trim, moment_max - self.trim
 
         def times(matrices: Signal, vectors: Signal) -> Signal:
             return np.asarray(np.einsum("cij,acj->aci", matrices, vectors))
@@ -85,9 +86,12 @@ class DoubletModel:
             angle = angle + Ts / 2 * (now + rate)
             wanted = np.clip(times(Kp_o, height * direction - angle), np.negative(rate_max), rate_max)
             slope = a * slope + (1 - a) / Ts * (now - rate)
-            integral = integral + Ts * times(Ki_i, wanted - now)
-            moment = times(Kp_i, wanted - now) + integral - times(Kd_i, slope) + times(Kff_i, wanted)
-            moment = np.clip(moment, -moment_max - self.trim, moment_max - self.trim)
+            rest = times(Kp_i, wanted - now) - times(Kd_i, slope) + times(Kff_i, wanted)
+            growth = Ts * times(Ki_i, wanted - now)
+            tried = rest + integral + growth
+            wound_up = ((tried > highest) & (growth > 0)) | ((tried < lowest) & (growth < 0))
+            integral = integral + np.where(wound_up, 0.0, growth)
+            moment = np.clip(rest + integral, lowest, highest)
             angles[:, :, k], moments[:, :, k] = angle, moment + self.trim
             rate, state = now, state @ self.plant.A.T + moment @ self.plant.B.T
         return angles, moments
