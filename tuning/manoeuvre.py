@@ -66,7 +66,8 @@ class DoubletModel:
         """
         first = candidates[0]
         Ts, a = first.Ts, first.derivative_pole
-        rate_max, moment_max = first.limits.rate_max[:2], np.array(first.limits.moment_max[:2])
+        rate_max = first.limits.rate_max[:2]
+        moment_max, integral_max = np.array(first.limits.moment_max[:2]), np.array(first.limits.integral_max[:2])
         Kp_o, Kp_i, Ki_i, Kd_i, Kff_i = (
             np.stack([getattr(gains, name) for gains in candidates])
             for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i")
@@ -76,7 +77,9 @@ class DoubletModel:
         state = np.zeros((*shape[:2], len(self.plant.A)))
         angles, moments = (np.zeros((*shape[:2], len(self.setpoint), 2)) for _ in range(2))
         direction = np.eye(2)[:, None, :]
+        # Moments are counted from the trim, which the flown integral holds.
         lowest, highest = -moment_max - self.trim, moment_max - self.trim
+        least, most = -integral_max - self.trim, integral_max - self.trim
 
         def times(matrices: Signal, vectors: Signal) -> Signal:
             return np.asarray(np.einsum("cij,acj->aci", matrices, vectors))
@@ -90,7 +93,7 @@ class DoubletModel:
             growth = Ts * times(Ki_i, wanted - now)
             tried = rest + integral + growth
             wound_up = ((tried > highest) & (growth > 0)) | ((tried < lowest) & (growth < 0))
-            integral = integral + np.where(wound_up, 0.0, growth)
+            integral = np.clip(integral + np.where(wound_up, 0.0, growth), least, most)
             moment = np.clip(rest + integral, lowest, highest)
             angles[:, :, k], moments[:, :, k] = angle, moment + self.trim
             rate, state = now, state @ self.plant.A.T + moment @ self.plant.B.T
