@@ -2,8 +2,8 @@
 
 A rate-loop model is a means: what is flown is the attitude, and how well it follows is bounded by what the rate loop
 was asked for. Here a plant identified from the log (PBSID) flies the doublet in the flown difference equation,
-saturation included, and a descent goes from VRFT's gains to those that follow the attitude model best
-within an effort. The measured frequency response keeps the margins: what it does not allow is not gone to.
+saturation included, and a descent goes from VRFT's gains to those that follow the attitude model best within an
+effort. The measured frequency response keeps the margins: what it does not allow is not gone to.
 """
 
 from __future__ import annotations
@@ -117,7 +117,8 @@ def doublet_model(experiment: Experiment, manoeuvre: Manoeuvre) -> DoubletModel:
 
 def effort(gains: Gains, model: DoubletModel) -> tuple[float, float]:
     """Predicted RMS of both moments together over the roll and over the pitch doublet."""
-    return tuple(float(v) for v in _effort(model.fly([gains])[1])[:, 0])  # type: ignore[return-value]
+    roll, pitch = _effort(model.fly([gains])[1])[:, 0]
+    return float(roll), float(pitch)
 
 
 def _effort(moments: Signal) -> Signal:
@@ -168,10 +169,10 @@ def refine_cascade(
         wanted[axis, 0, :, axis] = reference.response(model.setpoint)
     weight = np.where(np.eye(2, dtype=bool), 1.0, OTHER_AXIS)[:, None, None, :] / np.sqrt(len(model.setpoint))
     where = np.tile(np.ones(4, bool) if full else np.eye(2, dtype=bool).ravel(), len(terms))
-    sizes = _sizes(gains)
+    sizes = typical_sizes(gains)
     scale = np.repeat([sizes[name] for name in terms], 4)[where]
     start = np.concatenate([getattr(gains, name).ravel() for name in terms])
-    floor = INTEGRAL * _integral(gains, gains)
+    floor = INTEGRAL * integral_rate(gains.Ki_i, gains.Kp_i)
 
     def placed(values: Signal) -> Gains:
         every = start.copy()
@@ -184,7 +185,8 @@ def refine_cascade(
         """Of the peak of the sensitivity, of the gain above the band, of the integral; relative."""
         differences = np.linalg.svd(np.eye(2) + cascade_loop(candidate, known).L_u, compute_uv=False)
         above = float(loop_above(candidate, coherent)[-1]) / HIGH_FREQUENCY_LOOP
-        integral = _integral(candidate, gains) / floor - 1 if floor > 0 else 1.0
+        # VRFT's Kp_i is nearly the inverse of the plant's gain: beside it the directions are alike.
+        integral = integral_rate(candidate.Ki_i, gains.Kp_i) / floor - 1 if floor > 0 else 1.0
         return [1 - float(np.linalg.norm(1 / differences.ravel(), ord=SMOOTH)) / PEAK, 1 - above / SHARE, integral]
 
     def examine(points: Signal) -> tuple[Signal, Signal]:
@@ -196,7 +198,7 @@ def refine_cascade(
     return placed(descend(examine, start[where] / scale, STEP)[0])
 
 
-def _sizes(gains: Gains) -> dict[str, float]:
+def typical_sizes(gains: Gains) -> dict[str, float]:
     """A typical change of each matrix' elements: the starting point of some may be zero."""
     proportional = float(np.abs(gains.Kp_i).max())
     return {
@@ -208,7 +210,7 @@ def _sizes(gains: Gains) -> dict[str, float]:
     }
 
 
-def _integral(gains: Gains, of: Gains) -> float:
-    """Least integral action in any direction: VRFT's Kp_i is nearly the inverse of the plant's gain."""
-    action = gains.Ki_i @ np.linalg.inv(of.Kp_i)
+def integral_rate(Ki_i: Signal, Kp_i: Signal) -> float:
+    """Least integral action beside the proportional one, in any direction, 1/s."""
+    action = Ki_i @ np.linalg.inv(Kp_i)
     return float(np.linalg.eigvalsh((action + action.T) / 2)[0])

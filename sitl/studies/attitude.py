@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from codegen.native import NativeController, NativeLibrary, load_native
-from sitl.airframe import Airframe, Vehicle, load_airframe
+from sitl.airframe import Vehicle, load_airframe
 from sitl.autopilot import Autopilot
 from sitl.errors import SitlError
 from sitl.loop import Flight, fly
@@ -18,13 +18,13 @@ from sitl.metrics import Performance, performance
 from sitl.scenario import AXES, Scenario, doublet, excitation_flight
 from sitl.studies.autotune import autotune
 from sitl.studies.benchmarks import TABLES
-from sitl.studies.optimum import Task, best_gains, integral_rate, moment_rms
+from sitl.studies.optimum import Task, best_gains, moment_rms
 from tuning.cascade import measured_plant, tune
 from tuning.certificate import certify
 from tuning.closed_loop import PlantResponse
 from tuning.experiment import Experiment
 from tuning.gains import Gains
-from tuning.manoeuvre import doublet_model, effort
+from tuning.manoeuvre import doublet_model, effort, integral_rate
 from tuning.reference import ReferenceModel, second_order
 from tuning.spec import Manoeuvre, TuningSpec
 
@@ -215,11 +215,11 @@ def fly_set(airframe: str, gains: Gains, scenario: Scenario, seed: int, noise: b
     return flight
 
 
-def experiment(study: Study, airframe: str, seed: int, noise: bool = True) -> tuple[Flight, Experiment]:
+def experiment(study: Study, airframe: str, seed: int) -> tuple[Flight, Experiment]:
     """The excitation flight of a study on a vehicle, and its signals as they are logged."""
     default = _bench(airframe)[1]
     scenario = excitation_flight(*study.excitation, default.Ts, np.random.default_rng(seed))
-    flight = fly_set(airframe, default, scenario, seed, noise)
+    flight = fly_set(airframe, default, scenario, seed)
     names = {"u": "moment", "y_i": "rates", "y_o": "attitude", "u_bar": "excitation", "r_o": "setpoint"}
     signals: Any = {name: flight.record[field][:, :2].astype(np.float64) for name, field in names.items()}
     return flight, Experiment(Ts=default.Ts, source=f"{airframe}, seed {seed}", flown=default, **signals)
@@ -254,19 +254,18 @@ def optimum(study: Study) -> dict[str, Gains]:
     _, log, siso_log = logs(study, 0)
     plant = measured_plant(log)
     found = tune_all(study, log, siso_log, plant)
-    airframe: Airframe = _bench(study.airframe)[0].airframe
     Ts = log.Ts
     # Without noise a vehicle in balance needs no hover, and what comes after the doublet does not count.
     doublets = study.doublets(Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
     spent = [moment_rms(fly_set(study.airframe, found[SISO], task, 0, noise=False)) for task in doublets]
     task = Task(
-        airframe,
+        _bench(study.airframe)[0].airframe,
         _bench(study.airframe)[2],
         doublets,
         study.models(BEST, Ts)[1],
         plant.at(plant.coherent()),
         [EFFORT * value for value in spent],
-        integral_rate(found[DEFAULT]),
+        integral_rate(found[DEFAULT].Ki_i, found[DEFAULT].Kp_i),
     )
     best = best_gains(task, [found[AUTOTUNE], found[REFINED]])
     bound = best_gains(replace(task, effort=None), [best])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -71,13 +71,13 @@ def _one_thread() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _shown(study: Study, best: Mapping[str, Gains]) -> tuple[Run, dict[str, Any]]:
-    found = run(study, 0, dict(best))
+def _shown(study: Study, best: dict[str, Gains]) -> tuple[Run, dict[str, Any]]:
+    found = run(study, 0, best)
     return found, numbers(found)
 
 
-def _counted(study: Study, seed: int, best: Mapping[str, Gains]) -> dict[str, Any]:
-    return numbers(run(study, seed, dict(best)))
+def _counted(study: Study, seed: int, best: dict[str, Gains]) -> dict[str, Any]:
+    return numbers(run(study, seed, best))
 
 
 def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None) -> list[Statistics]:

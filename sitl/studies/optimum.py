@@ -22,7 +22,7 @@ from tuning.certificate import HIGH_FREQUENCY_LOOP, Thresholds, loop_above
 from tuning.closed_loop import PlantResponse, cascade_loop
 from tuning.descent import descend
 from tuning.gains import Gains
-from tuning.manoeuvre import OTHER_AXIS
+from tuning.manoeuvre import OTHER_AXIS, integral_rate, typical_sizes
 from tuning.reference import ReferenceModel
 
 #: Every gain of the structure that the thesis' tables have.
@@ -49,11 +49,11 @@ class Task:
     outer : ReferenceModel
         What the attitude should follow.
     plant : PlantResponse
-        Response of the vehicle, from a flight without noise: the gains must be ones that could be certified.
+        Response of the vehicle that a log gives: the gains must be ones that could be certified from it.
     effort : sequence of 2 float or None
         RMS of the moments allowed in each doublet; None: as much as it takes, certified or not.
     integral : float, 1/s
-        Integral action that is needed, see `integral_rate`: a vehicle must find its trim.
+        Integral action that is needed, see `tuning.manoeuvre.integral_rate`: a vehicle must find its trim.
     """
 
     airframe: Airframe
@@ -90,7 +90,7 @@ class Task:
             *(1 - moment_rms(flight) / allowed for flight, allowed in zip(flights, self.effort, strict=True)),
             1 - float((1 / loop).max()) / Thresholds.Ms,
             1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
-            integral_rate(gains) / self.integral - 1,
+            integral_rate(gains.Ki_i, gains.Kp_i) / self.integral - 1,
         ]
 
 
@@ -111,7 +111,8 @@ def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
     """
     ends = []
     for start in starts:
-        scale = np.concatenate([np.full(4, _size(start, name)) for name in FREE])
+        sizes = typical_sizes(start)
+        scale = np.repeat([sizes[name] for name in FREE], 4)
         first = np.concatenate([getattr(start, name).ravel() for name in FREE]) / scale
 
         def at(values: Signal, start: Gains = start, scale: Signal = scale) -> Gains:
@@ -127,17 +128,3 @@ def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
         cost, left = task.examine(found)
         ends.append((min(left) < -TOLERATED, cost, found))
     return min(ends, key=lambda end: end[:2])[2]
-
-
-def integral_rate(gains: Gains) -> float:
-    """Least integral action beside the proportional one, in any direction, 1/s."""
-    action = gains.Ki_i @ np.linalg.inv(gains.Kp_i)
-    return float(np.linalg.eigvalsh((action + action.T) / 2)[0])
-
-
-def _size(gains: Gains, name: str) -> float:
-    """A typical size of a matrix' elements."""
-    proportional = float(np.abs(gains.Kp_i).max())
-    return {"Kp_o": float(np.abs(gains.Kp_o).max()), "Ki_i": 2 * proportional, "Kd_i": 0.02 * proportional}.get(
-        name, proportional
-    )
