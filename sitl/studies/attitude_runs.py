@@ -57,12 +57,13 @@ class Statistics:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes that are started inside compute with one thread each."""
+def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
+    """A pool of fresh processes that compute with one thread each."""
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
-        yield
+        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+            yield pool
     finally:
         for name, value in before.items():
             if value is None:
@@ -76,7 +77,8 @@ def _shown(study: Study, best: dict[str, Gains]) -> tuple[Run, dict[str, Any]]:
     return found, numbers(found)
 
 
-def _counted(study: Study, seed: int, best: dict[str, Gains]) -> dict[str, Any]:
+def run_once(study: Study, seed: int, best: dict[str, Gains]) -> dict[str, Any]:
+    """`numbers` of one run."""
     return numbers(run(study, seed, best))
 
 
@@ -93,10 +95,8 @@ def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None)
     """
     from rich.progress import Progress
 
-    count = workers or os.cpu_count() or 1
     with (
-        _one_thread(),
-        ProcessPoolExecutor(count, get_context("spawn")) as pool,
+        processes(workers or os.cpu_count() or 1) as pool,
         Progress(console=progress_console(), transient=True) as bar,
     ):
         task = bar.add_task("experiments", total=len(chosen) * (seeds + 1))
@@ -110,7 +110,7 @@ def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None)
         best = counted([pool.submit(optimum, study) for study in chosen])
         first = [pool.submit(_shown, *pair) for pair in zip(chosen, best, strict=True)]
         others = [
-            [pool.submit(_counted, study, seed, sets) for seed in range(1, seeds)]
+            [pool.submit(run_once, study, seed, sets) for seed in range(1, seeds)]
             for study, sets in zip(chosen, best, strict=True)
         ]
         return [
