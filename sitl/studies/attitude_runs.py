@@ -63,7 +63,11 @@ def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
     os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
         with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-            yield pool
+            try:
+                yield pool
+            except BaseException:
+                pool.shutdown(wait=False, cancel_futures=True)  # what is waiting would keep the message back
+                raise
     finally:
         for name, value in before.items():
             if value is None:
