@@ -64,7 +64,7 @@ def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = No
     if flown:
         parts |= _attitude_parts(run_studies(flown, seeds, workers), seeds)
     report = out / f"{name}.html"
-    lead = " ".join(part.lead for part in parts.values())
+    lead = " ".join(part.lead for part in parts.values() if part.lead)
     sections = [section for part in parts.values() for section in part.sections]
     write_report(report, f"mimopilot reproduce {name}", lead, sections)
     tables = tuple(table for section in sections for table in section.tables)
