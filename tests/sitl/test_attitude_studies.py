@@ -13,7 +13,7 @@ from sitl.studies.attitude_runs import processes, run_once, run_studies
 from sitl.studies.autotune import autotune, identify_arx, minimum_variance_pid
 from sitl.studies.benchmarks import TABLES
 from sitl.studies.commands import Study as Choice
-from sitl.studies.expectations import expectations
+from sitl.studies.expectations import EFFORT, expectations
 from sitl.studies.reproduce import ALL, STUDIES, reproduce
 
 PRINTED = json.loads(TABLES.read_text())
@@ -69,8 +69,8 @@ def test_following_is_near_the_best_possible_where_the_motors_are_not_at_their_l
 def test_the_best_on_the_true_plant_keeps_its_limits_and_is_the_best_within_them(found, name):
     statistics = found[name]
     for axis in AXES:
-        allowed = 1.06 * statistics.median(SISO, axis, "effort_rms")
-        assert statistics.median(BEST, axis, "effort_rms") < 1.01 * allowed
+        # 6 % without noise; what brisk gains make of the noise comes on top.
+        assert statistics.median(BEST, axis, "effort_rms") < EFFORT * statistics.median(SISO, axis, "effort_rms")
         for method in (SISO, MIMO):
             assert statistics.median(BEST, axis, "J_M_o") < statistics.median(method, axis, "J_M_o")
         assert statistics.median(BOUND, axis, "J_M_o") < statistics.median(BEST, axis, "J_M_o")
@@ -115,7 +115,7 @@ def test_the_gmvc_design_of_a_known_model():
 
 def test_the_arx_fit_finds_a_second_order_model():
     generator = np.random.default_rng(0)
-    u = np.repeat(generator.choice([-1.0, 1.0], 400), 5)
+    u = np.concatenate([np.zeros(3), np.repeat(generator.choice([-1.0, 1.0], 400), 5)])  # from rest
     y = np.zeros_like(u)
     for k in range(3, len(u)):
         y[k] = 1.7 * y[k - 1] - 0.72 * y[k - 2] + 0.02 * u[k - 1] + 0.01 * u[k - 2]
