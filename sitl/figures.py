@@ -37,14 +37,16 @@ def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer
     figure = Figure(figsize=(9, 9.5), layout="constrained")
     panels: Any = figure.subplots(4, 1, sharex=True)
     model, _ = reference_responses(first, inner, outer)
-    panels[0].step(time, np.degrees(first.record["setpoint"][:, axis]), where="post", label="set-point", **SETPOINT)
-    panels[0].plot(time, np.degrees(model), label=f"reference model ({outer.label})", **MODEL)
+    time, setpoint = time[shown], first.record["setpoint"][shown, axis]
+    panels[0].step(time, np.degrees(setpoint), where="post", label="set-point", **SETPOINT)
+    panels[0].plot(time, np.degrees(model[shown]), label=f"reference model ({outer.label})", **MODEL)
     for (label, flight), (colour, style) in zip(flights.items(), STYLES, strict=False):
         line = {"color": colour, "linestyle": style, "linewidth": 1.6, "label": label}
-        panels[0].plot(time, np.degrees(flight.truth["attitude"][:, axis]), **line)
-        panels[1].plot(time, np.degrees(flight.truth["attitude"][:, other]), **line)
-        panels[2].plot(time, np.degrees(flight.truth["rates"][:, axis]), **line)
-        panels[3].step(time, flight.record["moment"][:, axis], where="post", **line)
+        truth = flight.truth[shown]
+        panels[0].plot(time, np.degrees(truth["attitude"][:, axis]), **line)
+        panels[1].plot(time, np.degrees(truth["attitude"][:, other]), **line)
+        panels[2].plot(time, np.degrees(truth["rates"][:, axis]), **line)
+        panels[3].step(time, flight.record["moment"][shown, axis], where="post", **line)
     for panel, text in zip(
         panels,
         (
@@ -61,7 +63,7 @@ def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer
     panels[0].legend(loc="upper right", fontsize=9, ncols=2)
     panels[0].set_title(f"{AXES[axis].capitalize()} {scenario.name}", loc="left")
     panels[3].set_xlabel("time from the start of the manoeuvre [s] (shaded: window of the figures)")
-    panels[3].set_xlim(time[shown][0], time[-1])
+    panels[3].set_xlim(time[0], time[-1])
     figure.align_ylabels(panels)
     return figure
 
@@ -80,9 +82,11 @@ def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
     )
     middle = time[-1] / 2
     for row, (text, values) in zip(panels, signals, strict=True):
-        for panel, lines in zip(row, (0.4, 1.2), strict=True):
+        # The overview as pixels: as lines it would be most of a report's size.
+        for panel, width, pixels in zip(row, (0.4, 1.2), (True, False), strict=True):
             for axis, (colour, _) in enumerate((STYLES[1], STYLES[0])):
-                panel.step(time, values[:, axis], where="post", color=colour, linewidth=lines, label=AXES[axis])
+                line = {"color": colour, "linewidth": width, "rasterized": pixels, "label": AXES[axis]}
+                panel.step(time, values[:, axis], where="post", **line)
             panel.grid(alpha=0.3)
         row[0].set_ylabel(text)
     panels[0, 1].legend(loc="upper right", fontsize=9, ncols=2)

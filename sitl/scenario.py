@@ -85,7 +85,9 @@ def _check_angle(amplitude: float) -> None:
         raise SitlError(f"amplitude: got {got:.6g} degrees, expected above 0 and at most {limit:.0f}")
 
 
-def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float = TAIL_S) -> Scenario:
+def doublet(
+    axis: str, amplitude: float, period: float, Ts: float, tail: float = TAIL_S, lead: float = LEAD
+) -> Scenario:
     """Set-point +A for half of `period`, -A for the other half, then level.
 
     Parameters
@@ -100,13 +102,15 @@ def doublet(axis: str, amplitude: float, period: float, Ts: float, tail: float =
         Control period.
     tail : float, s
         Level flight after it.
+    lead : float, s
+        Hover before it: what a vehicle that is out of balance needs to find its trim.
     """
     _check_angle(amplitude)
     _check_length("period", period, Ts)
     if not 0 <= tail <= MAX_SECONDS:
         raise SitlError(f"tail: got {tail} s, expected 0 to {MAX_SECONDS:g} s")
     column = _axis_index(axis)
-    start, half = round(LEAD / Ts), round(period / 2 / Ts)
+    start, half = round(lead / Ts), round(period / 2 / Ts)
     setpoint = np.zeros((start + 2 * half + round(tail / Ts), 3))
     setpoint[start : start + half, column] = amplitude
     setpoint[start + half : start + 2 * half, column] = -amplitude

@@ -16,6 +16,7 @@ from tuning.experiment import Experiment
 from tuning.gains import Gains, Limits, YawGains
 from tuning.gates import examine_band, examine_estimates, examine_saturation
 from tuning.instruments import Instruments, Stretches, align, excited_stretches, external_signal, instruments
+from tuning.manoeuvre import doublet_model, refine_cascade
 from tuning.reference import ReferenceModel
 from tuning.siso import siso_vrft
 from tuning.spec import TuningSpec
@@ -236,7 +237,21 @@ def tune(
             gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full, spec.doublet_s)
         except TuningError as error:
             warnings.append(f"the attitude gains are left as VRFT gives them: {error}")
-    if "Kp_o" not in deviations:
+    if spec.manoeuvre:
+        try:
+            gains = refine_cascade(
+                gains,
+                doublet_model(experiment, spec.manoeuvre),
+                plant,
+                outer_models,
+                terms=[*(TERMS[term] for term in spec.structure), "Kp_o"],
+                full=spec.method == "mimo",
+                limit=spec.manoeuvre.effort,
+            )
+            deviations = {}
+        except TuningError as error:
+            warnings.append(f"the gains are not refined for the manoeuvre: {error}")
+    if deviations and "Kp_o" not in deviations:
         deviations["Kp_o"] = found.outer_deviation()
     certificate = certify(gains, plant, spec.models("inner", experiment.Ts), outer_models, experiment.sha256)
     provenance = {
@@ -249,6 +264,7 @@ def tune(
         "trim": spec.trim,
         "pull": spec.pull,
         "refined": spec.refine,
+        **({"manoeuvre": spec.manoeuvre.model_dump(exclude_none=True)} if spec.manoeuvre else {}),
         "fit": [float(value) for loop in found.inner for value in loop.solution.r_squared],
         "warnings": warnings,
         "inner_model": [list(model) for model in spec.inner],

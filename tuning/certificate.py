@@ -119,7 +119,7 @@ def certify(
 
     if len(known) < MIN_FREQUENCIES:
         return verdict(NOT_CERTIFIED, "the excitation reaches fewer than 8 frequencies", {}, (0.0, 0.0))
-    small = _loop_above(gains, plant.at(known)) <= HIGH_FREQUENCY_LOOP
+    small = loop_above(gains, plant.at(known)) <= HIGH_FREQUENCY_LOOP
     # Where the loop is small for good nothing more has to be known: the noisy end of the band is left out.
     settled = len(known) - int(np.argmin(small[::-1])) if not small.all() else 1
     known = known[: max(settled + 1, MIN_FREQUENCIES)]
@@ -199,7 +199,7 @@ def _turn(f: Complex) -> float:
 
 def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
     """Why nothing can be said outside of the band; empty when the assumptions hold."""
-    loop = float(_loop_above(gains, plant)[-1])
+    loop = float(loop_above(gains, plant)[-1])
     if loop > HIGH_FREQUENCY_LOOP:
         return (
             f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
@@ -223,7 +223,7 @@ def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
     return ""
 
 
-def _loop_above(gains: Gains, plant: PlantResponse) -> Signal:
+def loop_above(gains: Gains, plant: PlantResponse) -> Signal:
     """What the rate loop's gain may still reach above each frequency of the plant, (K,).
 
     The supremum over w > w_k of sigma_max(G(w_k)) (w_k / w) sigma_max(C_e + C_d)(w). A rate is the integral of the
@@ -241,7 +241,7 @@ def _loop_above(gains: Gains, plant: PlantResponse) -> Signal:
 def _outer_loop_above(gains: Gains, plant: PlantResponse) -> float:
     """What the attitude path (C_e + Kff) Kp_o G_o may still add to the loop's gain above the plant's band.
 
-    G_o falls at least like 1/w^2 there, see `_loop_above`.
+    G_o falls at least like 1/w^2 there, see `loop_above`.
     """
     grid = np.linspace(plant.omega[-1], np.pi / gains.Ts, 200)
     C_e, _ = inner_controllers(gains, grid)
@@ -275,7 +275,7 @@ def _figures(
         for i, axis in enumerate(("roll", "pitch"))
     }
     # Above the band the loop is at most this large: no gain margin is claimed beyond what that leaves.
-    rest = _loop_above(gains, plant)[-1]
+    rest = loop_above(gains, plant)[-1]
     ceiling = -20 * float(np.log10(rest)) if rest > 0 else np.inf
     distance = np.abs(np.linalg.det(identity + nominal.L_u)).min()
     return {

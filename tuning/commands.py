@@ -41,6 +41,10 @@ def tune(
         str | None, typer.Option(help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 20,0.4,0.")
     ] = None,
     outer: Annotated[str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY; 10,0.7,0.")] = None,
+    doublet: Annotated[
+        str | None,
+        typer.Option(help="Refine all gains for a doublet: DEGREES,SECONDS (whole length), such as 22.5,0.42."),
+    ] = None,
     structure: Annotated[
         str | None,
         typer.Option(help="Terms of the rate controller: P, PI, PD or PID (the default), F behind for feed-forward."),
@@ -73,13 +77,14 @@ def tune(
     from tuning.logs.columns import load_columns
     from tuning.logs.reader import read_log
     from tuning.output import print_json
-    from tuning.spec import load_spec, parse_model
+    from tuning.spec import load_spec, parse_doublet, parse_model
 
     task = load_spec(
         spec,
         method=method,
         inner=parse_model(inner) if inner else None,
         outer=parse_model(outer) if outer else None,
+        manoeuvre=parse_doublet(doublet) if doublet else None,
         structure=structure,
         instrument=instrument or ("repeated" if repeat else None),
         window=window,

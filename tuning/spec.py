@@ -39,6 +39,24 @@ class LimitsSpec(_Table):
     integral_max: Triple
 
 
+class Manoeuvre(_Table):
+    """A doublet that all gains are refined for, `tuning.manoeuvre`.
+
+    Attributes
+    ----------
+    amplitude_deg : float, deg
+    period_s : float, s
+        Its whole length.
+    effort : tuple of 2 float or None
+        RMS of both moments together that the roll and the pitch doublet may need; None: what they need with the
+        gains that VRFT gives.
+    """
+
+    amplitude_deg: Annotated[float, Field(gt=0, le=60)]
+    period_s: Annotated[float, Field(gt=0, le=60)]
+    effort: tuple[Positive, Positive] | None = None
+
+
 class TuningSpec(_Table):
     """One tuning task.
 
@@ -69,6 +87,8 @@ class TuningSpec(_Table):
         leaves them as VRFT gives them.
     doublet_s : float or None, s
         Length of the doublet that the refinement weighs errors by; None: 1/omega, for set-points of all kinds.
+    manoeuvre : Manoeuvre or None
+        Refine all gains, of both loops, for this doublet; None: the rate loop stays as its model asks.
     derivative_cutoff_hz : float or None, Hz
         Of the derivative filter that will fly; None: as flown.
     moment_scale : tuple of 3 float or None, N m
@@ -88,6 +108,7 @@ class TuningSpec(_Table):
     pull: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     refine: bool = True
     doublet_s: Annotated[float, Field(gt=0, le=60)] | None = None
+    manoeuvre: Manoeuvre | None = None
     derivative_cutoff_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     moment_scale: Triple | None = None
     yaw: YawSpec | None = None
@@ -148,3 +169,18 @@ def parse_model(text: str) -> tuple[float, float, int]:
         return float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
     except ValueError:
         raise TuningError(f"reference model: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0") from None
+
+
+def parse_doublet(text: str) -> dict[str, float]:
+    """``DEGREES,SECONDS`` as it stands on the command line: a `Manoeuvre`.
+
+    Raises
+    ------
+    TuningError
+        When it is not two numbers.
+    """
+    try:
+        amplitude, period = (float(part) for part in text.split(","))
+    except ValueError:
+        raise TuningError(f"doublet: got {text!r}, expected DEGREES,SECONDS such as 22.5,0.42") from None
+    return {"amplitude_deg": amplitude, "period_s": period}

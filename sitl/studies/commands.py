@@ -12,10 +12,17 @@ from sitl.commands import AirframeArgument, AxisOption, FaultOption, JsonOption,
 
 
 class Study(StrEnum):
-    """What can be reproduced."""
+    """What can be reproduced: Chapter 5's benchmarks, Chapter 6's vehicles, and ours."""
 
     NUMERICAL_EXAMPLE = "numerical-example"
     LV100 = "lv100"
+    ADAM0_SIM = "adam0-sim"
+    ADAM0 = "adam0"
+    ADAM0_PERTURBED = "adam0-perturbed"
+    ANTR = "antr"
+    ADAM0_SMALL = "adam0-small"
+    COUPLED = "coupled"
+    ALL = "all"
 
 
 def register(app: typer.Typer) -> None:
@@ -87,15 +94,20 @@ def faults(
 
 
 def reproduce(
-    study: Annotated[Study, typer.Argument(help="Which benchmark of the thesis.")],
+    study: Annotated[Study, typer.Argument(help="Which study, or all of them.")],
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("reproduction"),
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Experiments of each vehicle, with other noise; 50 by default.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one a core.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Compute a benchmark of the thesis again and print it beside the thesis' figures."""
-    from sitl.studies.reproduce import print_reproduction, reproduce_lv100, reproduce_numerical_example
+    """Compute the thesis' tables and figures again, beside its own figures."""
+    from sitl.studies.reproduce import SEEDS, print_reproduction
+    from sitl.studies.reproduce import reproduce as compute
     from tuning.output import print_json
 
-    found = reproduce_lv100(out) if study is Study.LV100 else reproduce_numerical_example(out)
+    found = compute(study.value, out, seeds or SEEDS, workers)
     if as_json:
         print_json(found.as_json())
     else:

@@ -3,8 +3,9 @@ import json
 import numpy as np
 import pytest
 
+from sitl.studies.benchmark_studies import gain_spread, run_cbt, run_ift, study_lv100
 from sitl.studies.benchmarks import excitation, lv100
-from sitl.studies.reproduce import gain_spread, reproduce_lv100, reproduce_numerical_example, run_cbt, run_ift
+from sitl.studies.reproduce import reproduce
 from tests.conftest import assert_one_clear_line
 from tuning.comparators import correlation_based_tuning, iterative_feedback_tuning
 from tuning.errors import TuningError
@@ -68,8 +69,8 @@ def test_repeated_tunings_agree_with_table_5_2():
 
 
 def test_the_numerical_example_beside_table_5_3(tmp_path):
-    found = reproduce_numerical_example(tmp_path)
-    table = found.figures["table_5_3"]
+    found = reproduce("numerical-example", tmp_path)
+    table = found.figures["numerical-example"]["table_5_3"]
     for key in ("B0", "B1"):
         assert np.array(table["MIMO"][key]) == pytest.approx(
             np.array(table["MIMO, Table 5.3 as printed"][key]), abs=5.1e-4
@@ -79,22 +80,26 @@ def test_the_numerical_example_beside_table_5_3(tmp_path):
     assert np.diag(table["SISO"]["B0"]) == pytest.approx([0.1 / 0.09516, 0.1 / 0.04758], rel=1e-3)
     first = found.report.read_bytes()
     assert b"Table 5.3" in first
-    assert reproduce_numerical_example(tmp_path).report.read_bytes() == first
+    assert reproduce("numerical-example", tmp_path).report.read_bytes() == first
 
 
-def test_the_lv100_report_has_every_table_and_the_same_bytes_again(tmp_path):
-    found = reproduce_lv100(tmp_path, runs=4, seeds=1)
-    text = found.report.read_text()
-    for word in ("Table 5.1", "Table 5.2", "Figures 5.1 and 5.2", "CbT", "IFT", "469", "as printed", "<svg"):
+def test_lv100_has_every_table_and_figure_and_the_same_again():
+    found = study_lv100(runs=4, seeds=1)
+    text = " ".join([section.heading + section.text for section in found.sections])
+    text += " ".join(cell for table in found.tables for row in [[table.caption], *table.rows] for cell in row)
+    for word in ("Table 5.1", "Table 5.2", "Figures 5.1 and 5.2", "CbT", "IFT", "469", "as printed"):
         assert word in text
-    assert json.dumps(found.as_json())
-    assert reproduce_lv100(tmp_path, runs=4, seeds=1).report.read_text() == text
+    assert sum(figure.startswith("<svg") for section in found.sections for figure in section.figures) == 2
+    assert json.dumps(found.figures)
+    assert study_lv100(runs=4, seeds=1).sections == found.sections
 
 
 def test_the_command_prints_one_json_object_and_refuses_what_it_does_not_know(mimopilot):
     result = mimopilot("reproduce", "numerical-example", "--out", "o", "--json")
     assert result.returncode == 0, result.stderr
-    assert json.loads(result.stdout)["table_5_3"]["SISO"]["J_MR"] == pytest.approx(0.0227, abs=1e-3)
+    assert json.loads(result.stdout)["numerical-example"]["table_5_3"]["SISO"]["J_MR"] == pytest.approx(
+        0.0227, abs=1e-3
+    )
     assert mimopilot("reproduce", "table-9").returncode == 2
 
 

@@ -1,0 +1,302 @@
+"""Chapter 6 of the thesis on the bench: each vehicle flies its experiment, is tuned from it, and flies doublets."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from codegen.native import NativeController, NativeLibrary, load_native
+from sitl.airframe import Vehicle, load_airframe
+from sitl.autopilot import Autopilot
+from sitl.errors import SitlError
+from sitl.loop import Flight, fly
+from sitl.metrics import Performance, performance
+from sitl.scenario import AXES, Scenario, doublet, excitation_flight
+from sitl.studies.autotune import autotune
+from sitl.studies.benchmarks import TABLES
+from sitl.studies.optimum import Task, best_gains, moment_rms
+from tuning.cascade import measured_plant, tune
+from tuning.certificate import certify
+from tuning.closed_loop import PlantResponse
+from tuning.experiment import Experiment
+from tuning.gains import Gains
+from tuning.manoeuvre import doublet_model, effort, integral_rate
+from tuning.reference import ReferenceModel, second_order
+from tuning.spec import Manoeuvre, TuningSpec
+
+DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, perturbed log"
+MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same without limits"
+#: Effort over SISO's that is asked of the refined gains, as predicted, and allowed to the best on the true plant, as
+#: flown: the 10 % of the expectation less what a prediction may miss.
+EFFORT = 1.06
+#: Hover before a doublet; a mass at one motor takes longer to be trimmed out.
+LEAD_S, TRIM_S = 1.0, 6.0
+
+Model = tuple[float, float, int]
+
+
+@dataclass(frozen=True)
+class Study:
+    """One vehicle and what is asked of it.
+
+    Attributes
+    ----------
+    name, title : str
+    airframe : str
+    inner, outer : (rad/s, damping, delay in samples)
+        Reference models of the rate and the attitude loop.
+    siso_models : (inner, outer)
+        Those that SISO was tuned for.
+    siso_airframe : str
+        Whose log SISO is tuned on.
+    amplitude_deg, period_s : float
+        Of the doublet.
+    lead_s : float
+        Hover before it.
+    excitation : (s an axis, amplitude, rad/s)
+        PRBS of the experiment.
+    gains_table : (str, mapping)
+        Name of the thesis' table of gains and what it prints.
+    costs_table : (str, axis, mapping)
+        The same for J.
+    offaxis : float or None
+        What MIMO's off-axis peak may be, over SISO's; None: nothing is coupled.
+    """
+
+    name: str
+    title: str
+    airframe: str
+    inner: Model
+    outer: Model
+    siso_models: tuple[Model, Model]
+    siso_airframe: str
+    amplitude_deg: float
+    period_s: float
+    lead_s: float
+    excitation: tuple[float, float, float]
+    gains_table: tuple[str, dict[str, Any]]
+    costs_table: tuple[str, str, dict[str, Any]]
+    offaxis: float | None
+
+    def models(self, method: str, Ts: float) -> tuple[ReferenceModel, ReferenceModel]:
+        """Rate-loop and attitude-loop model that a method's flights are compared with: those it was tuned for."""
+        inner, outer = self.siso_models if method in (SISO, SISO_OWN) else (self.inner, self.outer)
+        return second_order(*inner, Ts), second_order(*outer, Ts)
+
+    def doublets(self, Ts: float, **lengths: float) -> list[Scenario]:
+        """Roll, pitch; `lengths` are those of `doublet`."""
+        height = float(np.radians(self.amplitude_deg))
+        return [doublet(axis, height, self.period_s, Ts, **({"lead": self.lead_s} | lengths)) for axis in AXES]
+
+    def methods(self) -> list[str]:
+        """Names of all gain sets, in the order of the tables."""
+        own = [SISO_OWN] if self.siso_airframe != self.airframe else []
+        return [DEFAULT, AUTOTUNE, SISO, *own, MIMO, REFINED, BEST, BOUND]
+
+
+def studies() -> dict[str, Study]:
+    """The studies by name, from the thesis' tables; the strongly coupled one is our own."""
+    printed = json.loads(TABLES.read_text())
+
+    def model(entry: dict[str, Any]) -> Model:
+        return float(entry["omega"]), float(entry["zeta"]), int(entry["delay"])
+
+    def made(
+        name: str, title: str, airframe: str, key: str, gains: str, costs: str, offaxis: float | None, **changes: Any
+    ) -> Study:
+        part = printed[key]
+        models = part.get("reference_models", {"MIMO": part, "SISO": part})
+        inner, outer = (model(models["MIMO"][loop]) for loop in ("inner", "outer"))
+        siso_inner, siso_outer = (model(models["SISO"][loop]) for loop in ("inner", "outer"))
+        prbs = part.get("prbs", printed["adam0_simulation"]["prbs"])
+        task = part["doublet"]
+        number, _, axis = costs.partition(" ")
+        entry = {
+            "name": name,
+            "title": title,
+            "airframe": airframe,
+            "inner": inner,
+            "outer": outer,
+            "siso_models": (siso_inner, siso_outer),
+            "siso_airframe": airframe,
+            "amplitude_deg": float(task["amplitude_deg"]),
+            "period_s": task["period_s"],
+            "lead_s": LEAD_S,
+            "excitation": (float(prbs["seconds_per_axis"]), float(prbs["amplitude"]), float(prbs["bandwidth_rad_s"])),
+            "gains_table": (f"Table {gains}", part[f"table_{gains.replace('.', '_')}"] if gains else {}),
+            "costs_table": (
+                f"Table {number}",
+                axis,
+                part[f"table_{number.replace('.', '_')}_{axis}"] if costs else {},
+            ),
+            "offaxis": offaxis,
+        }
+        return Study(**(entry | changes))
+
+    simulation = made("adam0-sim", "ADAM-0, 10 % coupling", "adam0", "adam0_simulation", "5.4", "", 1 / 3)
+    return {
+        study.name: study
+        for study in (
+            simulation,
+            made("adam0", "ADAM-0, nominal", "adam0_nominal", "adam0_flight_nominal", "6.2", "6.3 roll", None),
+            made(
+                "adam0-perturbed",
+                "ADAM-0, 160 g at motor 3",
+                "adam0_perturbed",
+                "adam0_flight_perturbed",
+                "6.4",
+                "6.5 pitch",
+                1 / 3,
+                siso_airframe="adam0_nominal",
+                lead_s=TRIM_S,
+            ),
+            # The thesis does not print the length of ANT-R's doublet.
+            made("antr", "ANT-R", "antr", "antr_flight", "6.7", "6.8 roll", None, period_s=0.4),
+            replace(
+                simulation,
+                name="adam0-small",
+                title="ADAM-0, 10 % coupling, small doublet",
+                amplitude_deg=8.0,  # far from the motors' limits, where the vehicle is linear
+                gains_table=("", {}),
+            ),
+            replace(
+                simulation,
+                name="coupled",
+                title="ADAM-0 with a boom, 40 % coupling",
+                airframe="adam0_boom",
+                siso_airframe="adam0_boom",
+                amplitude_deg=15.0,  # at 22.5 its motors saturate
+                gains_table=("", {}),
+                offaxis=1 / 5,
+            ),
+        )
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One experiment and what came of it.
+
+    Attributes
+    ----------
+    experiment : Flight
+    gains : dict
+        Method -> set, certified from the experiment.
+    flights : dict
+        Method -> roll and pitch doublet.
+    figures : dict
+        Method -> `Performance` of both.
+    """
+
+    experiment: Flight
+    gains: dict[str, Gains]
+    flights: dict[str, list[Flight]]
+    figures: dict[str, list[Performance]]
+
+
+@cache
+def _bench(airframe: str) -> tuple[Vehicle, Gains, NativeLibrary]:
+    vehicle = load_airframe(airframe)
+    default = vehicle.default_gains()
+    return vehicle, default, load_native(default)
+
+
+def fly_set(airframe: str, gains: Gains, scenario: Scenario, seed: int, noise: bool = True) -> Flight:
+    """One flight of a vehicle under a gain set; a lost one is an error."""
+    vehicle, _, library = _bench(airframe)
+    autopilot = Autopilot(vehicle.airframe, gains, NativeController(library, gains))
+    flight = fly(vehicle.airframe, autopilot, scenario, seed, noise)
+    if flight.crashed_at is not None:
+        raise SitlError(f"{airframe}: lost at {flight.crashed_at:.2f} s of the {scenario.name}", exit_code=1)
+    return flight
+
+
+def experiment(study: Study, airframe: str, seed: int) -> tuple[Flight, Experiment]:
+    """The excitation flight of a study on a vehicle, and its signals as they are logged."""
+    default = _bench(airframe)[1]
+    scenario = excitation_flight(*study.excitation, default.Ts, np.random.default_rng(seed))
+    flight = fly_set(airframe, default, scenario, seed)
+    names = {"u": "moment", "y_i": "rates", "y_o": "attitude", "u_bar": "excitation", "r_o": "setpoint"}
+    signals: Any = {name: flight.record[field][:, :2].astype(np.float64) for name, field in names.items()}
+    return flight, Experiment(Ts=default.Ts, source=f"{airframe}, seed {seed}", flown=default, **signals)
+
+
+def tune_all(study: Study, log: Experiment, siso_log: Experiment, plant: PlantResponse) -> dict[str, Gains]:
+    """Every data-driven method, each from one log; `plant` is what `log` says of the response."""
+    default = _bench(study.airframe)[1]
+    inner, outer = study.siso_models
+    siso = TuningSpec(method="siso", inner=(inner, inner), outer=(outer, outer))
+    mimo = TuningSpec(inner=(study.inner, study.inner), outer=(study.outer, study.outer))
+    found = {DEFAULT: default, AUTOTUNE: autotune(log, default), SISO: tune(siso_log, siso)}
+    if siso_log is not log:
+        found[SISO_OWN] = tune(log, siso)
+    task = Manoeuvre(amplitude_deg=study.amplitude_deg, period_s=study.period_s)
+    roll, pitch = effort(found[SISO], doublet_model(log, task))
+    task = task.model_copy(update={"effort": (EFFORT * roll, EFFORT * pitch)})
+    found[MIMO] = tune(log, mimo, plant)
+    found[REFINED] = tune(log, mimo.model_copy(update={"manoeuvre": task}), plant)
+    return found
+
+
+def logs(study: Study, seed: int) -> tuple[Flight, Experiment, Experiment]:
+    """The study's excitation flight, its log, and the log that SISO is tuned on."""
+    flight, log = experiment(study, study.airframe, seed)
+    other = log if study.siso_airframe == study.airframe else experiment(study, study.siso_airframe, seed)[1]
+    return flight, log, other
+
+
+def optimum(study: Study) -> dict[str, Gains]:
+    """The best gains on the true plant: with the effort and the margins of the expectations, and without any."""
+    _, log, siso_log = logs(study, 0)
+    plant = measured_plant(log)
+    found = tune_all(study, log, siso_log, plant)
+    Ts = log.Ts
+    # Without noise a vehicle in balance needs no hover, and what comes after the doublet does not count.
+    doublets = study.doublets(Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
+    spent = [moment_rms(fly_set(study.airframe, found[SISO], task, 0, noise=False)) for task in doublets]
+    task = Task(
+        _bench(study.airframe)[0].airframe,
+        _bench(study.airframe)[2],
+        doublets,
+        study.models(BEST, Ts)[1],
+        plant.at(plant.coherent()),
+        [EFFORT * value for value in spent],
+        integral_rate(found[DEFAULT].Ki_i, found[DEFAULT].Kp_i),
+    )
+    best = best_gains(task, [found[AUTOTUNE], found[REFINED]])
+    bound = best_gains(replace(task, effort=None), [best])
+    return {BEST: best, BOUND: bound}
+
+
+def run(study: Study, seed: int, best: dict[str, Gains]) -> Run:
+    """Fly the experiment, tune, certify, and fly both doublets with every set."""
+    flight, log, siso_log = logs(study, seed)
+    plant = measured_plant(log)
+    inner, outer = ([model] * 2 for model in study.models(MIMO, log.Ts))
+    gains = {
+        method: replace(found, certificate=certify(found, plant, inner, outer).as_table())
+        for method, found in (tune_all(study, log, siso_log, plant) | best).items()
+    }
+    doublets = study.doublets(log.Ts)
+    flights = {m: [fly_set(study.airframe, found, task, seed) for task in doublets] for m, found in gains.items()}
+    figures = {
+        method: [performance(one, *study.models(method, log.Ts)) for one in both] for method, both in flights.items()
+    }
+    return Run(flight, gains, flights, figures)
+
+
+def numbers(found: Run) -> dict[str, Any]:
+    """What of a run goes into statistics: figures, verdicts and gains by method."""
+    return {
+        method: {
+            "verdict": gains.verdict()[0],
+            "Ms": (gains.certificate or {}).get("figures", {}).get("Ms"),
+            "gains": {name: np.asarray(getattr(gains, name)).tolist() for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i")},
+            **{axis: asdict(figures) for axis, figures in zip(AXES, found.figures[method], strict=True)},
+        }
+        for method, gains in found.gains.items()
+    }

@@ -1,0 +1,168 @@
+"""Figures of the attitude studies: motor commands, gains with their spread, figures of merit with theirs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
+
+from sitl.figures import STYLES
+from sitl.loop import Flight
+from sitl.metrics import reference_responses
+from sitl.scenario import AXES
+from sitl.studies.attitude import MIMO, REFINED, SISO, Run, Study
+from sitl.studies.attitude_runs import Statistics
+
+#: A colour, a line and a marker of its own for each method that is compared everywhere.
+LOOK = dict(zip((SISO, MIMO, REFINED), zip(STYLES, "so^", strict=False), strict=False))
+PRINTED = {"color": "black", "marker": "x", "markersize": 7, "markeredgewidth": 1.6, "linestyle": "none"}
+MATRICES = {"Kp_o": "1/s", "Kp_i": "s", "Ki_i": "-", "Kd_i": "s^2"}
+ELEMENTS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
+COSTS = {
+    "J_M_o": "J_M,o [rad^2]",
+    "J_M_i": "J_M,i [rad^2/s^2]",
+    "J_r_o": "J_r,o [rad^2]",
+    "J_r_i": "J_r,i [rad^2/s^2]",
+    "offaxis_peak_deg": "off-axis peak [deg]",
+    "effort_rms": "effort: RMS of u [-]",
+}
+#: What the bars of a spread reach over.
+LOW, HIGH = 5, 95
+
+
+def tracking_figure(found: Run, study: Study) -> Figure:
+    """Distance of angle and rate to the reference models, driven by their own set-points, in both doublets."""
+    figure = Figure(figsize=(9, 5.5), layout="constrained")
+    panels: Any = figure.subplots(2, 2, sharex=True, sharey="row")
+    for method, ((colour, style), _) in LOOK.items():
+        for column, (axis, flight) in enumerate(zip(AXES, found.flights[method], strict=True)):
+            scenario, record = flight.scenario, flight.record
+            models = reference_responses(flight, *study.models(method, scenario.Ts))
+            shown = _shown(flight)
+            for panel, name, model in zip(panels[:, column], ("attitude", "rates"), models, strict=True):
+                line = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": method}
+                panel.plot(_time(flight)[shown], np.degrees(record[name][shown, column] - model[shown]), **line)
+            panels[0, column].set_title(f"{axis} doublet", loc="left", fontsize=10)
+            panels[1, column].set_xlabel("time from the start of the doublet [s]")
+    for panel, text in zip(panels[:, 0], ("angle - model [deg]", "rate - model [deg/s]"), strict=True):
+        panel.set_ylabel(text)
+    for panel in panels.flat:
+        panel.grid(alpha=0.3)
+        panel.axhline(0, color="black", linewidth=0.6)
+    _legend(figure, panels[0, 0])
+    figure.suptitle(f"{study.title}: measured minus reference model", x=0.02, ha="left")
+    return figure
+
+
+def _time(flight: Flight) -> NDArray[np.float64]:
+    """From the start of the doublet, s."""
+    return np.asarray((np.arange(len(flight.record)) - flight.scenario.window[0]) * flight.scenario.Ts, np.float64)
+
+
+def _shown(flight: Flight) -> NDArray[np.bool_]:
+    """From shortly before the doublet to its length after it."""
+    start, stop = flight.scenario.window
+    return np.asarray((_time(flight) >= -0.1) & (_time(flight) <= 2 * (stop - start) * flight.scenario.Ts))
+
+
+def motors_figure(found: Run, rotors: int, title: str) -> Figure:
+    """Commands of all motors in both doublets, one row a motor."""
+    figure = Figure(figsize=(9, 1.5 + 1.5 * rotors), layout="constrained")
+    panels: Any = figure.subplots(rotors, 2, sharex=True, sharey=True)
+    for method, ((colour, style), _) in LOOK.items():
+        for column, flight in enumerate(found.flights[method]):
+            shown = _shown(flight)
+            for motor in range(rotors):
+                line = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": method}
+                command = flight.record["commands"][shown, motor]
+                panels[motor, column].step(_time(flight)[shown], command, where="post", **line)
+    for panel in panels.flat:
+        panel.grid(alpha=0.3)
+        panel.set_ylim(-0.05, 1.05)
+    for motor in range(rotors):
+        panels[motor, 0].set_ylabel(f"motor {motor + 1} [-]")
+    for column, axis in enumerate(AXES):
+        panels[0, column].set_title(f"{axis} doublet", loc="left", fontsize=10)
+        panels[-1, column].set_xlabel("time from the start of the doublet [s]")
+    _legend(figure, panels[0, 0])
+    figure.suptitle(f"{title}: motor commands (thrust, 0 to 1)", x=0.02, ha="left")
+    return figure
+
+
+def gains_figure(found: Statistics, printed: Mapping[str, Any], table: str) -> Figure:
+    """Every gain: median and 5 to 95 % over the seeds; a cross where the thesis prints one."""
+    figure = Figure(figsize=(9, 8.5), layout="constrained")
+    panels: Any = figure.subplots(4, 4)
+    for row, (name, unit) in zip(panels, MATRICES.items(), strict=True):
+        for element, panel in enumerate(row):
+            for place, (method, look) in enumerate(LOOK.items()):
+                values = found.gains(method, name).reshape(-1, 4)[:, element]
+                _spread(panel, place, values, look, method)
+                if method in printed:
+                    value = np.ravel(printed[method][name])[element]
+                    panel.plot(place + 0.25, value, label=f"{table} as printed", **PRINTED)
+            panel.axhline(0, color="black", linewidth=0.6)
+            panel.set_xlim(-0.6, len(LOOK) - 0.4)
+            panel.set_xticks([])
+            panel.grid(alpha=0.3, axis="y")
+            panel.tick_params(labelsize=8)
+        row[0].set_ylabel(f"{name} [{unit}]")
+    for panel, text in zip(panels[0], ELEMENTS, strict=True):
+        panel.set_title(text, fontsize=10)
+    _legend(figure, panels[0, 0])
+    title = f"{found.study.title}: gains, median and {LOW} to {HIGH} % of {len(found.runs)} experiments"
+    figure.suptitle(title, x=0.02, ha="left")
+    return figure
+
+
+def costs_figure(found: Statistics, methods: Sequence[str], printed: Mapping[str, Any], axis_printed: str) -> Figure:
+    """Every figure of merit by method: median and 5 to 95 % over the seeds, roll and pitch."""
+    figure = Figure(figsize=(9, 8.5), layout="constrained")
+    panels: Any = figure.subplots(3, 2, sharey=True)
+    places = np.arange(len(methods))[::-1]
+    for panel, (name, text) in zip(panels.flat, COSTS.items(), strict=True):
+        for axis, shift, (colour, _), marker in zip(AXES, (0.16, -0.16), (STYLES[1], STYLES[0]), "os", strict=True):
+            for place, method in zip(places, methods, strict=True):
+                values = found.values(method, axis, name)
+                low, middle, high = np.percentile(values, [LOW, 50, HIGH])
+                panel.plot([low, high], [place + shift] * 2, color=colour, linewidth=2.2)
+                filled = colour if axis == "roll" else "white"
+                panel.plot(
+                    middle,
+                    place + shift,
+                    marker,
+                    color=colour,
+                    markerfacecolor=filled,
+                    markersize=6,
+                    label=f"{axis} doublet",
+                )
+                if axis == axis_printed and name in printed.get(method, {}):
+                    panel.plot(printed[method][name], place + shift, label="printed, real flight", **PRINTED)
+        low, high = panel.dataLim.x0, panel.dataLim.x1
+        panel.set_xscale("log" if high > 10 * low else "linear")
+        panel.xaxis.set_minor_formatter(NullFormatter())
+        panel.set_xlabel(text)
+        panel.set_yticks(places, methods)
+        panel.grid(alpha=0.3, axis="x")
+        panel.tick_params(labelsize=8)
+    _legend(figure, panels[0, 0])
+    title = f"{found.study.title}: median and {LOW} to {HIGH} % of {len(found.runs)} seeds"
+    figure.suptitle(title, x=0.02, ha="left")
+    return figure
+
+
+def _spread(panel: Any, place: float, values: NDArray[np.float64], look: Any, label: str) -> None:
+    (colour, _), marker = look
+    low, middle, high = np.percentile(values, [LOW, 50, HIGH])
+    panel.plot([place, place], [low, high], color=colour, linewidth=2.5)
+    panel.plot(place, middle, marker, color=colour, markersize=6, label=label)
+
+
+def _legend(figure: Figure, panel: Any) -> None:
+    """One entry for each label of a panel, below the figure."""
+    handles = dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=9)

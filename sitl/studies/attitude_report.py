@@ -1,0 +1,189 @@
+"""An attitude study as tables and figures, beside what the thesis prints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from sitl.airframe import load_airframe
+from sitl.figures import experiment_figure, manoeuvre_figure, svg
+from sitl.report import Section, Table
+from sitl.scenario import AXES
+from sitl.studies.attitude import AUTOTUNE, BEST, BOUND, DEFAULT, EFFORT, MIMO, REFINED, SISO, SISO_OWN, Study
+from sitl.studies.attitude_figures import (
+    COSTS,
+    ELEMENTS,
+    HIGH,
+    LOW,
+    MATRICES,
+    costs_figure,
+    gains_figure,
+    motors_figure,
+    tracking_figure,
+)
+from sitl.studies.attitude_runs import Statistics
+
+IN_KIND = (
+    "The thesis' figures of real flights can only be compared in kind: its vehicles' inertias, motors and winds are "
+    "not known, and those of the bench are class values."
+)
+METHODS = (
+    f"{DEFAULT}: the gains that flew the experiment. {AUTOTUNE}: one axis at a time by the rule of PX4's autotune, "
+    f"from the same log. {SISO} and {MIMO}: VRFT with the thesis' reference models. {REFINED}: {MIMO} refined on a "
+    f"model from the same log, for this doublet, with {EFFORT - 1:.0%} more effort than {SISO} is predicted to need. "
+    f"{BEST}: all gains found by direct optimisation in the bench, with as much effort, Ms at most 2.5 and the "
+    f"integral action of the default gains; no method knows the true plant. {BOUND}: whatever it takes. Effort: RMS of "
+    "both moments together."
+)
+SPREAD_COLUMNS = ("gain", *ELEMENTS)
+COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].partition(":")[0] for text in COSTS.values()))
+CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms")
+
+
+def study_sections(found: Statistics) -> list[Section]:
+    """Headings, tables and figures of a study."""
+    study, name = found.study, found.study.name
+    inner, outer = study.models(MIMO, found.shown.experiment.scenario.Ts)
+    rotors = len(load_airframe(study.airframe).airframe.rotors)
+
+    def doublets(methods: Iterable[str], key: str) -> list[str]:
+        return [
+            svg(
+                manoeuvre_figure({m: found.shown.flights[m][axis] for m in methods}, inner, outer),
+                f"{name} {key} {AXES[axis]}",
+            )
+            for axis in range(2)
+        ]
+
+    _, axis, costs = study.costs_table
+    return [
+        Section(
+            f"{name}: experiment",
+            _lead(study, inner.label, outer.label),
+            figures=[svg(experiment_figure(found.shown.experiment), f"{name} experiment")],
+        ),
+        Section(
+            f"{name}: gains",
+            f"Medians, in brackets {LOW} to {HIGH} % of {len(found.runs)} experiments with other noise and another "
+            "PRBS. Kp_o in 1/s, Kp_i in s, Ki_i without unit, Kd_i in s^2.",
+            [gains_table(found)],
+            [svg(gains_figure(found, study.gains_table[1], study.gains_table[0]), f"{name} gains")],
+        ),
+        Section(
+            f"{name}: doublets",
+            f"Doublet of {study.amplitude_deg:g} degrees, {study.period_s:g} s. J over the doublet, each method beside "
+            f"the models that it was tuned for. {METHODS} {IN_KIND if costs else ''}",
+            [costs_table(found), certificates_table(found)],
+            [
+                svg(costs_figure(found, study.methods(), costs, axis), f"{name} costs"),
+                *doublets((SISO, MIMO, REFINED), "ours"),
+                *doublets((DEFAULT, AUTOTUNE, REFINED, BEST), "others"),
+                svg(tracking_figure(found.shown, study), f"{name} tracking"),
+                svg(motors_figure(found.shown, rotors, study.title), f"{name} motors"),
+            ],
+        ),
+    ]
+
+
+def _lead(study: Study, inner: str, outer: str) -> str:
+    seconds, amplitude, bandwidth = study.excitation
+    text = (
+        f"{load_airframe(study.airframe).airframe.description}. PRBS of amplitude {amplitude:g} and {bandwidth:g} "
+        f"rad/s for {seconds:g} s on each axis under the default gains. Reference models (rad/s, damping, delay "
+        f"in samples): rate loop {inner}; attitude loop {outer}."
+    )
+    (omega, zeta, delay), (omega_o, zeta_o, delay_o) = study.siso_models
+    if study.siso_models != (study.inner, study.outer):
+        text += f" SISO: {omega:g}, {zeta:g}, {delay}; {omega_o:g}, {zeta_o:g}, {delay_o}."
+    if study.siso_airframe != study.airframe:
+        text += (
+            f" {SISO} is tuned on the log of {study.siso_airframe}, as the thesis had to; {SISO_OWN} is what this "
+            "vehicle's own log gives."
+        )
+    return text
+
+
+def gains_table(found: Statistics) -> Table:
+    """Medians and spread of every method, beside the thesis'."""
+    number, printed = found.study.gains_table
+    rows = []
+    for matrix in MATRICES:
+        for method in found.study.methods():
+            values = found.gains(method, matrix).reshape(-1, 4)
+            low, middle, high = np.percentile(values, [LOW, 50, HIGH], axis=0)
+            cells = [
+                _plain(f"{m:.4f}") + (f" ({_plain(f'{a:.4f}')} to {_plain(f'{b:.4f}')})" if b - a > 1e-9 else "")
+                for a, m, b in zip(low, middle, high, strict=True)
+            ]
+            rows.append([f"{matrix}  {method}", *cells])
+            if method in printed:
+                rows.append([f"{matrix}  {method}, {number}", *(f"{v:.4f}" for v in np.ravel(printed[method][matrix]))])
+    return Table(f"{found.study.name}: gains, output <- error", SPREAD_COLUMNS, rows)
+
+
+def costs_table(found: Statistics) -> Table:
+    """Medians of every figure by method and axis, beside the thesis' real flights."""
+    number, axis_printed, printed = found.study.costs_table
+    rows = []
+    for axis in AXES:
+        for method in found.study.methods():
+            medians = [_figure(name, found.median(method, axis, name)) for name in COSTS]
+            rows.append([f"{axis}, {method}", *medians])
+            if axis == axis_printed and method in printed:
+                flown = [_figure(name, printed[method][name]) if name in printed[method] else "" for name in COSTS]
+                rows.append([f"{axis}, {method}, {number} (real flight)", *flown])
+    caption = f"{found.study.name}: medians of {len(found.runs)} seeds; J in rad^2 and rad^2/s^2, peak in deg"
+    return Table(caption, COST_COLUMNS, rows)
+
+
+def certificates_table(found: Statistics) -> Table:
+    """What the certificate says of every method, from the log that this vehicle flew."""
+    rows = []
+    for method in found.study.methods():
+        verdicts = ", ".join(f"{count}: {verdict}" for verdict, count in found.verdicts(method).items())
+        peaks = [run[method]["Ms"] for run in found.runs if run[method]["Ms"] is not None]
+        rows.append([method, verdicts, f"{np.median(peaks):.2f}" if peaks else ""])
+    return Table(f"{found.study.name}: certificates, and the median peak of the sensitivity", CERTIFICATE_COLUMNS, rows)
+
+
+def study_figures(found: Statistics) -> dict[str, Any]:
+    """The study's part of what ``--json`` prints."""
+    study = found.study
+
+    def spread(values: Any) -> dict[str, Any]:
+        low, middle, high = np.percentile(values, [LOW, 50, HIGH], axis=0)
+        return {"median": middle.tolist(), f"p{LOW}": low.tolist(), f"p{HIGH}": high.tolist()}
+
+    return {
+        "seeds": len(found.runs),
+        "methods": {
+            method: {
+                "verdicts": found.verdicts(method),
+                "gains": {matrix: spread(found.gains(method, matrix)) for matrix in MATRICES},
+                **{axis: {name: spread(found.values(method, axis, name)) for name in COSTS} for axis in AXES},
+            }
+            for method in study.methods()
+        },
+        "printed": _printed(study),
+    }
+
+
+def _printed(study: Study) -> Mapping[str, Any]:
+    number, axis, costs = study.costs_table
+    found: dict[str, Any] = {}
+    if study.gains_table[1]:
+        found[study.gains_table[0]] = study.gains_table[1]
+    if costs:
+        found[f"{number}, {axis}"] = costs
+    return found
+
+
+def _figure(name: str, value: float) -> str:
+    return f"{value:.2f}" if name == "offaxis_peak_deg" else f"{value:.3g}"
+
+
+def _plain(text: str) -> str:
+    """Without a minus sign before zero."""
+    return text.removeprefix("-") if not text.strip("-0.") else text

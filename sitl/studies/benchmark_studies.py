@@ -1,0 +1,270 @@
+"""Chapter 5 of the thesis: its two benchmarks, computed again and printed beside its own figures."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import nullcontext
+from typing import Any
+
+import numpy as np
+
+from sitl.figures import svg
+from sitl.report import Section, Table
+from sitl.studies.benchmark_figures import sensitivity_figure, step_figure
+from sitl.studies.benchmarks import Benchmark, Signal, excitation, lv100, numerical_example
+from sitl.studies.part import Part
+from tuning.comparators import Comparison, correlation_based_tuning, iterative_feedback_tuning
+from tuning.identification import pbsid
+from tuning.loop import LoopController
+from tuning.refine import refine
+from tuning.siso import siso_vrft
+from tuning.vrft import vrft
+
+SAMPLES = 5000
+IFT_SAMPLES = 1000
+RUNS, LENGTHS, CHUNK, WORKERS = 500, (1000, 10_000), 25, 2
+SEEDS = 20
+CONTROLLER_COLUMNS = ("controller", "(1,1)", "(1,2)", "(2,1)", "(2,2)", "J_MR", "experiments")
+SPREAD_COLUMNS = ("gain, N", "mean", "std", "printed |mean|", "printed std")
+
+
+def one_experiment(task: Benchmark, design: str, seed: int, samples: int = SAMPLES) -> tuple[Signal, Signal, Signal]:
+    """u_bar, u and y, each (samples, 2), of one experiment under the initial controller."""
+    generator = np.random.default_rng(seed)
+    u_bar = excitation(samples, design, generator)
+    return u_bar, *task.run(task.initial, np.zeros_like(u_bar), u_bar, generator)
+
+
+def tune_once(task: Benchmark, design: str, seed: int) -> dict[str, LoopController]:
+    """Every method that needs one experiment, on the same one.
+
+    Parameters
+    ----------
+    task : Benchmark
+    design : str
+        See `sitl.studies.benchmarks.excitation`.
+    seed : int
+
+    Returns
+    -------
+    dict
+        Method -> controller.
+    """
+    u_bar, u, y = one_experiment(task, design, seed)
+    Ts, models = task.plant.Ts, task.models
+    thesis = vrft(u, y, u, models, "PI", weight="identity")
+    external = vrft(u, y, u_bar, models, "PI", weight="identity")
+    optimal = LoopController(vrft(u, y, u_bar, models, "PI").gains, Ts)
+    plant = pbsid(u, y, Ts, external=u_bar).plant
+    return {
+        "VRFT, instrument u, W = I (thesis)": LoopController(thesis.gains, Ts),
+        "VRFT, instrument u_bar, W = I": LoopController(external.gains, Ts),
+        "VRFT, instrument u_bar, optimal W": optimal,
+        "VRFT, refined on a PBSID model": refine(optimal, plant, models).controller,
+    }
+
+
+def run_cbt(task: Benchmark, seed: int) -> Comparison:
+    """Correlation-based Tuning: 8 experiments of 5000 samples, binary input of amplitude 1."""
+    generator = np.random.default_rng(seed)
+    w = generator.choice([-1.0, 1.0], SAMPLES)
+    return correlation_based_tuning(lambda c, r, u: task.run(c, r, u, generator), task.models, w)
+
+
+def run_ift(task: Benchmark, seed: int) -> Comparison:
+    """Iterative Feedback Tuning: 6 iterations, experiments of 1000 samples, binary set-point of amplitude 1."""
+    generator = np.random.default_rng(seed)
+    r = generator.choice([-1.0, 1.0], (IFT_SAMPLES, 2))
+    assert task.initial is not None
+    return iterative_feedback_tuning(lambda c, r, u: task.run(c, r, u, generator), task.initial, task.models, r)
+
+
+def gain_spread(task: Benchmark, samples: int, runs: int, seed: int) -> Signal:
+    """Gains of repeated experiments, simulation included: Table 5.2.
+
+    Parameters
+    ----------
+    task : Benchmark
+    samples, runs : int
+    seed : int
+
+    Returns
+    -------
+    (runs, 2, 2, 2) array
+        Run, Kp or Ki, row, column: VRFT with instrument u_bar and W = I, one axis after the other.
+    """
+    starts = range(0, runs, CHUNK)
+
+    def chunk(start: int) -> list[Signal]:
+        generator = np.random.default_rng([seed, samples, start])
+        count = min(CHUNK, runs - start)
+        u_bar = np.stack([excitation(samples, "in turn", generator) for _ in range(count)], axis=1)
+        u, y = task.run(task.initial, np.zeros_like(u_bar), u_bar, generator)
+        gains = []
+        for i in range(count):
+            found = vrft(u[:, i], y[:, i], u_bar[:, i], task.models, "PI", weight="identity").gains
+            gains.append(np.stack([found["P"], found["I"]]))
+        return gains
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        return np.array([gain for part in pool.map(chunk, starts) for gain in part])
+
+
+def study_numerical_example() -> Part:
+    """Table 5.3 and Figure 5.3: noise-free MIMO and SISO VRFT."""
+    task = numerical_example()
+    half = 1000
+    u = excitation(2 * half, "in turn", np.random.default_rng(0))
+    u, y = task.run(None, np.zeros_like(u), u, np.random.default_rng(0))
+    mimo = LoopController(vrft(u, y, u, task.models, "PI", weight="identity").gains, task.plant.Ts)
+    axes = []
+    for i, part in enumerate((slice(half), slice(half, None))):
+        u_i, y_i = u[part, i : i + 1], y[part, i : i + 1]
+        axes.append(siso_vrft(u_i, y_i, u_i, task.model, "PI", repeated=y_i, weight="identity"))
+    diagonal = {term: np.diag([axis.gain(term).item() for axis in axes]) for term in "PI"}
+    found = {"MIMO": mimo, "SISO": LoopController(diagonal, task.plant.Ts)}
+    shown = _beside(found, _printed(task, "table_5_3"), "Table 5.3")
+    table = Table("Table 5.3: (B0 z + B1)/(z - 1), noise-free", CONTROLLER_COLUMNS, _rows(task, shown, {}))
+    figure = svg(step_figure(task, found, 60, "Steps of the numerical example: MIMO and SISO VRFT"), "steps")
+    lead = (
+        "The 2x2 numerical example of the thesis, tuned without noise: one input after the other, white, in open loop."
+    )
+    section = Section("Table 5.3 and Figure 5.3", "J_MR: (3.1), here on the true plant.", [table], [figure])
+    return Part(lead, [section], {"table_5_3": _numbers(task, shown, {})})
+
+
+def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
+    """Tables 5.1 and 5.2, Figures 5.1 and 5.2, and J_MR from one experiment over noise seeds.
+
+    Parameters
+    ----------
+    runs : int
+        Experiments a length in Table 5.2.
+    seeds : int
+        Experiments a design in the one-experiment comparison.
+    """
+    task = lv100()
+    with _progress("LV100: one-experiment methods"):
+        studies = {
+            design: [tune_once(task, design, seed) for seed in range(seeds)] for design in ("in turn", "together")
+        }
+    with _progress("LV100: Correlation-based Tuning and Iterative Feedback Tuning"):
+        comparisons = {"CbT": run_cbt(task, 0), "IFT": run_ift(task, 0)}
+    with _progress(f"LV100: {2 * runs} tunings of Table 5.2"):
+        begin = time.monotonic()
+        gains = {N: gain_spread(task, N, runs, 0) for N in LENGTHS}
+        seconds = time.monotonic() - begin
+
+    medians = {
+        design: {method: float(np.median([task.cost(run[method]) for run in studies[design]])) for method in tuned[0]}
+        for design, tuned in studies.items()
+    }
+    refined = studies["together"][0]["VRFT, refined on a PBSID model"]
+    ours = {**studies["in turn"][0], "VRFT, refined, both axes at once": refined}
+    ours |= {name: comparison.controller for name, comparison in comparisons.items()}
+    printed = _printed(task, "table_5_1")
+    corrected = np.array(task.printed["table_5_1"]["VRFT"]["B1"])
+    corrected[1, 0] = -19.2  # Table 5.1 contradicts Table 5.2 here
+    printed["VRFT with (2,1) corrected"] = LoopController.from_polynomial(
+        printed["VRFT"].polynomial()[0], corrected, 0.1
+    )
+    experiments = {name: comparison.experiments for name, comparison in comparisons.items()}
+    shown = _beside(ours, printed, "Table 5.1")
+    rms = {d: [np.sqrt(np.mean(s**2, axis=0)).tolist() for s in one_experiment(task, d, 0)[1:]] for d in medians}
+
+    tables = (
+        Table("Table 5.1: (B0 z + B1)/(z - 1) by each method", CONTROLLER_COLUMNS, _rows(task, shown, experiments)),
+        Table(
+            f"J_MR from one experiment (N = {SAMPLES}, noise variance 0.0025, amplitude 1): median of {seeds} seeds",
+            ("method", *(f"axes {design}" for design in medians)),
+            [[m, *(f"{medians[d][m]:.4f}" for d in medians)] for m in medians["in turn"]]
+            + [["best possible 2x2 PI", *[f"{task.printed['J_MR']['best_2x2_PI']:.4f}"] * 2]]
+            + [
+                [f"rms of {name}, 1 / 2", *(f"{rms[d][i][0]:.2f} / {rms[d][i][1]:.2f}" for d in medians)]
+                for i, name in enumerate(("u", "y"))
+            ],
+        ),
+        Table(f"Table 5.2: gains of {runs} experiments a length", SPREAD_COLUMNS, _spread_rows(task, gains)),
+    )
+    main = {
+        name: ours[name] for name in ("VRFT, instrument u_bar, W = I", "VRFT, refined on a PBSID model", "CbT", "IFT")
+    }
+    sections = [
+        Section(
+            "Table 5.1, Figures 5.1 and 5.2",
+            "CbT: 8 experiments in open loop. IFT: 6 iterations. The thesis does not print the amplitude; 1 is used.",
+            tables[:1],
+            [
+                svg(sensitivity_figure(task, main, "LV100: complementary sensitivity"), "sensitivity"),
+                svg(step_figure(task, main, 60, "LV100: steps of the set-points"), "steps"),
+            ],
+        ),
+        Section("One experiment", "The plant is known to none of the methods; J_MR is computed on it.", tables[1:2]),
+        Section("Table 5.2", "VRFT, instrument u_bar, W = I. The thesis prints magnitudes.", tables[2:]),
+    ]
+    figures = {
+        "table_5_1": _numbers(task, shown, experiments),
+        "one_experiment_median_J_MR": medians,
+        "rms_u_y": rms,
+        "table_5_2": {
+            str(N): {"mean": g.mean(axis=0).tolist(), "std": g.std(axis=0, ddof=1).tolist()} for N, g in gains.items()
+        },
+        "table_5_2_seconds": seconds,
+    }
+    return Part("The LV100 gas turbine, M = 0.4/(z - 0.6) I, Ts = 0.1 s.", sections, figures)
+
+
+def _progress(text: str) -> Any:
+    if not sys.stderr.isatty():
+        return nullcontext()
+    from rich.console import Console
+
+    return Console(stderr=True).status(text)
+
+
+def _printed(task: Benchmark, table: str) -> dict[str, LoopController]:
+    return {n: LoopController.from_polynomial(**v, Ts=task.plant.Ts) for n, v in task.printed[table].items()}
+
+
+def _beside(
+    ours: Mapping[str, LoopController], printed: Mapping[str, LoopController], table: str
+) -> dict[str, LoopController]:
+    return {**ours, **{f"{name}, {table} as printed": controller for name, controller in printed.items()}}
+
+
+def _rows(task: Benchmark, shown: Mapping[str, LoopController], experiments: Mapping[str, int]) -> list[list[str]]:
+    rows = []
+    for name, controller in shown.items():
+        B0, B1 = (m.ravel() for m in controller.polynomial())
+        cells = [f"{b0:.4g} z {'-' if b1 < 0 else '+'} {abs(b1):.4g}" for b0, b1 in zip(B0, B1, strict=True)]
+        count = experiments.get(name, "" if "printed" in name else 1)
+        rows.append([name, *cells, f"{task.cost(controller):.4f}", str(count)])
+    return rows
+
+
+def _numbers(task: Benchmark, shown: Mapping[str, LoopController], experiments: Mapping[str, int]) -> dict[str, Any]:
+    return {
+        name: {
+            "B0": controller.polynomial()[0].tolist(),
+            "B1": controller.polynomial()[1].tolist(),
+            "J_MR": task.cost(controller),
+            **({"experiments": experiments[name]} if name in experiments else {}),
+        }
+        for name, controller in shown.items()
+    }
+
+
+def _spread_rows(task: Benchmark, gains: Mapping[int, Signal]) -> list[list[str]]:
+    rows = []
+    for t, term in enumerate(("Kp", "Ki")):
+        for element, printed in task.printed["table_5_2"][term].items():
+            i, j = (int(v) - 1 for v in element.split(","))
+            for (N, found), power in zip(gains.items(), ("1e3", "1e4"), strict=True):
+                value = found[:, t, i, j]
+                ours = [f"{value.mean():.3f}", f"{value.std(ddof=1):.3f}"]
+                theirs = [f"{printed[f'{what}_{power}']:.3f}" for what in ("mean", "std")]
+                rows.append([f"{term}({element}), {N}", *ours, *theirs])
+    return rows

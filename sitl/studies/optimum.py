@@ -1,0 +1,130 @@
+"""The best that the controller's structure can do on the true plant: the yardstick, not a method.
+
+It flies the doublets in the bench itself, without noise, and changes every gain until nothing gets better. A vehicle's
+owner cannot do that; no data-driven method may use it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from codegen.errors import CodegenError
+from codegen.native import NativeController, NativeLibrary
+from sitl.airframe import Airframe
+from sitl.autopilot import Autopilot
+from sitl.loop import Flight, fly
+from sitl.scenario import Scenario
+from tuning.certificate import HIGH_FREQUENCY_LOOP, Thresholds, loop_above
+from tuning.closed_loop import PlantResponse, cascade_loop
+from tuning.descent import descend
+from tuning.gains import Gains
+from tuning.manoeuvre import OTHER_AXIS, integral_rate, typical_sizes
+from tuning.reference import ReferenceModel
+
+#: Every gain of the structure that the thesis' tables have.
+FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
+#: Relative step of the differences: the flown controller is single precision.
+STEP, AGAIN = 1e-3, 3
+#: Limits of `Task.examine`, what a gain set that cannot fly costs (rad^2), and by what a limit may be missed.
+LIMITS, LOST, TOLERATED = 5, 10.0, 2e-3
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What is to be flown best.
+
+    Attributes
+    ----------
+    airframe : Airframe
+    library : NativeLibrary
+        The compiled controller.
+    doublets : sequence of 2 Scenario
+        Roll, pitch.
+    outer : ReferenceModel
+        What the attitude should follow.
+    plant : PlantResponse
+        Response of the vehicle that a log gives: the gains must be ones that could be certified from it.
+    effort : sequence of 2 float or None
+        RMS of the moments allowed in each doublet; None: as much as it takes, certified or not.
+    integral : float, 1/s
+        Integral action that is needed, see `tuning.manoeuvre.integral_rate`: a vehicle must find its trim.
+    """
+
+    airframe: Airframe
+    library: NativeLibrary
+    doublets: Sequence[Scenario]
+    outer: ReferenceModel
+    plant: PlantResponse
+    effort: Sequence[float] | None
+    integral: float
+
+    def fly(self, gains: Gains) -> list[Flight]:
+        """Both doublets, without noise."""
+        return [
+            fly(self.airframe, Autopilot(self.airframe, gains, NativeController(self.library, gains)), task, 0, False)
+            for task in self.doublets
+        ]
+
+    def examine(self, gains: Gains) -> tuple[float, list[float]]:
+        """Mean square distance of both angles to the model, weighed as the method does, and what the limits leave."""
+        try:
+            flights = self.fly(gains)
+        except CodegenError:  # a gain outside of the range of its parameter
+            return LOST, [-1.0] * LIMITS
+        cost = 0.0
+        for axis, flight in enumerate(flights):
+            error = flight.truth["attitude"][:, :2].copy()
+            error[:, axis] -= self.outer.response(flight.scenario.setpoint[:, axis])
+            error[:, 1 - axis] *= OTHER_AXIS
+            cost += float(np.mean(np.sum(error[slice(*flight.scenario.window)] ** 2, axis=1)))
+        if self.effort is None:
+            return cost, [1.0] * LIMITS
+        loop = np.linalg.svd(np.eye(2) + cascade_loop(gains, self.plant).L_u, compute_uv=False)
+        return cost, [
+            *(1 - moment_rms(flight) / allowed for flight, allowed in zip(flights, self.effort, strict=True)),
+            1 - float((1 / loop).max()) / Thresholds.Ms,
+            1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
+            integral_rate(gains.Ki_i, gains.Kp_i) / self.integral - 1,
+        ]
+
+
+def moment_rms(flight: Flight) -> float:
+    """RMS of the roll and pitch moments together over the manoeuvre."""
+    moments = flight.record["moment"][slice(*flight.scenario.window), :2].astype(np.float64)
+    return float(np.sqrt(np.mean(np.sum(moments**2, axis=1))))
+
+
+def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
+    """The gains that keep both angles nearest to the model in both doublets within the limits, from several starts.
+
+    Parameters
+    ----------
+    task : Task
+    starts : sequence of Gains
+        Where the descent begins; the best end counts.
+    """
+    ends = []
+    for start in starts:
+        sizes = typical_sizes(start)
+        scale = np.repeat([sizes[name] for name in FREE], 4)
+        first = np.concatenate([getattr(start, name).ravel() for name in FREE]) / scale
+
+        def at(values: Signal, start: Gains = start, scale: Signal = scale) -> Gains:
+            parts = np.split(values * scale, len(FREE))
+            matrices = {name: part.reshape(2, 2) for name, part in zip(FREE, parts, strict=True)}
+            return replace(start, certificate=None, provenance={"method": "optimum"}, **matrices)  # type: ignore[arg-type]
+
+        def examine(points: Signal, at: Callable[[Signal], Gains] = at) -> tuple[Signal, Signal]:
+            every = [task.examine(at(values)) for values in points]
+            return np.array([cost for cost, _ in every]), np.array([left for _, left in every])
+
+        found = at(descend(examine, first, STEP, AGAIN)[0])
+        cost, left = task.examine(found)
+        ends.append((min(left) < -TOLERATED, cost, found))
+    return min(ends, key=lambda end: end[:2])[2]
