@@ -166,15 +166,17 @@ def _rotor_speed(command, i, plant):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _wrench_polynomial(state, commands, plant):  # type: ignore[no-untyped-def]
-    """Wrench while commands are held, as coefficients of 1, e and e^2, e = exp(-t / motor_time_constant).
+def _spin(state, commands, plant, e_end):  # type: ignore[no-untyped-def]
+    """Let the rotors turn until e = exp(-t / motor_time_constant) is `e_end`, commands held.
 
-    Each rotor's speed is settled + gap e, its thrust proportional to the square.
+    Each rotor's speed is settled + gap e, its thrust proportional to the square. Returns the wrench meanwhile, as
+    coefficients of 1, e and e^2.
     """
     constant, linear, square = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
     for i in range(plant.rotors.shape[0]):
         settled = _rotor_speed(commands[i], i, plant)
         gap = state[ROTORS + i] - settled
+        state[ROTORS + i] = settled + gap * e_end
         c = plant.thrust_coefficient * settled * settled
         b = plant.thrust_coefficient * 2.0 * settled * gap
         a = plant.thrust_coefficient * gap * gap
@@ -199,8 +201,10 @@ def _wrench(polynomial, e):  # type: ignore[no-untyped-def]
 @compiled
 def advance(state, commands, plant, steps, step):  # type: ignore[no-untyped-def]
     """Integrate in place over `steps` Runge-Kutta steps with motor commands (thrust fractions 0..1) held."""
-    polynomial = _wrench_polynomial(state, commands, plant)
-    decay = np.exp(-0.5 * step / plant.motor_time_constant)
+    decay, e_end = np.exp(-0.5 * step / plant.motor_time_constant), 1.0
+    for _ in range(steps):
+        e_end *= decay * decay
+    polynomial = _spin(state, commands, plant, e_end)
     body, e, after = _take(state, plant), 1.0, _wrench(polynomial, 1.0)
     x, y, z = state[0], state[1], state[2]
     for _ in range(steps):
@@ -211,9 +215,6 @@ def advance(state, commands, plant, steps, step):  # type: ignore[no-untyped-def
         x, y, z = x + way[0], y + way[1], z + way[2]
     state[0], state[1], state[2] = x, y, z
     _put(body, state, plant)
-    for i in range(plant.rotors.shape[0]):
-        settled = _rotor_speed(commands[i], i, plant)
-        state[ROTORS + i] = settled + (state[ROTORS + i] - settled) * e
 
 
 @compiled
