@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from sitl.plant import GRAVITY
+
 IDLE = 0.2  # collective of rotors that turn on the ground, as a share of hover's
 SPOOL_SECONDS = 1.0  # from standing rotors to the collective of hover
 STILL_CLIMB, STILL_RATE = 0.1, 0.15  # m/s, rad/s: a vehicle that moves less stands
@@ -14,6 +16,8 @@ STILL_SECONDS = 0.5  # a vehicle that should sink and does not may stand on some
 PROOF_SECONDS = 0.7  # then thrust goes down for so long: one that flies would fall
 LOW_THRUST = 0.7  # of hover's: nothing flies on less
 LEASH = 3.0  # m, farthest that the altitude to hold may run ahead of the vehicle
+TRIM_RATE = 0.2  # 1/s: how fast thrust that is asked for lastingly becomes part of hover's
+MAX_TRIM = 0.3  # share of hover's collective
 
 
 @dataclass(slots=True)
@@ -54,6 +58,8 @@ class Lift:
         The vehicle stands on something.
     ground : float, m
         Altitude where it last stood.
+    trim : float
+        Learned in the air: how much more than `hover` it takes, as a share. A weak motor or a load asks for it.
     """
 
     def __init__(self, hover: float) -> None:
@@ -62,12 +68,13 @@ class Lift:
         self.ground = 0.0
         self.target = 0.0
         self.ceiling = 0.0
+        self.trim = 0.0
         self._still = 0.0
         self._descent = 0.0
 
     def rest(self, dt: float, estimate: Estimate) -> None:
         """One period without thrust: a vehicle that does not move stands."""
-        self.ceiling = 0.0
+        self.ceiling = self.trim = 0.0
         still = abs(estimate.climb) <= STILL_CLIMB and all(abs(rate) <= STILL_RATE for rate in estimate.rates)
         self._still = self._still + dt if still else 0.0
         self.landed = self._still >= STILL_SECONDS
@@ -94,6 +101,10 @@ class Lift:
         self.target = min(max(self.target, estimate.altitude - LEASH), estimate.altitude + LEASH)
         self._descent = self._descent + dt if speed < 0 else 0.0
         collective = self._feel(dt, estimate, sinks=self._descent >= DESCENT_SECONDS)
+        if not self.landed and self._still == 0.0:
+            # What `altitude_hold` adds is acceleration: over a manoeuvre from rest to rest it comes to nothing.
+            asked = ((self.target - estimate.altitude) - 2.0 * estimate.climb) / GRAVITY
+            self.trim = min(max(self.trim + dt * TRIM_RATE * asked, -MAX_TRIM), MAX_TRIM)
         return (self.target if self._still <= STILL_SECONDS else math.nan), collective
 
     def thrust(self, dt: float, estimate: Estimate, thrust: float) -> tuple[float, float]:
@@ -132,10 +143,10 @@ class Lift:
             if self._still > STILL_SECONDS:
                 self._aim(estimate)  # it fell: so it flies
             self._still = 0.0
-            return self.hover
+            return self.hover * (1 + self.trim)
         self._still += dt
         proof = (self._still - STILL_SECONDS) / PROOF_SECONDS
         if proof >= 1:
             self.landed = True
             self._stand(estimate)
-        return self.hover * (1 - (1 - IDLE) * min(max(proof, 0.0), 1.0))
+        return self.hover * (1 + self.trim) * (1 - (1 - IDLE) * min(max(proof, 0.0), 1.0))
