@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
@@ -16,9 +12,7 @@ from numpy.typing import NDArray
 from sitl.studies.attitude import Run, Study, numbers, optimum, run
 from tuning.gains import Gains
 from tuning.output import progress_console
-
-#: One thread each: the processes share the cores, and sums do not depend on how many there are.
-THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+from tuning.parallel import cores, processes, run_all
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,34 +50,16 @@ class Statistics:
         return {verdict: found.count(verdict) for verdict in sorted(set(found))}
 
 
-@contextmanager
-def processes(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of fresh processes that compute with one thread each."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-            try:
-                yield pool
-            except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)  # what is waiting would keep the message back
-                raise
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-
-
-def _shown(study: Study, best: dict[str, Gains]) -> tuple[Run, dict[str, Any]]:
-    found = run(study, 0, best)
+def run_once(task: tuple[Study, int, dict[str, Gains]]) -> tuple[Run, dict[str, Any]]:
+    """One run of a study with a seed, beside the best sets, and its `numbers`."""
+    found = run(*task)
     return found, numbers(found)
 
 
-def run_once(study: Study, seed: int, best: dict[str, Gains]) -> dict[str, Any]:
-    """`numbers` of one run."""
-    return numbers(run(study, seed, best))
+def _counted(task: tuple[Study, int, dict[str, Gains]]) -> tuple[Run | None, dict[str, Any]]:
+    """`run_once`; flights take long to hand over, and only those of seed 0 are shown."""
+    found, counted = run_once(task)
+    return (found if task[1] == 0 else None), counted
 
 
 def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None) -> list[Statistics]:
@@ -99,25 +75,26 @@ def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None)
     """
     from rich.progress import Progress
 
-    with (
-        processes(workers or os.cpu_count() or 1) as pool,
-        Progress(console=progress_console(), transient=True) as bar,
-    ):
-        task = bar.add_task("experiments", total=len(chosen) * (seeds + 1))
+    count = workers or cores()
+    best: dict[str, dict[str, Gains]] = {}
+    runs: dict[tuple[str, int], tuple[Run | None, dict[str, Any]]] = {}
+    with processes(count) as pool, Progress(console=progress_console(), transient=True) as bar:
+        shown = bar.add_task("experiments", total=len(chosen) * (seeds + 1))
 
-        def counted(futures: Sequence[Future[Any]]) -> list[Any]:
-            for future in as_completed(futures):
-                future.result()
-                bar.advance(task)
-            return [future.result() for future in futures]
+        def keep_best(study: Study, sets: dict[str, Gains]) -> None:
+            best[study.name] = sets
+            bar.advance(shown)
 
-        best = counted([pool.submit(optimum, study) for study in chosen])
-        first = [pool.submit(_shown, *pair) for pair in zip(chosen, best, strict=True)]
-        others = [
-            [pool.submit(run_once, study, seed, sets) for seed in range(1, seeds)]
-            for study, sets in zip(chosen, best, strict=True)
-        ]
-        return [
-            Statistics(study, shown, [zeroth, *counted(rest)])
-            for study, (shown, zeroth), rest in zip(chosen, counted(first), others, strict=True)
-        ]
+        def keep_run(task: tuple[Study, int, Any], found: tuple[Run | None, dict[str, Any]]) -> None:
+            runs[task[0].name, task[1]] = found
+            bar.advance(shown)
+
+        run_all(pool, 2 * count, optimum, chosen, keep_best)
+        tasks = [(study, seed, best[study.name]) for study in chosen for seed in range(seeds)]
+        run_all(pool, 2 * count, _counted, tasks, keep_run)
+    results = []
+    for study in chosen:
+        first = runs[study.name, 0][0]
+        assert first is not None
+        results.append(Statistics(study, first, [runs[study.name, seed][1] for seed in range(seeds)]))
+    return results

@@ -9,12 +9,13 @@ from sitl.airframe import load_airframe
 from sitl.scenario import AXES
 from sitl.studies.attitude import AUTOTUNE, BEST, BOUND, MIMO, REFINED, SISO, SISO_OWN, experiment, studies
 from sitl.studies.attitude_report import study_sections
-from sitl.studies.attitude_runs import processes, run_once, run_studies
+from sitl.studies.attitude_runs import run_once, run_studies
 from sitl.studies.autotune import autotune, identify_arx, minimum_variance_pid
 from sitl.studies.benchmarks import TABLES
 from sitl.studies.commands import Study as Choice
 from sitl.studies.expectations import EFFORT, expectations
 from sitl.studies.reproduce import ALL, STUDIES, reproduce
+from tuning.parallel import processes
 
 PRINTED = json.loads(TABLES.read_text())
 SEEDS = 2
@@ -87,7 +88,7 @@ def test_a_run_is_the_same_whatever_the_process_and_what_else_it_did(found):
     statistics = found["coupled"]
     best = {method: statistics.shown.gains[method] for method in (BEST, BOUND)}
     with processes(1) as pool:
-        again = pool.submit(run_once, statistics.study, 1, best).result()
+        _, again = pool.submit(run_once, (statistics.study, 1, best)).result()
     assert json.dumps(again) == json.dumps(statistics.runs[1])
 
 
