@@ -97,7 +97,9 @@ def experiment(
         str | None, typer.Option(help="Link to a vehicle that hovers under our controller; see upload.")
     ] = None,
     gains: GainsOption = None,
-    axis: Annotated[str, typer.Option(help="roll, pitch, or both, one after the other; with --connect.")] = "both",
+    axis: Annotated[
+        str | None, typer.Option(help="With --connect: roll, pitch, or both, one after the other (the default).")
+    ] = None,
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
     amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
     bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,
@@ -110,9 +112,14 @@ def experiment(
         int | None, typer.Option(min=0, help="Inject the same moment in every run; by default each has its own.")
     ] = None,
     mode: Annotated[
-        str, typer.Option(help="Flight mode to excite in: hold, position, altitude, offboard; with --connect.")
-    ] = "hold",
-    tilt_deg: Annotated[float, typer.Option(help="Stop beyond this roll or pitch, degrees; with --connect.")] = 28.0,
+        str | None,
+        typer.Option(
+            help="With --connect: flight mode to excite in: hold (the default), position, altitude, offboard."
+        ),
+    ] = None,
+    tilt_deg: Annotated[
+        float | None, typer.Option(help="With --connect: stop beyond this roll or pitch, degrees (28).")
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
     timeout: Annotated[float, typer.Option(min=0.5, max=600, help="Silence of the vehicle that ends all, s.")] = 12.0,
     signing_key: Annotated[Path | None, typer.Option(help="Key of the link; see upload.")] = None,
@@ -131,6 +138,8 @@ def experiment(
     if airframe is not None:
         if out is None:
             raise SitlError("--out: name the log to write, FILE.ulg")
+        if (axis, mode, tilt_deg) != (None,) * 3:
+            raise SitlError("--axis, --mode, --tilt-deg: belong to --connect; a simulated flight excites both axes")
         plan = (seconds_per_axis, amplitude, bandwidth, excitation_seed)
         _simulated_experiment(airframe, out, gains, plan, seed, runs)
         return
@@ -144,7 +153,9 @@ def experiment(
     from sitl.mavlink.session import Options
 
     options = Options(connect or "", system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json)
-    fly_experiment(options, Choice(axis, seconds_per_axis, amplitude, bandwidth, seed, mode, tilt_deg))
+    tilt = 28.0 if tilt_deg is None else tilt_deg
+    choice = Choice(axis or "both", seconds_per_axis, amplitude, bandwidth, seed, mode or "hold", tilt)
+    fly_experiment(options, choice)
 
 
 def _simulated_experiment(
