@@ -217,6 +217,17 @@ def test_the_longest_interval_can_be_told(bench):
     assert received(interval).interval_us == 2_000_000_000
 
 
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_every_message_can_be_sent_of_a_vehicle_of_which_nothing_is_a_number(bench, value):
+    bench.show()
+    situation = bench.telemetry.situation
+    for name in ("attitude", "quaternion", "rates", "collective", "commands", "moment"):
+        situation.row[name] = value
+    situation.vehicle.estimate = Estimate(value, value, value, (value,) * 3, 10.0, 0.0, 0.0, 0.0)
+    for number in TOPICS:
+        assert received(bench.telemetry.build(number)).get_msgId() == number
+
+
 def test_no_rate_is_faster_than_the_control_loop(bench):
     bench.show()
     assert bench.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 1) == ACCEPTED
