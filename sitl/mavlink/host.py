@@ -83,7 +83,7 @@ class Host:
         self.fixed = autopilot.arguments()[:5]
         self.heard = self._news = self._turn = 0.0
         self._connected = False
-        self._periods = self._first = 0
+        self._periods = self._examined = self._first = 0
         self._told: dict[str, float] = {}
 
     def reboot(self) -> None:
@@ -135,7 +135,7 @@ class Host:
         """A plant that may know nothing of what was before."""
         self.heard = now
         self.stamp = self._zero = -1
-        self._periods = 0
+        self._periods = self._examined = 0
         self.situation.home = self.situation.imu = self.situation.fix = ()
         self.vehicle.plant_back()
 
@@ -245,11 +245,12 @@ class Host:
         for parameter, value in zip(PARAMETERS, gains.tolist(), strict=True):
             if not parameter.minimum <= value <= parameter.maximum:
                 found["parameters"] = f"{parameter.name} is {value:g}, not within its range"
-        Ts, period = float(gains[-1]), (self.stamp - self._first) * 1e-6 / EXAMINED
-        if self._periods and abs(period - Ts) > 0.02 * Ts and not fault:
+        Ts, passed = float(gains[-1]), self._periods - self._examined
+        period = (self.stamp - self._first) * 1e-6 / max(passed, 1)
+        if passed >= EXAMINED and abs(period - Ts) > 0.02 * Ts and not fault:
             found["rate"] = f"the plant's period is {1e3 * period:.3g} ms, the gains are for {1e3 * Ts:.3g} ms"
         if not fault:
-            self._first = self.stamp
+            self._first, self._examined = self.stamp, self._periods
         for subject in ("controller", "parameters", "rate"):
             before = self.vehicle.obstacles.pop(subject, None)
             if subject in found:

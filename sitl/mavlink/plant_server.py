@@ -146,6 +146,8 @@ class Lockstep:
             if vehicle.copies:
                 self.connection.sendall(messages * vehicle.copies)
                 answer = self._answer(armed=bool(answer[18] & ARMED))
+            else:
+                self._receive(0.0)  # nobody answers what is lost, but the autopilot or the parent may go
 
     def _first_answer(self) -> tuple[Any, ...]:
         """Offer the start until it is answered."""
@@ -220,7 +222,7 @@ class Lockstep:
         while True:
             now = time.monotonic()
             self.server.look_around(now)
-            data = receive(self.connection, self.spin)
+            data = receive(self.connection, self.spin if now < until else 0.0)
             if data is None:
                 if now >= until:
                     return []

@@ -117,8 +117,8 @@ class TcpStation(Station):
                 self.close()
                 yield None
                 continue
-            for message in self.codec.parse(data):
-                yield [(message, self)] if _is_ours(message) else []
+            for message in self.codec.search(data):
+                yield [(message, self)] if message is not None and _is_ours(message) else []
             yield []
 
 

@@ -95,7 +95,15 @@ def _local_position(s: Situation) -> Any:
 def _global_position(s: Situation) -> Any:
     above = s.state.alt - s.home[2]
     return mavlink.MAVLink_global_position_int_message(
-        s.milliseconds, s.state.lat, s.state.lon, s.state.alt, above, s.state.vx, s.state.vy, s.state.vz, _heading(s)
+        s.milliseconds,
+        s.state.lat,
+        s.state.lon,
+        s.state.alt,
+        above,
+        s.state.vx,
+        s.state.vy,
+        s.state.vz,
+        _heading(s, UNKNOWN_16),
     )
 
 
@@ -110,7 +118,7 @@ def _vfr_hud(s: Situation) -> Any:
     e = s.vehicle.estimate
     speed = math.hypot(e.north, e.east)
     return mavlink.MAVLink_vfr_hud_message(
-        speed, speed, _heading(s) // 100, round(100 * float(s.row["collective"])), e.altitude, e.climb
+        speed, speed, _heading(s, 0) // 100, _int16(100 * float(s.row["collective"])), e.altitude, e.climb
     )
 
 
@@ -134,7 +142,7 @@ def _scaled_imu(s: Situation) -> Any:
 
 
 def _servo_output(s: Situation) -> Any:
-    pulses = [round(1000 + 1000 * value) for value in _floats(s.row["commands"])]
+    pulses = [_int16(1000 + 1000 * value) for value in _floats(s.row["commands"])]
     return mavlink.MAVLink_servo_output_raw_message(max(s.stamp, 0) % 2**32, 0, *pulses[:8])
 
 
@@ -215,8 +223,10 @@ def _floats(values: Any) -> list[float]:
     return [float(value) for value in values]
 
 
-def _heading(s: Situation) -> int:
-    return round(math.degrees(s.vehicle.estimate.yaw) * 100) % 36000
+def _heading(s: Situation, unknown: int) -> int:
+    """0.01 deg; a plant may tell an attitude that is none."""
+    yaw = s.vehicle.estimate.yaw
+    return round(math.degrees(yaw) * 100) % 36000 if math.isfinite(yaw) else unknown
 
 
 def _int16(value: float) -> int:

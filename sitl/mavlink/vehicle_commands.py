@@ -16,6 +16,7 @@ from sitl.modes import Denied, Failed, Mode, Refused, Severity, Vehicle
 
 FORCE = 21196  # param2 of arm and disarm: override
 TAKEOFF_HEIGHT = 2.5  # m, when none is given
+MAX_INTERVAL_US = 2_000_000_000  # MESSAGE_INTERVAL can tell little more
 
 
 class Unsupported(Refused):
@@ -176,10 +177,12 @@ class VehicleCommands:
             self.telemetry.set_rate(number, TOPICS[number].rate)
         elif interval == -1:
             self.telemetry.set_rate(number, 0.0)
-        elif interval > 0 and math.isfinite(interval):
+        elif 0 < interval <= MAX_INTERVAL_US:
             self.telemetry.set_rate(number, 1e6 / interval)
         else:
-            raise Denied(f"message interval {interval:g} us: expected -1 (never), 0 (default) or above")
+            raise Denied(
+                f"message interval {interval:g} us: expected -1 (never), 0 (default) or up to {MAX_INTERVAL_US}"
+            )
         return []
 
     def _get_interval(self, command: Command) -> list[Any]:

@@ -52,12 +52,12 @@ class InTheAir:
         self.excitation = Excitation(self.injector, situation)
         self.server = ParameterServer(self.autopilot.controller, gains, self.injector)
         telemetry = Telemetry(situation)
-        commands = VehicleCommands(self.vehicle, telemetry, self.reboot)
+        self.commands = VehicleCommands(self.vehicle, telemetry, self.reboot)
         self.signer = Signer(key) if key else None
         self.attacker = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.attacker.bind(("127.0.0.1", 0))
         self.stations = Stations(self.attacker.getsockname()[1], 0, 0, signer=self.signer)
-        self.ground = Ground(self.server, commands, telemetry, self.stations)
+        self.ground = Ground(self.server, self.commands, telemetry, self.stations)
         self.udp, self.tcp_address = self.stations.udp.getsockname(), self.stations.tcp.getsockname()
         self.tcp = socket.create_connection(self.tcp_address)
         self.friend = Codec(255, 190, Signer(key) if key else None)
@@ -134,9 +134,10 @@ def frame(number, payload, seq, signer=None):
 class Attacks:
     """Seeded datagrams of every sort, by name; none is a change that a vehicle in the air should obey."""
 
-    def __init__(self, seed, known, names, signer=None, replay=b""):
-        self.random, self.signer = random.Random(seed), signer
-        self.known, self.names = sorted(known), [name.encode() for name in names]
+    def __init__(self, seed, target, replay=b""):
+        self.random, self.signer = random.Random(seed), target.friend.signer
+        self.known, self.names = sorted(target.stations.wanted), [name.encode() for name in target.server.index]
+        self.commands = sorted(target.commands.handlers)
         self.all = sorted(KINDS)
         self.sorts = {
             "random bytes": self.noise,
@@ -151,7 +152,7 @@ class Attacks:
             "other messages": lambda: self.sound(self.random.choice(self.all)),
             "bad parameters": self.bad_parameter,
         }
-        if signer:
+        if self.signer:
             change = mavlink.MAVLink_param_set_message(1, 1, b"MIMO_RP_RR", 0.123, 9)
             self.sorts |= {
                 "unsigned change": lambda: Codec(255, 190).pack(change),
@@ -189,6 +190,8 @@ class Attacks:
         }
         for name in {"target_system", "target_component", "target"} & fields.keys():
             fields[name] = [self.random.choice([0, 1]) if target else self.random.randrange(2, 256)]
+        if kind.msgname in ("COMMAND_LONG", "COMMAND_INT") and self.random.random() < 0.5:
+            fields["command"] = [self.random.choice(self.commands)]
         if fields.get("command", [0])[0] in OBEYED:
             fields["command"] = [0]
         if kind.msgname == "PARAM_SET" and fields["param_type"] == [9]:
@@ -239,7 +242,7 @@ def attack(target, count, seed):
         if abs(target.server.values["MIMO_RP_RR"] - 0.12) > 1e-6:
             raise AssertionError("a signed change was not taken")
         target.server.write("MIMO_RP_RR", 0.14, 9)
-    attacks = Attacks(seed, target.stations.wanted, target.server.index, target.friend.signer, replay)
+    attacks = Attacks(seed, target, replay)
     sent, before = Counter(), target.state()
     question = mavlink.MAVLink_param_request_read_message(1, 1, b"MIMO_RP_RR", -1)
     for number in range(count):

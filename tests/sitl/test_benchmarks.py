@@ -73,7 +73,7 @@ def test_runs_side_by_side_are_the_runs_one_by_one():
 
 @pytest.mark.parametrize("design", ["in turn", "together"])
 def test_one_lv100_experiment_gives_a_controller_close_to_the_best_there_is(design):
-    # The bar: median of 20 seeds at most 0.054 from one experiment of 5000 samples, amplitude 1.
+    # The bar: median of 20 seeds at most 0.054 from one experiment of 5000 samples, amplitude 1.
     task = lv100()
     plain, refined = [], []
     for seed in range(20):

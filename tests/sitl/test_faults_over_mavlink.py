@@ -1,5 +1,6 @@
 """Faults of the plant process and of its link: the flight in process again."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -93,6 +94,16 @@ class Frames:
 
     def answer(self, stamp, commands, armed):
         pass
+
+
+def test_a_fault_at_the_moment_of_an_examination_is_not_taken_for_a_plant_of_another_rate(vehicle, library):
+    host = Host(pilot(vehicle, library), Frames())
+    for k in range(1001):
+        rate = math.nan if 450 <= k <= 520 else 0.0
+        host._period(PlantState(7_000_000 + 4000 * k, 1, 0, 0, 0, rate, *[0.0] * 4, 10_000, *[0] * 8))
+    texts = [text for _, text in host.vehicle.said]
+    assert any("the controller refuses its inputs" in text for text in texts)
+    assert not any("period" in text for text in texts)
 
 
 def test_the_host_corrupts_its_gains_and_hears_no_set_points_in_the_time_of_the_fault(vehicle, library):

@@ -3,7 +3,7 @@
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.mavlink import stations
+from sitl.mavlink import link, stations
 from tests.sitl.hostile import KEY, InTheAir, attack, drain
 
 SEED = 7
@@ -59,6 +59,21 @@ def test_one_turn_reads_no_more_than_its_time_allows(target, monkeypatch):
     for _ in range(30):
         heard += len(list(target.stations.receive()))
     assert heard == 100
+
+
+@pytest.mark.parametrize("piece", [b"\xfe", b"\xfe\xfe\0\0\0\x6e", b"\xfd\xff\0\0\0\0\0\x6e\0\0"])
+def test_a_stream_of_false_starts_takes_no_more_time_than_is_allowed(target, monkeypatch, piece):
+    clock, looked_at, is_sound = iter(range(10**9)), [], link._is_sound
+    monkeypatch.setattr(stations.time, "perf_counter", lambda: next(clock) * stations.BUDGET_S / 10)
+    monkeypatch.setattr(link, "_is_sound", lambda frame: looked_at.append(len(frame)) or is_sound(frame))
+    target.tcp.sendall((piece * 2000)[:2000])
+    deepest = turns = 0
+    while sum(looked_at) < 20_000:
+        before = len(looked_at)
+        assert list(target.stations.receive()) == []
+        deepest, turns = max(deepest, len(looked_at) - before), turns + 1
+    assert deepest <= 11
+    assert turns >= 5
 
 
 def test_a_station_that_never_reads_is_not_waited_for(target):

@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.airframe import load_airframe
 from sitl.errors import SitlError
+from sitl.faults import parse_fault
 from sitl.mavlink.hitl import SerialPlant
 from sitl.mavlink.lean import ACTUATORS, GPS, SENSOR, STATE, LeanCodec
 from sitl.mavlink.link import LOOPBACK, listen
@@ -32,9 +33,9 @@ AIRFRAME = load_airframe("adam0").airframe
 class Bench:
     """A plant served in this process, on a thread; what it tells is in `told`."""
 
-    def __init__(self, speed=None, altitude=0.0):
+    def __init__(self, speed=None, altitude=0.0, *faults):
         self.told = []
-        self.vehicle = SimulatedVehicle(AIRFRAME, TS, 3, altitude, self.told.append)
+        self.vehicle = SimulatedVehicle(AIRFRAME, TS, 3, altitude, self.told.append, tuple(map(parse_fault, faults)))
         self.listener = listen(LOOPBACK, 0)
         self.port = self.listener.getsockname()[1]
         server = PlantServer(self.vehicle, self.listener, speed, child=False)
@@ -184,6 +185,17 @@ def test_a_killed_autopilot_is_noticed_within_a_second_and_the_next_starts_anew(
     assert (state[0], state[10]) == (1_000_000, 0)
     pilot.answer(state[0])
     assert pilot.frame()[0] == 1_004_000
+    pilot.close()
+
+
+def test_an_autopilot_that_leaves_while_the_link_is_cut_is_noticed_and_the_next_is_served():
+    bench = Bench(None, 0.0, "link@0.4")
+    pilot = Pilot(bench.port)
+    pilot.fly(100, 0.6)
+    pilot.close()
+    bench.until_told("the autopilot went away at", 5)
+    pilot = Pilot(bench.port)
+    assert pilot.frame()[0] == 1_000_000
     pilot.close()
 
 
@@ -351,6 +363,7 @@ def test_a_board_on_a_serial_port_flies_in_real_time_and_its_silence_and_loss_ar
     plant = SerialPlant(vehicle, f"{device},921600")
     threading.Thread(target=plant.serve, daemon=True).start()
     until(lambda: len(board.sensors) > 10, 5)
+    told.clear()  # what was late before does not count
     begin, first = time.monotonic(), board.sensors[-1][0]
     time.sleep(1.0)
     elapsed, passed = time.monotonic() - begin, (board.sensors[-1][0] - first) / 1e6

@@ -207,8 +207,25 @@ def test_messages_come_at_their_rates_and_at_those_asked_for(bench):
     assert bench.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 0) == ACCEPTED
     assert bench.telemetry.rates[30] == 20.0
     assert bench.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 9999, 1000) == UNSUPPORTED
-    for wrong in ((30, math.nan), (30, -7)):
+    for wrong in ((30, math.nan), (30, -7), (30, math.inf), (30, 3e38)):
         assert bench.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, *wrong) == DENIED
+
+
+def test_the_longest_interval_can_be_told(bench):
+    assert bench.result(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, 2e9) == ACCEPTED
+    _, interval = bench.long(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, 30)
+    assert received(interval).interval_us == 2_000_000_000
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_every_message_can_be_sent_of_a_vehicle_of_which_nothing_is_a_number(bench, value):
+    bench.show()
+    situation = bench.telemetry.situation
+    for name in ("attitude", "quaternion", "rates", "collective", "commands", "moment"):
+        situation.row[name] = value
+    situation.vehicle.estimate = Estimate(value, value, value, (value,) * 3, 10.0, 0.0, 0.0, 0.0)
+    for number in TOPICS:
+        assert received(bench.telemetry.build(number)).get_msgId() == number
 
 
 def test_no_rate_is_faster_than_the_control_loop(bench):
@@ -430,6 +447,15 @@ def test_no_command_whatever_its_numbers_breaks_anything(number, params):
 def test_known_commands_with_any_numbers_are_answered(number, params):
     bench = Bench()
     assert bench.result(number, *params) in (ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.floats(width=32))
+def test_every_interval_that_is_accepted_can_be_told_and_sent(interval):
+    bench = Bench()
+    bench.long(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, 30, interval)
+    assert received(bench.long(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, 30)[1]).message_id == 30
+    bench.telemetry.messages(100.0)
 
 
 def test_handlers_can_be_added(bench):
