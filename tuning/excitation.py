@@ -71,10 +71,10 @@ def prbs(
     if samples < 0:
         raise TuningError(f"prbs: got {samples} samples, expected 0 or more")
     signal = np.empty(samples)
+    stream = pulses(hold_min, hold_max, generator)
     start = 0
-    for sign, hold in pulses(hold_min, hold_max, generator):
-        if start >= samples:
-            break
+    while start < samples:  # not one pulse more is drawn than is needed: others draw from the generator next
+        sign, hold = next(stream)
         signal[start : start + hold] = sign * amplitude
         start += hold
     return signal

@@ -25,6 +25,15 @@ def test_equal_seeds_give_equal_signals_and_others_do_not():
     assert (one != other).any()
 
 
+def test_a_prbs_draws_one_sign_and_the_pulses_that_it_needs_and_nothing_more():
+    generator, again = np.random.default_rng(5), np.random.default_rng(5)
+    signal = prbs(500, 1.0, 16, 64, generator)
+    again.integers(2)
+    for _ in range(np.count_nonzero(np.diff(signal)) + 1):
+        again.integers(16, 64, endpoint=True)
+    assert generator.random() == again.random()
+
+
 @pytest.mark.parametrize("bandwidth", [0.0, -1.0, 1e6, float("nan")])
 def test_a_bandwidth_beyond_nyquist_or_not_positive_is_refused(bandwidth):
     with pytest.raises(TuningError, match="bandwidth"):
