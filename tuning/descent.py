@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 ITERATIONS = 60
 #: A descent ends where one step gains less than this share of the cost that it began with.
-TOLERANCE = 1e-4
+TOLERANCE = 1e-6
 #: It begins again from its end, its picture of the curvature forgotten, while that gains this share.
 WORTH = 0.02
 
