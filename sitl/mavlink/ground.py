@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -9,7 +10,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.mavlink.parameter_server import ParameterServer
 from sitl.mavlink.protocols import PROTOCOLS
-from sitl.mavlink.stations import Stations
+from sitl.mavlink.stations import BUDGET_S, Stations
 from sitl.mavlink.steering import Steering
 from sitl.mavlink.telemetry import Telemetry, texts
 from sitl.mavlink.vehicle_commands import Command, VehicleCommands
@@ -83,8 +84,11 @@ class Ground:
         complaint = self.parameters.complaint()
         if complaint:
             self.vehicle.say(Severity.CRITICAL, complaint)
+        end = time.perf_counter() + BUDGET_S
         for message in self.telemetry.messages(now):
             self.stations.send(message)
+            if time.perf_counter() > end:
+                break
         self.stations.deliver()
 
     def _heartbeat(self, message: Any) -> list[Any]:

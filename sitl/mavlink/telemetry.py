@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -55,18 +56,17 @@ class Telemetry:
             return None
         return topic.build(self.situation)
 
-    def messages(self, now: float) -> list[Any]:
-        """What is due at a monotonic time, s."""
+    def messages(self, now: float) -> Iterator[Any]:
+        """What is due at a monotonic time (s), what waits longest first; what is not taken stays due."""
         if now < self.next:
-            return []
-        made = []
-        for number, due in self.due.items():
-            if now >= due:
-                period = 1 / self.rates[number]
-                self.due[number] = due + period if now < due + period else now + period
-                made.append(self.build(number))
+            return
+        for number in sorted((number for number, due in self.due.items() if now >= due), key=self.due.__getitem__):
+            due, period = self.due[number], 1 / self.rates[number]
+            self.due[number] = due + period if now < due + period else now + period
+            message = self.build(number)
+            if message is not None:
+                yield message
         self.next = min(self.due.values(), default=math.inf)
-        return [message for message in made if message is not None]
 
 
 def texts(severity: Severity, text: str, number: int) -> list[Any]:
