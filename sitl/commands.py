@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 
 AirframeArgument = Annotated[
-    str, typer.Argument(help="Airframe: adam0, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file.")
+    str,
+    typer.Argument(help="Airframe: adam0, adam0_boom, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file."),
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
 FaultOption = Annotated[
@@ -348,6 +349,8 @@ def sitl(
     if scenario is not None:
         task = scenario_of(scenario, axis, amplitude_deg, period_s, None, fault, controller.Ts)
         faults = task.faults
+    elif (axis, amplitude_deg, period_s) != (None,) * 3:
+        raise SitlError("--axis, --amplitude-deg, --period-s: they belong to a --scenario; give one")
     if plant and (port, speed, seed) != (0, "1", 0):
         raise SitlError("--port, --speed and --seed belong to the plant: with --plant, say them where it was started")
     address = _address(plant) if plant else None

@@ -48,6 +48,9 @@ def write_atomically(path: Path, content: str | bytes) -> bool:
         os.umask(mask)
         Path(temporary).chmod(0o666 & ~mask)
         Path(temporary).replace(path)
+    except OSError as error:  # a full disk, say, which names no file
+        Path(temporary).unlink(missing_ok=True)
+        raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise

@@ -23,7 +23,7 @@ def register(app: typer.Typer) -> None:
     """Add the campaigns' commands to the front door."""
     app.command(
         epilog="Example: mimopilot campaign adam0 --gains siso.gains.toml mimo.gains.toml --runs 10000 "
-        "--vary spec.toml --out campaign"
+        "--vary vary.toml --out campaign"
     )(campaign)
     app.command(epilog="Example: mimopilot replay campaign --run 4711 --out worst.ulg")(replay)
 

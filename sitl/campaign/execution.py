@@ -50,8 +50,10 @@ def run_campaign(plan: Plan, folder: Path, workers: int, scheduler: str | None =
     SitlError
         When the folder holds another campaign, when it was interrupted, or when workers are lost.
     """
-    settle(plan, folder)
     results, parts = folder / RESULTS, folder / PARTS
+    if not results.is_file():  # compiles before workers are forked, and finds what is wrong before the folder is taken
+        list(stand_of(tuple(plan.files.items())).flights(0))
+    settle(plan, folder)
     if not results.is_file():
         parts.mkdir(exist_ok=True)
         missing = [chunk for chunk in range(chunks(plan)) if not _part(parts, chunk).is_file()]
@@ -67,7 +69,6 @@ def _part(parts: Path, chunk: int) -> Path:
 
 
 def _fly(plan: Plan, parts: Path, missing: list[int], workers: int, scheduler: str | None) -> None:
-    list(stand_of(tuple(plan.files.items())).flights(0))  # compiles, and finds what is wrong, before workers are forked
     flights = len(plan.gains) * len(plan.scenarios)
     flown = chunks(plan) - len(missing)
     with _executor(workers, scheduler) as (executor, ahead), _progress(plan, flown) as advance:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from codegen.render import generator_version
@@ -185,3 +188,12 @@ def _difference(there: dict[str, str], here: dict[str, str]) -> str:
             return f"{name}: {old.get(name)!r} there, {new.get(name)!r} here"
     names = [name for name in [*here, *there] if here.get(name) != there.get(name)]
     return f"{names[0]} differs"
+
+
+@contextmanager
+def reading(results: Path) -> Iterator[None]:
+    """A table of results that is damaged is told in one line."""
+    try:
+        yield
+    except pa.ArrowInvalid as error:
+        raise SitlError(f"{results}: damaged; remove it and give the campaign's command again") from error

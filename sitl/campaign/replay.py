@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sitl.campaign.flights import Stand
-from sitl.campaign.plan import RESULTS, SPEC, Plan, plan_from_files, read_files
+from sitl.campaign.plan import RESULTS, SPEC, Plan, plan_from_files, read_files, reading
 from sitl.errors import SitlError
 from sitl.loop import Flight
 
@@ -79,7 +79,8 @@ def _flown(results: Path, run: int, gains: str, axis: str) -> dict[str, Any] | N
     if not results.is_file():
         return None
     chosen = (pc.field("run") == run) & (pc.field("gains") == gains) & (pc.field("axis") == axis)
-    (row,) = pq.read_table(results, filters=chosen).to_pylist()
+    with reading(results):
+        (row,) = pq.read_table(results, filters=chosen).to_pylist()
     return dict(row)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from sitl.campaign.plan import Plan
+from sitl.campaign.plan import Plan, reading
 from sitl.commands import UNITS
 from sitl.intervals import quantile, wilson
 
@@ -99,7 +99,7 @@ class Results:
         stride = len(self.plan.gains) * len(axes)
         offset = list(self.plan.gains).index(gains) * len(axes) + axes.index(axis)
         parts, start = [], 0
-        with pq.ParquetFile(self.path) as table:
+        with reading(self.path), pq.ParquetFile(self.path) as table:
             for batch in table.iter_batches(BATCH, columns=[name]):
                 values = batch.column(0).to_numpy(zero_copy_only=False)
                 parts.append(values[(offset - start) % stride :: stride].copy())

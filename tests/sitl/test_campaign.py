@@ -406,3 +406,13 @@ def test_the_specification_in_the_readme_can_be_drawn_from(vehicle):
     (example,) = (block for block in re.findall(r"```toml\n(.*?)```", readme, re.DOTALL) if "[[fault]]" in block)
     names = drawn(vehicle, example, 1)[0].values
     assert {"mass", "delay", "inertia.xx", "motors.effectiveness.4", "fault.1.motor", "amplitude_deg"} <= set(names)
+
+
+def test_a_mistake_found_by_the_first_draw_takes_no_folder(tmp_path):
+    vary = tmp_path / "vary.toml"
+    vary.write_text("mass = { uniform = [-2, -1] }\n")
+    arguments = ["campaign", "adam0", "--vary", str(vary), "--runs", "3", "--out", str(tmp_path / "out")]
+    result = subprocess.run([sys.executable, "-m", "mimopilot", *arguments], capture_output=True, text=True)
+    assert result.returncode == 2
+    assert "1000 draws in a row" in result.stderr
+    assert not (tmp_path / "out").exists()
