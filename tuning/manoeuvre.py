@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
-from tuning.closed_loop import ACCURATE, MIN_FREQUENCIES, PlantResponse, cascade_loop
+from tuning.closed_loop import ACCURATE, MIN_FREQUENCIES, PlantResponse, cascade_loop, longest_run
 from tuning.descent import descend
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
@@ -162,7 +162,7 @@ def refine_cascade(
     known = response.at(response.coherent() & (response.relative_error() < ACCURATE))
     if len(known.omega) < MIN_FREQUENCIES:
         raise TuningError(f"only {len(known.omega)} frequencies of the measured response are known to 10 %")
-    coherent = response.at(response.coherent())
+    coherent = response.at(longest_run(np.flatnonzero(response.coherent())))
     allowed = np.array(limit if limit is not None else effort(gains, model))
     wanted = np.zeros((2, 1, len(model.setpoint), 2))
     for axis, reference in enumerate(outer):
@@ -192,10 +192,21 @@ def refine_cascade(
     def examine(points: Signal) -> tuple[Signal, Signal]:
         candidates = [placed(values) for values in points]
         angles, moments = model.fly(candidates)
-        cost = np.sum(((angles - wanted) * weight) ** 2, axis=(0, 2, 3))
-        return cost, np.hstack([1 - _effort(moments).T / allowed, [left(candidate) for candidate in candidates]])
+        residuals = np.moveaxis((angles - wanted) * weight, 1, 0).reshape(len(points), -1)
+        return residuals, np.hstack([1 - _effort(moments).T / allowed, [left(candidate) for candidate in candidates]])
 
-    return placed(descend(examine, start[where] / scale, STEP)[0])
+    diagonal = np.tile(np.eye(2, dtype=bool).ravel(), len(terms))[where]
+    # Each axis for itself, then the coupling: from VRFT's coupled gains the way often ends in a worse valley.
+    point = np.where(diagonal, start[where] / scale, 0.0)
+    point[diagonal], _ = descend(lambda points: examine(_spread(points, diagonal)), point[diagonal], STEP)
+    return placed(descend(examine, point, STEP)[0] if full else point)
+
+
+def _spread(points: Signal, where: NDArray[np.bool_]) -> Signal:
+    """Points of fewer dimensions among zeros."""
+    every = np.zeros((len(points), len(where)))
+    every[:, where] = points
+    return every
 
 
 def typical_sizes(gains: Gains) -> dict[str, float]:

@@ -21,7 +21,7 @@ from sitl.studies.benchmarks import TABLES
 from sitl.studies.optimum import Task, best_gains, moment_rms
 from tuning.cascade import measured_plant, tune
 from tuning.certificate import certify
-from tuning.closed_loop import PlantResponse
+from tuning.closed_loop import PlantResponse, longest_run
 from tuning.experiment import Experiment
 from tuning.gains import Gains
 from tuning.manoeuvre import doublet_model, effort, integral_rate
@@ -263,7 +263,7 @@ def optimum(study: Study) -> dict[str, Gains]:
         _bench(study.airframe)[2],
         doublets,
         study.models(BEST, Ts)[1],
-        plant.at(plant.coherent()),
+        plant.at(longest_run(np.flatnonzero(plant.coherent()))),
         [EFFORT * value for value in spent],
         integral_rate(found[DEFAULT].Ki_i, found[DEFAULT].Kp_i),
     )

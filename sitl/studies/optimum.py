@@ -71,22 +71,27 @@ class Task:
             for task in self.doublets
         ]
 
-    def examine(self, gains: Gains) -> tuple[float, list[float]]:
-        """Mean square distance of both angles to the model, weighed as the method does, and what the limits leave."""
+    def examine(self, gains: Gains) -> tuple[Signal, list[float]]:
+        """Distance of both angles to the model in each sample, weighed as the method does so that the sum of squares
+        is a mean square (rad^2), and what the limits leave.
+        """
+        spans = [stop - start for start, stop in (task.window for task in self.doublets)]
         try:
             flights = self.fly(gains)
         except CodegenError:  # a gain outside of the range of its parameter
-            return LOST, [-1.0] * LIMITS
-        cost = 0.0
-        for axis, flight in enumerate(flights):
-            error = flight.truth["attitude"][:, :2].copy()
-            error[:, axis] -= self.outer.response(flight.scenario.setpoint[:, axis])
+            samples = 2 * sum(spans)
+            return np.full(samples, np.sqrt(LOST / samples)), [-1.0] * LIMITS
+        errors = []
+        for axis, (flight, span) in enumerate(zip(flights, spans, strict=True)):
+            error = flight.truth["attitude"][:, :2] / np.sqrt(span)
+            error[:, axis] -= self.outer.response(flight.scenario.setpoint[:, axis]) / np.sqrt(span)
             error[:, 1 - axis] *= OTHER_AXIS
-            cost += float(np.mean(np.sum(error[slice(*flight.scenario.window)] ** 2, axis=1)))
+            errors.append(error[slice(*flight.scenario.window)].ravel())
+        residuals = np.concatenate(errors)
         if self.effort is None:
-            return cost, [1.0] * LIMITS
+            return residuals, [1.0] * LIMITS
         loop = np.linalg.svd(np.eye(2) + cascade_loop(gains, self.plant).L_u, compute_uv=False)
-        return cost, [
+        return residuals, [
             *(1 - moment_rms(flight) / allowed for flight, allowed in zip(flights, self.effort, strict=True)),
             1 - float((1 / loop).max()) / Thresholds.Ms,
             1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
@@ -122,9 +127,9 @@ def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
 
         def examine(points: Signal, at: Callable[[Signal], Gains] = at) -> tuple[Signal, Signal]:
             every = [task.examine(at(values)) for values in points]
-            return np.array([cost for cost, _ in every]), np.array([left for _, left in every])
+            return np.array([residuals for residuals, _ in every]), np.array([left for _, left in every])
 
         found = at(descend(examine, first, STEP, AGAIN)[0])
-        cost, left = task.examine(found)
-        ends.append((min(left) < -TOLERATED, cost, found))
+        residuals, left = task.examine(found)
+        ends.append((min(left) < -TOLERATED, float(residuals @ residuals), found))
     return min(ends, key=lambda end: end[:2])[2]

@@ -92,7 +92,7 @@ class Pilot:
     def __init__(self, address):
         self.link = mavutil.mavlink_connection(address, dialect="common", source_system=255)
         self.texts = []
-        self.said = self.beat = None
+        self.said = self.beat = self.last = None
         self.beats = 0
         self.wait(lambda: self.beat is not None)
 
@@ -101,7 +101,7 @@ class Pilot:
 
     def take(self, timeout=0.05):
         """One message, if there is one."""
-        message = self.link.recv_match(blocking=True, timeout=timeout)
+        message = self.last = self.link.recv_match(blocking=True, timeout=timeout)
         if message is not None and message.get_type() == "STATUSTEXT":
             if message.chunk_seq and self.texts:  # the rest of a long one
                 self.texts[-1] += message.text
@@ -134,6 +134,8 @@ class Pilot:
 
     def command(self, number, *params):
         """COMMAND_LONG; the result in its acknowledgement."""
+        while self.take(0) is not None:  # a buffer that is full has no room for an answer
+            pass
         self.link.mav.command_long_send(1, 1, number, 0, *params, *[0] * (7 - len(params)))
         while True:
             ack = self.asks("COMMAND_ACK")
@@ -144,9 +146,9 @@ class Pilot:
         """Wait until the vehicle can be armed."""
         self.wait(
             lambda: (
-                (m := self.take()) is not None
-                and m.get_type() == "SYS_STATUS"
-                and m.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK
+                self.last is not None
+                and self.last.get_type() == "SYS_STATUS"
+                and self.last.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK
             )
         )
 
