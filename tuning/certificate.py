@@ -22,7 +22,9 @@ from tuning.closed_loop import (
     cascade_loop,
     inner_controllers,
     longest_run,
+    singular_values,
 )
+from tuning.gain_stack import GainStack
 from tuning.gains import Gains
 from tuning.reference import ReferenceModel
 
@@ -223,8 +225,8 @@ def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
     return ""
 
 
-def loop_above(gains: Gains, plant: PlantResponse) -> Signal:
-    """What the rate loop's gain may still reach above each frequency of the plant, (K,).
+def loop_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
+    """What the rate loop's gain may still reach above each frequency of the plant, (K,); of a stack (sets, K).
 
     The supremum over w > w_k of sigma_max(G(w_k)) (w_k / w) sigma_max(C_e + C_d)(w). A rate is the integral of the
     moment over the inertia, behind motors and filters, so |G| falls at least like 1/w; that it does not grow would be
@@ -232,9 +234,9 @@ def loop_above(gains: Gains, plant: PlantResponse) -> Signal:
     """
     grid = np.concatenate([plant.omega, np.linspace(plant.omega[-1], np.pi / gains.Ts, 200)[1:]])
     C_e, C_d = inner_controllers(gains, grid)
-    falling = np.linalg.norm(C_e + C_d, ord=2, axis=(1, 2)) / grid
-    highest = np.maximum.accumulate(falling[::-1])[::-1][: len(plant.omega)]
-    reached: Signal = np.linalg.norm(plant.G_i, ord=2, axis=(1, 2)) * plant.omega * highest
+    falling = singular_values(C_e + C_d)[0] / grid
+    highest = np.maximum.accumulate(falling[..., ::-1], axis=-1)[..., ::-1][..., : len(plant.omega)]
+    reached: Signal = singular_values(plant.G_i)[0] * plant.omega * highest
     return reached
 
 

@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.frequency import local_response
+from tuning.gain_stack import GainStack
 from tuning.gains import Gains
 from tuning.reference import ReferenceModel
 
@@ -146,6 +147,16 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float) -> 
     )
 
 
+def singular_values(matrices: Complex) -> tuple[Signal, Signal]:
+    """Largest and smallest singular value of 2x2 matrices (..., 2, 2), each (...), in closed form: half of a tuning's
+    time would be spent in LAPACK's.
+    """
+    size = np.sum(np.abs(matrices) ** 2, axis=(-2, -1))
+    determinant = np.abs(matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0])
+    largest = np.sqrt((size + np.sqrt(np.maximum(size**2 - 4 * determinant**2, 0.0))) / 2)
+    return largest, determinant / np.where(largest > 0, largest, 1.0)
+
+
 def longest_run(indices: NDArray[np.intp]) -> NDArray[np.intp]:
     """Longest stretch of neighbours, single holes forgiven."""
     if not len(indices):
@@ -180,8 +191,8 @@ class CascadeLoop:
     U_o: Complex
 
 
-def inner_controllers(gains: Gains, omega: Signal) -> tuple[Complex, Complex]:
-    """C_e and C_d at frequencies omega (rad/s), (K, 2, 2) each."""
+def inner_controllers(gains: Gains | GainStack, omega: Signal) -> tuple[Complex, Complex]:
+    """C_e and C_d at frequencies omega (rad/s), (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
     z = np.exp(1j * omega * gains.Ts)[:, None, None]
     a = gains.derivative_pole
     C_e = gains.Kp_i + gains.Ts * gains.Ki_i * z / (z - 1)
@@ -189,12 +200,19 @@ def inner_controllers(gains: Gains, omega: Signal) -> tuple[Complex, Complex]:
     return C_e, C_d
 
 
-def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
-    """The transfers of `CascadeLoop` for a gain set on a measured plant."""
+def whole_loop(gains: Gains | GainStack, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
+    """L_i and L_u as in `CascadeLoop`, and the attitude path (C_e + Kff) Kp_o, (K, 2, 2) each; of a stack
+    (sets, K, 2, 2).
+    """
     C_e, C_d = inner_controllers(gains, plant.omega)
     forward = (C_e + gains.Kff_i) @ gains.Kp_o
     L_i = (C_e + C_d) @ plant.G_i
-    L_u = L_i + forward @ plant.G_o
+    return L_i, L_i + forward @ plant.G_o, forward
+
+
+def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
+    """The transfers of `CascadeLoop` for a gain set on a measured plant."""
+    L_i, L_u, forward = whole_loop(gains, plant)
     U_o: Complex = np.linalg.solve(np.eye(2) + L_u, forward).astype(np.complex128)
     return CascadeLoop(L_i, L_u, plant.G_o @ U_o, U_o)
 

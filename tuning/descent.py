@@ -1,90 +1,75 @@
-"""Least squares within limits by sequential quadratic programming with differences: how gains are refined."""
+"""Least squares within limits: how gains are refined."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cholesky, solve_triangular
-from scipy.optimize import minimize
+from scipy.optimize import least_squares
 
-ITERATIONS = 60
-#: A descent ends where one step gains less than this share of the cost that it began with.
-TOLERANCE = 1e-7
-#: It begins again from its end, its picture of the curvature forgotten, while that gains this share.
-WORTH = 0.02
-#: Curvature that a direction is taken to have at least, beside the cost at the start.
-FLAT = 0.01
+#: A round ends where a step gains less than this share of the cost, or after so many points.
+TOLERANCE, POINTS = 1e-6, 60
+#: Squares of what a limit is missed by count so often, beside a cost that begins at 1.
+STIFFNESS = 100.0
+#: Rounds, at most; how closely the limits are met where they end; more than the last is too much, all relative.
+ROUNDS, MET, MISSED = 12, 1e-4, 2e-3
 
 Signal = NDArray[np.float64]
-#: Points (B, n) -> residuals (B, R) and what is left of every limit (B, m): negative is too much.
 Examine = Callable[[Signal], tuple[Signal, Signal]]
 
 
-def descend(examine: Examine, first: Signal, step: float, again: int = 0) -> tuple[Signal, float]:
+def descend(examine: Examine, first: Signal, step: float) -> tuple[Signal, float]:
     """The point with the least sum of squared residuals within the limits, near a first one.
 
-    The unknowns are turned and stretched so that the sum looks round where the descent begins (Gauss and Newton's
-    curvature is then the identity, which the method starts from): gains act on a flight with very unequal strength.
+    Limits are residuals, too, as far as they are missed, each shifted by its price from round to round until it is met
+    (the augmented Lagrangian of Hestenes, Powell and Rockafellar); within a round scipy's trust region goes by Gauss
+    and Newton's curvature.
 
     Parameters
     ----------
     examine : callable
         Points (B, n) -> residuals (B, R) and what is left of every limit (B, m): negative is too much.
     first : (n,) array
-        Where to begin; every number of about the size 1.
+        Where to begin; every number of about the size 1. It need not keep the limits.
     step : float
         Of the differences.
-    again : int
-        How often it may begin again from its end, at most.
 
     Returns
     -------
     point : (n,) array
     cost : float
-        Its sum of squares.
+        Its sum of squares; infinite where a limit is missed.
     """
-    point, cost = _descent(examine, first, step)
-    for _ in range(again):
-        following, lower = _descent(examine, point, step)
-        if not lower < (1 - WORTH) * cost:
+    residuals, left = examine(first[None])
+    unit, prices = float(np.linalg.norm(residuals)), np.zeros(left.shape[1])
+
+    def values(points: Signal) -> Signal:
+        residuals, left = examine(points)
+        missed = np.sqrt(STIFFNESS) * np.maximum(prices / STIFFNESS - left, 0.0)
+        every: Signal = np.nan_to_num(np.hstack([residuals / unit, missed]), nan=1e3, posinf=1e3, neginf=-1e3)
+        return every
+
+    def slopes(point: Signal) -> Signal:
+        around = values(np.vstack([point, point + step * np.eye(len(point))]))
+        jacobian: Signal = (around[1:] - around[0]).T / step
+        return jacobian
+
+    point = first
+    for _ in range(ROUNDS):
+        found = least_squares(
+            lambda point: values(point[None])[0],
+            point,
+            jac=slopes,
+            x_scale="jac",
+            ftol=TOLERANCE,
+            xtol=TOLERANCE,
+            gtol=None,
+            max_nfev=POINTS,
+        )
+        point = found.x
+        residuals, left = examine(point[None])
+        if np.abs(np.minimum(left[0], prices / STIFFNESS)).max() < MET:
             break
-        point, cost = following, lower
-    return point, cost
-
-
-def _descent(examine: Examine, first: Signal, step: float) -> tuple[Signal, float]:
-    size = len(first)
-
-    def differ(point: Signal) -> tuple[Signal, Signal, Signal, Signal]:
-        """Residuals and limits there, each with its Jacobian."""
-        residuals, left = examine(np.vstack([point, point + step * np.eye(size)]))
-        residuals = np.nan_to_num(residuals, nan=1e3, posinf=1e3, neginf=-1e3)
-        left = np.nan_to_num(left, nan=-1e6, neginf=-1e6)
-        return residuals[0], (residuals[1:] - residuals[0]).T / step, left[0], (left[1:] - left[0]).T / step
-
-    residuals, slopes, _, _ = differ(first)
-    unit = float(residuals @ residuals)
-    round_here = solve_triangular(cholesky(2 / unit * slopes.T @ slopes + FLAT * np.eye(size)), np.eye(size))
-
-    @lru_cache(maxsize=8)
-    def around(turned: bytes) -> tuple[float, Signal, Signal, Signal]:
-        residuals, slopes, left, left_slopes = differ(first + round_here @ np.frombuffer(turned))
-        cost = float(residuals @ residuals) / unit
-        return cost, 2 / unit * residuals @ slopes @ round_here, left, left_slopes @ round_here
-
-    found = minimize(
-        lambda turned: around(turned.tobytes())[0],
-        np.zeros(size),
-        jac=lambda turned: around(turned.tobytes())[1],
-        method="SLSQP",
-        constraints={
-            "type": "ineq",
-            "fun": lambda turned: around(turned.tobytes())[2],
-            "jac": lambda turned: around(turned.tobytes())[3],
-        },
-        options={"maxiter": ITERATIONS, "ftol": TOLERANCE},
-    )
-    return first + round_here @ found.x, float(found.fun) * unit
+        prices = np.maximum(prices - STIFFNESS * left[0], 0.0)
+    return point, float(np.sum(residuals**2)) if left.min() > -MISSED else np.inf

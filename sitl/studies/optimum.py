@@ -18,7 +18,7 @@ from sitl.airframe import Airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import Flight, fly
 from sitl.scenario import Scenario
-from tuning.certificate import HIGH_FREQUENCY_LOOP, Thresholds, loop_above
+from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
 from tuning.closed_loop import PlantResponse, cascade_loop
 from tuning.descent import descend
 from tuning.gains import Gains
@@ -28,7 +28,7 @@ from tuning.reference import ReferenceModel
 #: Every gain of the structure that the thesis' tables have.
 FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
 #: Relative step of the differences: the flown controller is single precision.
-STEP, AGAIN = 1e-3, 3
+STEP = 1e-3
 #: Limits of `Task.examine`, what a gain set that cannot fly costs (rad^2), and by what a limit may be missed.
 LIMITS, LOST, TOLERATED = 5, 10.0, 2e-3
 
@@ -50,8 +50,10 @@ class Task:
         What the attitude should follow.
     plant : PlantResponse
         Response of the vehicle that a log gives: the gains must be ones that could be certified from it.
+    peak : float
+        Largest peak of the sensitivity for that.
     effort : sequence of 2 float or None
-        RMS of the moments allowed in each doublet; None: as much as it takes, certified or not.
+        RMS of the moments allowed in each doublet; None: as much as it takes.
     integral : float, 1/s
         Integral action that is needed, see `tuning.manoeuvre.integral_rate`: a vehicle must find its trim.
     """
@@ -61,6 +63,7 @@ class Task:
     doublets: Sequence[Scenario]
     outer: ReferenceModel
     plant: PlantResponse
+    peak: float
     effort: Sequence[float] | None
     integral: float
 
@@ -88,12 +91,11 @@ class Task:
             error[:, 1 - axis] *= OTHER_AXIS
             errors.append(error[slice(*flight.scenario.window)].ravel())
         residuals = np.concatenate(errors)
-        if self.effort is None:
-            return residuals, [1.0] * LIMITS
+        allowed = self.effort or (np.inf, np.inf)
         loop = np.linalg.svd(np.eye(2) + cascade_loop(gains, self.plant).L_u, compute_uv=False)
         return residuals, [
-            *(1 - moment_rms(flight) / allowed for flight, allowed in zip(flights, self.effort, strict=True)),
-            1 - float((1 / loop).max()) / Thresholds.Ms,
+            *(1 - moment_rms(flight) / most for flight, most in zip(flights, allowed, strict=True)),
+            1 - float((1 / loop).max()) / self.peak,
             1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
             integral_rate(gains.Ki_i, gains.Kp_i) / self.integral - 1,
         ]
@@ -129,7 +131,7 @@ def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
             every = [task.examine(at(values)) for values in points]
             return np.array([residuals for residuals, _ in every]), np.array([left for _, left in every])
 
-        found = at(descend(examine, first, STEP, AGAIN)[0])
+        found = at(descend(examine, first, STEP)[0])
         residuals, left = task.examine(found)
         ends.append((min(left) < -TOLERATED, float(residuals @ residuals), found))
     return min(ends, key=lambda end: end[:2])[2]

@@ -16,6 +16,7 @@ from tuning.cascade import tune
 from tuning.controller import Controller
 from tuning.descent import descend
 from tuning.errors import TuningError
+from tuning.gain_stack import GainStack
 from tuning.gains import Limits
 from tuning.manoeuvre import DoubletModel, doublet_model, effort
 from tuning.reference import second_order
@@ -93,7 +94,7 @@ def test_the_model_flies_the_flown_difference_equation(gains):
     A = np.array([[0.9, 0.02], [-0.01, 0.92]])
     plant = StateSpace(A, np.array([[0.5, 0.05], [0.04, 0.6]]), np.eye(2), np.zeros((2, 2)), TS)
     setpoint = np.repeat([0.4, -0.4, 0.0], 60)
-    angles, moments = DoubletModel(plant, np.zeros(2), setpoint).fly([gains])
+    angles, moments = DoubletModel(plant, np.zeros(2), setpoint).fly(GainStack.of(gains))
     for axis in range(2):
         controller, state, rate, angle = Controller(gains, np.float64), np.zeros(2), np.zeros(2), np.zeros(2)
         asked = np.zeros(3)

@@ -1,0 +1,56 @@
+"""Several gain sets of one vehicle at once, for what is computed of hundreds of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.gains import Gains
+
+MATRICES = ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i")
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class GainStack:
+    """Matrices of K gain sets, each array broadcast against frequencies.
+
+    Attributes
+    ----------
+    Kp_o, Kp_i, Ki_i, Kd_i, Kff_i : (K, 1, 2, 2) arrays
+        As in `tuning.gains.Gains`.
+    limits : (3, 2) array
+        Of rates (rad/s), moments and integral, the same for all.
+    Ts, derivative_pole : float
+    """
+
+    Kp_o: Signal
+    Kp_i: Signal
+    Ki_i: Signal
+    Kd_i: Signal
+    Kff_i: Signal
+    limits: Signal
+    Ts: float
+    derivative_pole: float
+
+    @classmethod
+    def of(cls, gains: Gains) -> GainStack:
+        """A stack of one."""
+        limits = np.array([gains.limits.rate_max[:2], gains.limits.moment_max[:2], gains.limits.integral_max[:2]])
+        matrices = {name: getattr(gains, name)[None, None] for name in MATRICES}
+        return cls(**matrices, limits=limits, Ts=gains.Ts, derivative_pole=gains.derivative_pole)
+
+    def varied(self, matrices: Mapping[str, Signal]) -> GainStack:
+        """The first set with some of its matrices replaced, (K, 2, 2) each."""
+        count = len(next(iter(matrices.values())))
+        every = {name: np.broadcast_to(getattr(self, name)[:1], (count, 1, 2, 2)) for name in MATRICES}
+        every |= {name: matrix[:, None] for name, matrix in matrices.items()}
+        return GainStack(**every, limits=self.limits, Ts=self.Ts, derivative_pole=self.derivative_pole)
+
+    def stacked(self) -> Signal:
+        """All in one array, (K, 5, 2, 2)."""
+        return np.concatenate([getattr(self, name) for name in MATRICES], axis=1)
