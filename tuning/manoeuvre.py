@@ -8,7 +8,7 @@ effort. The measured frequency response keeps the margins: what it does not allo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
 from tuning.closed_loop import ACCURATE, MIN_FREQUENCIES, PlantResponse, longest_run, singular_values, whole_loop
-from tuning.descent import MISSED, Examine, descend
+from tuning.descent import MISSED, descend
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.gain_stack import GainStack
@@ -32,8 +32,10 @@ PEAK, SHARE = 2.35, 0.95
 INTEGRAL = 0.2
 #: Where descents begin: VRFT's gains; its Kp_i so many times, with Kd_i over Kp_i in units of typical sizes (20 ms).
 BEGINNINGS = ((1.0, None), (1.0, 0.5), (1.0, 1.0), (1.7, 1.0))
-#: A valley with twice the integral and the derivative action is looked for so often, while that gains this share.
-HOPS, WORTH = 3, 0.02
+#: Other valleys are looked for so often, while that gains this share.
+HOPS, WORTH = 2, 0.02
+#: Over Kp_i, in units of typical sizes (0.5 s and 20 ms): what a cascade that spends its whole effort tends to.
+FIRM = {"Ki_i": 10.0, "Kd_i": 5.0}
 #: Weight of the other axis' error: what decoupling costs in following is little.
 OTHER_AXIS = 2.0
 #: Order of the norm over frequencies that stands for the peak: smooth, and a little more than the peak itself.
@@ -41,6 +43,8 @@ SMOOTH = 24.0
 STEP = 1e-4
 
 Signal = NDArray[np.float64]
+#: From a point and which of its elements are free to the end, its cost and that of either axis.
+Descent = Callable[[Signal, NDArray[np.bool_]], tuple[Signal, float, Signal]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +80,25 @@ class DoubletModel:
         matrices = (np.ascontiguousarray(matrix) for matrix in (plant.A, plant.B, plant.C))
         fly(*matrices, self.trim, self.setpoint, gains, stack.limits, stack.Ts, stack.derivative_pole, angles, moments)
         return angles, moments
+
+    def spectral_radius(self, stack: GainStack) -> float:
+        """Of the first set: the larger of the rate loop's alone and of the cascade's, limits aside."""
+        Kp_o, Kp_i, Ki_i, Kd_i, Kff_i = stack.stacked()[0]
+        n, Ts, a = len(self.plant.A), stack.Ts, stack.derivative_pole
+        start = np.eye(n + 8)
+        state, rate, slope, integral, angle = np.split(start, [n, n + 2, n + 4, n + 6])
+        now = self.plant.C @ state
+        angle = angle + Ts / 2 * (now + rate)
+        slope = a * slope + (1 - a) / Ts * (now - rate)
+        radius = 0.0
+        for wanted in (np.zeros_like(now), -Kp_o @ angle):
+            summed = integral + Ts * Ki_i @ (wanted - now)
+            moment = Kp_i @ (wanted - now) - Kd_i @ slope + Kff_i @ wanted + summed
+            step = np.vstack([self.plant.A @ state + self.plant.B @ moment, now, slope, summed, angle])
+            if not wanted.any():  # nobody looks at the angle
+                step = step[:-2, :-2]
+            radius = max(radius, float(np.abs(np.linalg.eigvals(step)).max()))
+        return radius
 
 
 def doublet_model(experiment: Experiment, manoeuvre: Manoeuvre) -> DoubletModel:
@@ -174,53 +197,70 @@ def refine_cascade(
         residuals = np.moveaxis((angles - wanted) * weight, 1, 0).reshape(len(points), -1)
         return residuals, np.hstack([1 - _effort(moments).T / allowed, left(candidates)])
 
+    def descended(first: Signal, free: NDArray[np.bool_]) -> tuple[Signal, float, Signal]:
+        """End, cost and cost of either axis from a first point on, some of whose elements are free; a limit that is
+        missed and a loop that is unstable cost infinity: on the far side of instability nothing else would tell.
+        """
+
+        def spread(points: Signal) -> Signal:
+            every = np.tile(first, (len(points), 1))
+            every[:, free] = points
+            return every
+
+        end = spread(descend(lambda points: examine(spread(points)), first[free], STEP)[0][None])
+        residuals, left = examine(end)
+        costs = np.sum(residuals.reshape(2, -1) ** 2, axis=1)
+        if left.min() < -MISSED or model.spectral_radius(stack.varied(matrices(end))) >= 1:
+            costs = np.full(2, np.inf)
+        return end[0], float(costs.sum()), costs
+
     start = np.array([getattr(gains, name) for name in terms]) / scale
-    point = _axis_by_axis(examine, start, terms)
+    point = _axis_by_axis(descended, start, terms)
     if full:
-        point = _coupled(examine, point, terms)
+        point = _coupled(descended, point, terms)
     found = {name: matrix[0] for name, matrix in matrices(point).items()}
     return replace(gains, certificate=None, **found)  # type: ignore[arg-type]
 
 
-def _axis_by_axis(examine: Examine, start: Signal, terms: Sequence[str]) -> Signal:
+def _axis_by_axis(descended: Descent, start: Signal, terms: Sequence[str]) -> Signal:
     """The best diagonal gains, (4 len(terms),): each axis takes its own from the better of several descents.
 
     From VRFT's coupled gains the way often ends in a worse valley; a rate derivative that damps leads to another.
     """
     diagonal = np.tile(np.eye(2, dtype=bool).ravel(), len(terms))
-
-    def spread(points: Signal) -> Signal:
-        every: Signal = np.zeros((len(points), len(diagonal)))
-        every[:, diagonal] = points
-        return every
-
-    ends = []
-    parts = dict(zip(terms, start, strict=True))
+    ends, parts = [], dict(zip(terms, start * np.eye(2), strict=True))
     for proportional, derivative in BEGINNINGS if {"Kp_i", "Kd_i"} <= set(terms) else BEGINNINGS[:1]:
         begin = parts.copy()
         if derivative is not None:
             begin["Kp_i"] = proportional * parts["Kp_i"]
             begin["Kd_i"] = derivative * begin["Kp_i"]
-        first = np.array([begin[name] for name in terms]).ravel()[diagonal]
-        end, _ = descend(lambda points: examine(spread(points)), first, STEP)
-        residuals, left = examine(spread(end[None]))
-        costs = np.sum(residuals.reshape(2, -1) ** 2, axis=1)
-        ends.append((costs if left.min() > -MISSED else costs + np.inf, end.reshape(-1, 2)))
-    best = np.argmin([costs for costs, _ in ends], axis=0)
-    together = np.column_stack([ends[best[axis]][1][:, axis] for axis in range(2)])
-    return spread(together.reshape(1, -1)).ravel()
+        ends.append(descended(_flat(begin), diagonal))
+    best = np.argmin([costs for _, _, costs in ends], axis=0)
+    rows = [ends[best[axis]][0].reshape(-1, 2, 2)[:, axis] for axis in range(2)]
+    return np.stack(rows, axis=1).ravel()
 
 
-def _coupled(examine: Examine, point: Signal, terms: Sequence[str]) -> Signal:
-    """The best full gains from diagonal ones on, (4 len(terms),)."""
-    point, cost = descend(examine, point, STEP)
-    firmer = np.repeat([2.0 if name in ("Ki_i", "Kd_i") else 1.0 for name in terms], 4)
-    for _ in range(HOPS):  # the coupling in place, the axes may have a better valley than each had for itself
-        following, lower = descend(examine, point * firmer, STEP)
+def _coupled(descended: Descent, point: Signal, terms: Sequence[str]) -> Signal:
+    """The best full gains from diagonal ones on, (4 len(terms),).
+
+    The coupling in place, there may be a better valley than each axis had for itself: with firmer integral and
+    derivative action.
+    """
+    every = np.ones(len(point), bool)
+    point, cost, _ = descended(point, every)
+    for _ in range(HOPS):
+        parts = dict(zip(terms, point.reshape(-1, 2, 2), strict=True))
+        doubled = parts | {name: 2 * parts[name] for name in ("Ki_i", "Kd_i") if name in parts}
+        firm = parts | {name: FIRM[name] * parts["Kp_i"] for name in FIRM if {name, "Kp_i"} <= parts.keys()}
+        following, lower, _ = min((descended(_flat(begin), every) for begin in (doubled, firm)), key=lambda end: end[1])
         if not lower < (1 - WORTH) * cost:
             break
         point, cost = following, lower
     return point
+
+
+def _flat(parts: Mapping[str, Signal]) -> Signal:
+    return np.array(list(parts.values())).ravel()
 
 
 def typical_sizes(gains: Gains) -> dict[str, float]:
