@@ -196,7 +196,9 @@ class Connection:
                 data, peer = self.port.recvfrom(65536)
                 self.peers[peer] = None
                 return bytes(data)
-            data = self.port.recv(65536) if self.kind == "tcp" else self.port.read(65536)
+            if self.kind != "tcp":
+                return bytes(self.port.read(65536))  # nothing, now and then, although it was ready; its end is an error
+            data = self.port.recv(65536)
         except (BlockingIOError, ConnectionRefusedError):
             return b""
         except OSError:

@@ -18,7 +18,7 @@ from sitl.studies.reproduce import ALL, STUDIES, reproduce
 from tuning.parallel import processes
 
 PRINTED = json.loads(TABLES.read_text())
-SEEDS = 2
+SEEDS = 3
 
 
 @pytest.fixture(scope="module")

@@ -165,9 +165,9 @@ def test_a_person_at_a_terminal_is_asked(certified, old, new, answer, written):
         command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url]
         with subprocess.Popen(command, stdin=far, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             os.write(near, answer.encode())
-            shown, _ = process.communicate(timeout=60)
+            shown, told = process.communicate(timeout=60)
         assert "Write 35 parameters to vehicle 1?" in shown
-        assert (process.returncode == 0) == written
+        assert (process.returncode == 0) == written, told
         assert named(link.vehicle.values, new) == (new if written else named(old, new))
     os.close(near)
     os.close(far)
