@@ -108,6 +108,36 @@ def test_the_model_flies_the_flown_difference_equation(gains):
     assert np.abs(moments[0, 0, :, 0]).max() == 0.12  # it did saturate
 
 
+def test_the_spectral_radius_is_how_fast_a_flight_grows(gains):
+    wide = Limits((1e99,) * 3, (1e99,) * 3, (1e99,) * 3)
+    A = np.array([[0.9, 0.02], [-0.01, 0.92]])
+    plant = StateSpace(A, np.array([[0.5, 0.05], [0.04, 0.6]]), np.eye(2), np.zeros((2, 2)), TS)
+    model = DoubletModel(plant, np.zeros(2), np.concatenate([np.ones(5), np.zeros(195)]))
+    stable = GainStack.of(dataclasses.replace(gains, limits=wide))
+    growing = GainStack.of(dataclasses.replace(gains, limits=wide, Kp_i=30 * gains.Kp_i))
+    size = np.abs(model.fly(growing)[0][:, 0]).max(axis=(0, 2))
+    assert model.spectral_radius(growing) == pytest.approx((size[150] / size[100]) ** (1 / 50), rel=1e-3)
+    # A stable one is told by its slowest mode, which may be the rate loop's when it is alone.
+    size = np.abs(model.fly(stable)[0][:, 0]).max(axis=(0, 2))
+    assert (size[150:200].max() / size[100:150].max()) ** (1 / 50) < model.spectral_radius(stable) < 1
+
+
+def test_refined_gains_are_stable_on_the_model_in_both_loops(log, sets):
+    model = doublet_model(log, Manoeuvre(**DOUBLET))
+    for name in ("refined", "refined siso"):
+        assert model.spectral_radius(GainStack.of(sets[name])) < 1
+
+
+def test_the_descent_comes_back_to_its_limits_from_outside():
+    def examine(points):
+        return 10.0 * points + 1e-3 * points**3, np.column_stack([points[:, 0] - 1.0, 2.0 - points[:, 1] ** 2])
+
+    point, cost = descend(examine, np.array([0.0, 3.0]), 1e-6)
+    assert point == pytest.approx([1.0, 0.0], abs=1e-3)
+    assert cost == pytest.approx(100.02, rel=1e-3)
+    assert descend(lambda points: (points, np.full((len(points), 1), -1.0)), np.ones(2), 1e-6)[1] == np.inf
+
+
 def test_the_descent_finds_the_minimum_on_its_limit():
     def examine(points):
         return points - np.array([3.0, 1.0]), 2.0 - np.sum(points, axis=1, keepdims=True)
