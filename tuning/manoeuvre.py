@@ -235,7 +235,10 @@ def _axis_by_axis(descended: Descent, start: Signal, terms: Sequence[str]) -> Si
             begin["Kp_i"] = proportional * parts["Kp_i"]
             begin["Kd_i"] = derivative * begin["Kp_i"]
         ends.append(descended(_flat(begin), diagonal))
-    best = np.argmin([costs for _, _, costs in ends], axis=0)
+    costs = np.array([costs for _, _, costs in ends])
+    if np.isinf(costs.min(axis=0)).any():
+        return _flat(parts)
+    best = np.argmin(costs, axis=0)
     rows = [ends[best[axis]][0].reshape(-1, 2, 2)[:, axis] for axis in range(2)]
     return np.stack(rows, axis=1).ravel()
 
@@ -244,10 +247,11 @@ def _coupled(descended: Descent, point: Signal, terms: Sequence[str]) -> Signal:
     """The best full gains from diagonal ones on, (4 len(terms),).
 
     The coupling in place, there may be a better valley than each axis had for itself: with firmer integral and
-    derivative action.
+    derivative action. Where no end keeps the limits the point stays where it was.
     """
     every = np.ones(len(point), bool)
-    point, cost, _ = descended(point, every)
+    end, cost, _ = descended(point, every)
+    point = end if cost < np.inf else point
     for _ in range(HOPS):
         parts = dict(zip(terms, point.reshape(-1, 2, 2), strict=True))
         doubled = parts | {name: 2 * parts[name] for name in ("Ki_i", "Kd_i") if name in parts}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -33,6 +33,8 @@ MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true p
 #: Effort over SISO's that is asked of the refined gains, as predicted: the 10 % of the expectation less what a
 #: prediction may miss. The best on the true plant may spend what the refined gains of the first seed do.
 EFFORT = 1.06
+#: Figures of a flight in which the vehicle was lost.
+LOST = Performance(**dict.fromkeys((field.name for field in fields(Performance)), np.inf))  # type: ignore[arg-type]
 #: Hover before a doublet; a mass at one motor takes longer to be trimmed out.
 LEAD_S, TRIM_S = 1.0, 6.0
 
@@ -206,10 +208,14 @@ def _bench(airframe: str) -> tuple[Vehicle, Gains, NativeLibrary]:
 
 
 def fly_set(airframe: str, gains: Gains, scenario: Scenario, seed: int, noise: bool = True) -> Flight:
-    """One flight of a vehicle under a gain set; a lost one is an error."""
+    """One flight of a vehicle under a gain set."""
     vehicle, _, library = _bench(airframe)
     autopilot = Autopilot(vehicle.airframe, gains, NativeController(library, gains))
-    flight = fly(vehicle.airframe, autopilot, scenario, seed, noise)
+    return fly(vehicle.airframe, autopilot, scenario, seed, noise)
+
+
+def _safe(flight: Flight, airframe: str, scenario: Scenario) -> Flight:
+    """A flight that must not be lost."""
     if flight.crashed_at is not None:
         raise SitlError(f"{airframe}: lost at {flight.crashed_at:.2f} s of the {scenario.name}", exit_code=1)
     return flight
@@ -219,7 +225,7 @@ def experiment(study: Study, airframe: str, seed: int) -> tuple[Flight, Experime
     """The excitation flight of a study on a vehicle, and its signals as they are logged."""
     default = _bench(airframe)[1]
     scenario = excitation_flight(*study.excitation, default.Ts, np.random.default_rng(seed))
-    flight = fly_set(airframe, default, scenario, seed)
+    flight = _safe(fly_set(airframe, default, scenario, seed), airframe, scenario)
     names = {"u": "moment", "y_i": "rates", "y_o": "attitude", "u_bar": "excitation", "r_o": "setpoint"}
     signals: Any = {name: flight.record[field][:, :2].astype(np.float64) for name, field in names.items()}
     return flight, Experiment(Ts=default.Ts, source=f"{airframe}, seed {seed}", flown=default, **signals)
@@ -290,7 +296,10 @@ def run(study: Study, seed: int, best: dict[str, Gains]) -> Run:
     doublets = study.doublets(log.Ts)
     flights = {m: [fly_set(study.airframe, found, task, seed) for task in doublets] for m, found in gains.items()}
     figures = {
-        method: [performance(one, *study.models(method, log.Ts)) for one in both] for method, both in flights.items()
+        method: [
+            LOST if one.crashed_at is not None else performance(one, *study.models(method, log.Ts)) for one in both
+        ]
+        for method, both in flights.items()
     }
     return Run(flight, gains, flights, figures)
 

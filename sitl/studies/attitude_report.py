@@ -39,7 +39,7 @@ METHODS = (
 )
 SPREAD_COLUMNS = ("gain", *ELEMENTS)
 COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].partition(":")[0] for text in COSTS.values()))
-CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms")
+CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms", "lost flights")
 
 
 def study_sections(found: Statistics) -> list[Section]:
@@ -144,8 +144,13 @@ def certificates_table(found: Statistics) -> Table:
     for method in found.study.methods():
         verdicts = ", ".join(f"{count}: {verdict}" for verdict, count in found.verdicts(method).items())
         peaks = [run[method]["Ms"] for run in found.runs if run[method]["Ms"] is not None]
-        rows.append([method, verdicts, f"{np.median(peaks):.2f}" if peaks else ""])
-    return Table(f"{found.study.name}: certificates, and the median peak of the sensitivity", CERTIFICATE_COLUMNS, rows)
+        lost = sum(np.isinf(found.values(method, axis, "effort_rms")).sum() for axis in AXES)
+        rows.append([method, verdicts, f"{np.median(peaks):.2f}" if peaks else "", str(lost)])
+    return Table(
+        f"{found.study.name}: certificates, median peak of the sensitivity, lost flights",
+        CERTIFICATE_COLUMNS,
+        rows,
+    )
 
 
 def study_figures(found: Statistics) -> dict[str, Any]:
