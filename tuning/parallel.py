@@ -12,8 +12,6 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExe
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
-from threadpoolctl import threadpool_limits
-
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
@@ -41,7 +39,6 @@ def processes(count: int) -> Iterator[Executor]:
 
 
 def _follow_parent() -> None:
-    threadpool_limits(1)  # or each worker's BLAS waits for the threads of the others: 3 times slower
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

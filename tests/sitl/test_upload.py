@@ -164,9 +164,13 @@ def test_a_person_at_a_terminal_is_asked(certified, old, new, answer, written):
     with UdpVehicle(ScriptedVehicle(old)) as link:
         command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url]
         with subprocess.Popen(command, stdin=far, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+            shown = ""
+            while "Write 35 parameters to vehicle 1?" not in shown:
+                character = process.stdout.read(1)
+                assert character, process.stderr.read()
+                shown += character
             os.write(near, answer.encode())
-            shown, told = process.communicate(timeout=60)
-        assert "Write 35 parameters to vehicle 1?" in shown
+            _, told = process.communicate(timeout=60)
         assert (process.returncode == 0) == written, told
         assert named(link.vehicle.values, new) == (new if written else named(old, new))
     os.close(near)
