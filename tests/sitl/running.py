@@ -100,8 +100,8 @@ class Pilot:
         self.link.close()
 
     def take(self, timeout=0.05):
-        """One message, if there is one."""
-        message = self.last = self.link.recv_match(blocking=True, timeout=timeout)
+        """One message, if there is one; 0: if it is there already."""
+        message = self.last = self.link.recv_match(blocking=timeout > 0, timeout=timeout or None)
         if message is not None and message.get_type() == "STATUSTEXT":
             if message.chunk_seq and self.texts:  # the rest of a long one
                 self.texts[-1] += message.text
