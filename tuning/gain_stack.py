@@ -8,9 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.gains import Gains
-
-MATRICES = ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i")
+from tuning.gains import MATRICES, Gains
 
 Signal = NDArray[np.float64]
 

@@ -256,8 +256,8 @@ def logs(study: Study, seed: int) -> tuple[Flight, Experiment, Experiment]:
 
 
 def optimum(study: Study) -> dict[str, Gains]:
-    """The best gains on the true plant: with the effort of the refined ones and the certificate's margins, and without
-    any limit.
+    """The best gains on the true plant: with the effort of the refined ones and the certificate's margins, and with
+    those margins and as much effort as it takes.
     """
     _, log, siso_log = logs(study, 0)
     plant = measured_plant(log)

@@ -20,7 +20,7 @@ from sitl.loop import Flight, fly
 from sitl.scenario import Scenario
 from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
 from tuning.closed_loop import PlantResponse, cascade_loop
-from tuning.descent import descend
+from tuning.descent import MISSED, descend
 from tuning.gains import Gains
 from tuning.manoeuvre import OTHER_AXIS, integral_rate, typical_sizes
 from tuning.reference import ReferenceModel
@@ -29,8 +29,8 @@ from tuning.reference import ReferenceModel
 FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
 #: Relative step of the differences: the flown controller is single precision.
 STEP = 1e-3
-#: Limits of `Task.examine`, what a gain set that cannot fly costs (rad^2), and by what a limit may be missed.
-LIMITS, LOST, TOLERATED = 5, 10.0, 2e-3
+#: Limits of `Task.examine`, and what a gain set that cannot fly costs (rad^2).
+LIMITS, LOST = 5, 10.0
 
 Signal = NDArray[np.float64]
 
@@ -133,5 +133,5 @@ def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
 
         found = at(descend(examine, first, STEP)[0])
         residuals, left = task.examine(found)
-        ends.append((min(left) < -TOLERATED, float(residuals @ residuals), found))
+        ends.append((min(left) < -MISSED, float(residuals @ residuals), found))
     return min(ends, key=lambda end: end[:2])[2]
