@@ -11,12 +11,13 @@ from numpy.typing import NDArray
 from tuning.certificate import certify
 from tuning.closed_loop import PlantResponse, plant_response, refine_outer
 from tuning.controller import rebuild_rate_setpoint
+from tuning.doublet import doublet_model
 from tuning.errors import NotMinimumPhaseError, TuningError
 from tuning.experiment import Experiment
 from tuning.gains import Gains, Limits, YawGains
 from tuning.gates import examine_band, examine_estimates, examine_saturation
 from tuning.instruments import Instruments, Stretches, align, excited_stretches, external_signal, instruments
-from tuning.manoeuvre import doublet_model, refine_cascade
+from tuning.manoeuvre import refine_cascade
 from tuning.reference import ReferenceModel
 from tuning.siso import siso_vrft
 from tuning.spec import TuningSpec
@@ -26,6 +27,10 @@ from tuning.vrft import LoopEstimate, vrft
 UPPER = 300.0
 #: Periods of a log and of a gain set may differ by this share.
 PERIOD_TOLERANCE = 0.02
+NO_MOTORS = (
+    "the log does not say how the motors are moved (PX4: actuator_motors, with THR_MDL_FAC set): where the doublet "
+    "drives them to their limits the refined gains are not the best"
+)
 TERMS = {"P": "Kp_i", "I": "Ki_i", "D": "Kd_i", "F": "Kff_i"}
 
 
@@ -238,6 +243,8 @@ def tune(
         except TuningError as error:
             warnings.append(f"the attitude gains are left as VRFT gives them: {error}")
     if spec.manoeuvre:
+        if experiment.motors is None:
+            warnings.append(NO_MOTORS)
         try:
             gains = refine_cascade(
                 gains,

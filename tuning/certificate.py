@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
 
 from tuning.closed_loop import (
     DRAWS,
@@ -30,6 +31,9 @@ from tuning.reference import ReferenceModel
 
 #: Above the band the rate loop's gain may be at most this, if the plant falls like an integrator from its end on.
 HIGH_FREQUENCY_LOOP = 0.5
+#: Neighbouring frequencies differ by this share at most: a loop at the limit has a peak that is narrower than the
+#: response's own grid.
+DENSE = 0.05
 
 CERTIFIED = "certified"
 THIN = "stable, thin margin"
@@ -114,29 +118,19 @@ def certify(
         What is thin.
     """
     thresholds = thresholds or Thresholds()
-    known = longest_run(np.flatnonzero(plant.coherent()))
 
     def verdict(text: str, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
         return Certificate(text, reason, figures, band, log_sha256, gains.matrices_sha256())
 
-    if len(known) < MIN_FREQUENCIES:
+    plant, above = _certified_band(gains, plant)
+    if len(plant.omega) < MIN_FREQUENCIES:
         return verdict(NOT_CERTIFIED, "the excitation reaches fewer than 8 frequencies", {}, (0.0, 0.0))
-    small = loop_above(gains, plant.at(known)) <= HIGH_FREQUENCY_LOOP
-    # Where the loop is small for good nothing more has to be known: the noisy end of the band is left out.
-    settled = len(known) - int(np.argmin(small[::-1])) if not small.all() else 1
-    known = known[: max(settled + 1, MIN_FREQUENCIES)]
-    which = np.zeros(len(plant.omega), bool)
-    which[known] = True
-    plant = plant.at(which)
     band = (float(plant.omega[0]), float(plant.omega[-1]))
-    normal = _Normaliser(inner, outer, plant.omega)
-
-    generator = np.random.default_rng(0)
-    draws = [cascade_loop(gains, plant.draw(generator)) for _ in range(DRAWS)]
-    nominal = cascade_loop(gains, plant)
+    dense, nominal, draws = _loops(gains, plant)
+    normal = _Normaliser(inner, outer, dense.omega)
     windings = [normal.windings(loop) for loop in draws]
-    figures = _figures(gains, plant, nominal, draws, inner)
-    beyond = _beyond_the_band(gains, plant)
+    figures = _figures(above, dense, nominal, draws, inner)
+    beyond = _beyond_the_band(gains, plant, above)
     if beyond:
         return verdict(NOT_CERTIFIED, beyond, figures, band)
     doubtful = sum(any(w) for w in windings)
@@ -157,6 +151,46 @@ def certify(
     if phase < thresholds.phase_deg:
         thin.append(f"phase margin {phase:.0f} degrees is below {thresholds.phase_deg:g}")
     return verdict(THIN if thin else CERTIFIED, "; ".join([*thin, assumed]), figures, band)
+
+
+def sensitivity_peak(gains: Gains, plant: PlantResponse) -> tuple[float, float]:
+    """Peak of the sensitivity at u and two standard errors of it: the certificate's ``Ms`` and ``Ms_error``.
+
+    Parameters
+    ----------
+    gains : Gains
+    plant : PlantResponse
+        With at least 8 coherent frequencies in a row.
+    """
+    return _sensitivity_peak(*_loops(gains, _certified_band(gains, plant)[0])[1:])
+
+
+def _sensitivity_peak(nominal: CascadeLoop, draws: list[CascadeLoop]) -> tuple[float, float]:
+    def peak(loop: CascadeLoop) -> float:
+        return float(np.linalg.norm(np.linalg.inv(np.eye(2) + loop.L_u), ord=2, axis=(1, 2)).max())
+
+    return peak(nominal), 2 * float(np.std([peak(loop) for loop in draws]))
+
+
+def _certified_band(gains: Gains, plant: PlantResponse) -> tuple[PlantResponse, float]:
+    """The longest coherent stretch, up to where the loop is small for good: nothing more has to be known above, and
+    the noisy end of the band is left out. With it what the loop's gain may still reach above.
+    """
+    plant = plant.at(longest_run(np.flatnonzero(plant.coherent())))
+    if len(plant.omega) < MIN_FREQUENCIES:
+        return plant, np.inf
+    above = loop_above(gains, plant)
+    small = above <= HIGH_FREQUENCY_LOOP
+    settled = len(small) - int(np.argmin(small[::-1])) if not small.all() else 1
+    last = min(max(settled + 1, MIN_FREQUENCIES), len(small)) - 1
+    return plant.at(np.arange(last + 1)), float(above[last])
+
+
+def _loops(gains: Gains, plant: PlantResponse) -> tuple[PlantResponse, CascadeLoop, list[CascadeLoop]]:
+    """The plant on a grid that shows narrow peaks, the loop around it, and around others that the experiment allows."""
+    generator, dense = np.random.default_rng(0), plant.interpolated(DENSE)
+    others = (plant.draw(generator).interpolated(DENSE) for _ in range(DRAWS))
+    return dense, cascade_loop(gains, dense), [cascade_loop(gains, other) for other in others]
 
 
 class _Normaliser:
@@ -199,9 +233,10 @@ def _turn(f: Complex) -> float:
     return float(np.sum(np.angle(f[1:] / f[:-1])))
 
 
-def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
-    """Why nothing can be said outside of the band; empty when the assumptions hold."""
-    loop = float(loop_above(gains, plant)[-1])
+def _beyond_the_band(gains: Gains, plant: PlantResponse, loop: float) -> str:
+    """Why nothing can be said outside of the band, where the rate loop's gain may still reach `loop`; empty when the
+    assumptions hold.
+    """
     if loop > HIGH_FREQUENCY_LOOP:
         return (
             f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
@@ -212,10 +247,7 @@ def _beyond_the_band(gains: Gains, plant: PlantResponse) -> str:
             f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the whole cascade's gain may still reach 1: "
             "excite a wider band"
         )
-    # The plant there is a real matrix times a scalar between a gain and an integrator: take that phase off.
-    turned = plant.G_i[0] * np.exp(-1j * np.angle(np.trace(plant.G_i[0])))
-    integral = gains.Ki_i @ turned.real
-    if np.any(gains.Ki_i) and np.linalg.eigvalsh(integral + integral.T)[0] <= 0:
+    if np.any(gains.Ki_i) and integral_action(gains.Ki_i, plant) <= 0:
         return (
             f"excitation begins at {plant.omega[0]:.1f} rad/s, where the loop's integral term is not positive: "
             "excite lower frequencies, or record longer"
@@ -230,14 +262,37 @@ def loop_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
 
     The supremum over w > w_k of sigma_max(G(w_k)) (w_k / w) sigma_max(C_e + C_d)(w). A rate is the integral of the
     moment over the inertia, behind motors and filters, so |G| falls at least like 1/w; that it does not grow would be
-    weaker, but then a filtered D counts with its gain at the Nyquist frequency, where no vehicle answers.
+    weaker, but then a filtered D counts with its gain at the Nyquist frequency, where no vehicle answers. That w |G|
+    does not rise is also what takes the noise off: from its highest value on it is fitted by such a sequence.
     """
     grid = np.concatenate([plant.omega, np.linspace(plant.omega[-1], np.pi / gains.Ts, 200)[1:]])
     C_e, C_d = inner_controllers(gains, grid)
     falling = singular_values(C_e + C_d)[0] / grid
     highest = np.maximum.accumulate(falling[..., ::-1], axis=-1)[..., ::-1][..., : len(plant.omega)]
-    reached: Signal = singular_values(plant.G_i)[0] * plant.omega * highest
+    rising: Signal = singular_values(plant.G_i)[0] * plant.omega
+    top = int(np.argmax(rising))
+    rising[top:] = isotonic_regression(rising[top:], increasing=False).x
+    reached: Signal = rising * highest
     return reached
+
+
+def integral_action(Ki_i: Signal, plant: PlantResponse) -> Signal:
+    """The least that integral terms do in any direction where the response begins: Ki_i G_i, its smallest eigenvalue.
+
+    Parameters
+    ----------
+    Ki_i : (..., 2, 2) array, 1/rad
+    plant : PlantResponse
+
+    Returns
+    -------
+    (...) array, 1/s
+    """
+    # The plant there is a real matrix times a scalar between a gain and an integrator: take that phase off.
+    turned = plant.G_i[0] * np.exp(-1j * np.angle(np.trace(plant.G_i[0])))
+    action = Ki_i @ turned.real
+    least: Signal = np.linalg.eigvalsh((action + np.swapaxes(action, -1, -2)) / 2)[..., 0]
+    return least
 
 
 def _outer_loop_above(gains: Gains, plant: PlantResponse) -> float:
@@ -252,17 +307,13 @@ def _outer_loop_above(gains: Gains, plant: PlantResponse) -> float:
 
 
 def _figures(
-    gains: Gains,
+    above: float,
     plant: PlantResponse,
     nominal: CascadeLoop,
     draws: list[CascadeLoop],
     inner: Sequence[ReferenceModel],
 ) -> dict[str, Any]:
     identity = np.eye(2)
-
-    def peak(loop: CascadeLoop) -> float:
-        return float(np.linalg.norm(np.linalg.inv(identity + loop.L_u), ord=2, axis=(1, 2)).max())
-
     m = np.stack([model.frequency_response(plant.omega) for model in inner], axis=1)[:, :, None] * identity
 
     def delta(loop: CascadeLoop) -> float:
@@ -277,12 +328,12 @@ def _figures(
         for i, axis in enumerate(("roll", "pitch"))
     }
     # Above the band the loop is at most this large: no gain margin is claimed beyond what that leaves.
-    rest = loop_above(gains, plant)[-1]
-    ceiling = -20 * float(np.log10(rest)) if rest > 0 else np.inf
+    ceiling = -20 * float(np.log10(above)) if above > 0 else np.inf
     distance = np.abs(np.linalg.det(identity + nominal.L_u)).min()
+    Ms, Ms_error = _sensitivity_peak(nominal, draws)
     return {
-        "Ms": peak(nominal),
-        "Ms_error": 2 * float(np.std([peak(loop) for loop in draws])),
+        "Ms": Ms,
+        "Ms_error": Ms_error,
         "delta": delta(nominal),
         "delta_error": 2 * float(np.std([delta(loop) for loop in draws])),
         "distance": float(distance),

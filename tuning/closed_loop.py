@@ -23,6 +23,8 @@ from tuning.reference import ReferenceModel
 #: Frequencies count where the excitation explains more than this share of a rate's power.
 COHERENT = 0.7
 ACCURATE = 0.1
+#: Windows of the response are at least this share of their frequency wide on each side: vehicles answer smoothly there.
+GROWTH = 0.05
 MIN_FREQUENCIES = 8
 DRAWS = 64
 
@@ -103,6 +105,25 @@ class PlantResponse:
             Ts=self.Ts,
         )
 
+    def interpolated(self, share: float) -> PlantResponse:
+        """The response with frequencies between its own, none further from the next than a share of itself.
+
+        w G_i and w^2 G_o hardly change from one to the next: they are interpolated. All else is the nearest's.
+        """
+        counts = np.ceil(np.log(self.omega[1:] / self.omega[:-1]) / np.log1p(share)).astype(int)
+        place = np.concatenate([*(k + np.arange(n) / n for k, n in enumerate(counts)), [len(counts)]])
+        index = np.arange(len(self.omega))
+        omega = np.interp(place, index, self.omega)
+        low = np.minimum(place.astype(int), len(index) - 2)
+        part, new, old = (place - low)[:, None, None], omega[:, None, None], self.omega[:, None, None]
+
+        def between(smooth: Complex) -> Complex:
+            value: Complex = (1 - part) * smooth[low] + part * smooth[low + 1]
+            return value
+
+        dense = self.at(np.rint(place).astype(int))
+        return replace(dense, omega=omega, G_i=between(old * self.G_i) / new, G_o=between(old**2 * self.G_o) / new**2)
+
     def draw(self, generator: np.random.Generator) -> PlantResponse:
         """Another plant that the experiment allows, from its error distribution."""
         shape = (len(self.omega), 6, 2)
@@ -131,7 +152,7 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float) -> 
     """
     signals = np.hstack([experiment.u, experiment.y_i, experiment.y_o])
     upper = min(upper, 0.95 * np.pi / experiment.Ts)
-    found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper)
+    found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper, GROWTH)
     T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
     if np.any(np.linalg.matrix_rank(T_u) < 2):
         raise TuningError("not excited: the external signal does not move both moments independently")

@@ -10,8 +10,9 @@ from scipy.optimize import least_squares
 
 #: A round ends where a step gains less than this share of the cost, or after so many points.
 TOLERANCE, POINTS = 1e-6, 60
-#: Squares of what a limit is missed by count so often, beside a cost that begins at 1.
-STIFFNESS = 100.0
+#: Squares of what a limit is missed by count so often, beside a cost that begins at 1; so much more often from a round
+#: on that does not bring what is missed down to a share.
+STIFFNESS, STIFFER, SHARE = 100.0, 4.0, 0.3
 #: Rounds, at most; how closely the limits are met where they end; more than the last is too much, all relative.
 ROUNDS, MET, MISSED = 12, 1e-4, 2e-3
 
@@ -42,11 +43,11 @@ def descend(examine: Examine, first: Signal, step: float) -> tuple[Signal, float
         Its sum of squares; infinite where a limit is missed.
     """
     residuals, left = examine(first[None])
-    unit, prices = float(np.linalg.norm(residuals)), np.zeros(left.shape[1])
+    unit, prices, stiffness, before = float(np.linalg.norm(residuals)), np.zeros(left.shape[1]), STIFFNESS, np.inf
 
     def values(points: Signal) -> Signal:
         residuals, left = examine(points)
-        missed = np.sqrt(STIFFNESS) * np.maximum(prices / STIFFNESS - left, 0.0)
+        missed = np.sqrt(stiffness) * np.maximum(prices / stiffness - left, 0.0)
         every: Signal = np.nan_to_num(np.hstack([residuals / unit, missed]), nan=1e3, posinf=1e3, neginf=-1e3)
         return every
 
@@ -69,7 +70,9 @@ def descend(examine: Examine, first: Signal, step: float) -> tuple[Signal, float
         )
         point = found.x
         residuals, left = examine(point[None])
-        if np.abs(np.minimum(left[0], prices / STIFFNESS)).max() < MET:
+        unmet = float(np.abs(np.minimum(left[0], prices / stiffness)).max())
+        if unmet < MET:
             break
-        prices = np.maximum(prices - STIFFNESS * left[0], 0.0)
+        prices = np.maximum(prices - stiffness * left[0], 0.0)
+        stiffness, before = stiffness * (STIFFER if unmet > SHARE * before else 1.0), unmet
     return point, float(np.sum(residuals**2)) if left.min() > -MISSED else np.inf

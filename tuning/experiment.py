@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tuning.errors import TuningError
 from tuning.gains import Gains
+from tuning.motors import Motors
 
 Signal = NDArray[np.float64]
 
@@ -35,6 +36,8 @@ class Experiment:
         Name and hash of the log.
     flown : Gains or None
         The controller that flew, when the log says so.
+    motors : Motors or None
+        How the allocator moved the motors, when the log says so.
 
     Raises
     ------
@@ -53,6 +56,7 @@ class Experiment:
     source: str = ""
     sha256: str = ""
     flown: Gains | None = None
+    motors: Motors | None = None
 
     def __post_init__(self) -> None:
         if not self.segments:

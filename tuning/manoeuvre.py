@@ -1,130 +1,47 @@
 """Gains for a manoeuvre: the whole cascade refined on a model that the same log gives.
 
 A rate-loop model is a means: what is flown is the attitude, and how well it follows is bounded by what the rate loop
-was asked for. Here a plant identified from the log (PBSID) flies the doublet in the flown difference equation,
-saturation included, and a descent goes from VRFT's gains to those that follow the attitude model best within an
-effort. The measured frequency response keeps the margins: what it does not allow is not gone to.
+was asked for. Here the doublet is predicted from the log, `tuning.doublet`, and a descent goes from VRFT's gains to
+those that follow the attitude model best within an effort. The measured frequency response keeps the margins: what it
+does not allow is not gone to.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
-from tuning.closed_loop import ACCURATE, MIN_FREQUENCIES, PlantResponse, longest_run, singular_values, whole_loop
-from tuning.descent import MISSED, descend
+from tuning.certificate import DENSE, HIGH_FREQUENCY_LOOP, Thresholds, integral_action, loop_above, sensitivity_peak
+from tuning.closed_loop import MIN_FREQUENCIES, PlantResponse, longest_run, singular_values, whole_loop
+from tuning.descent import descend
+from tuning.doublet import DoubletModel, effort, moment_rms
 from tuning.errors import TuningError
-from tuning.experiment import Experiment
 from tuning.gain_stack import GainStack
 from tuning.gains import Gains
-from tuning.identification import identify_rates
 from tuning.reference import ReferenceModel
-from tuning.spec import Manoeuvre
-from tuning.statespace import StateSpace
 
-#: The certificate's limits with some room: peak of the sensitivity, share of the gain allowed above the band.
-PEAK, SHARE = 2.35, 0.95
+#: Share of the gain that a certificate allows above the band.
+SHARE = 0.99
+#: The limit of the peak is corrected so often, until the certificate's is used up but for this share, or while that
+#: gains another.
+REPEATS, NEAR, WORTH = 5, 0.02, 0.01
 #: The integral term keeps this share of what VRFT gave it, in every direction.
 INTEGRAL = 0.2
-#: Where descents begin: VRFT's gains; its Kp_i so many times, with Kd_i over Kp_i in units of typical sizes (20 ms).
-BEGINNINGS = ((1.0, None), (1.0, 0.5), (1.0, 1.0), (1.7, 1.0))
-#: Other valleys are looked for so often, while that gains this share.
-HOPS, WORTH = 2, 0.02
-#: Over Kp_i, in units of typical sizes (0.5 s and 20 ms): what a cascade that spends its whole effort tends to.
-FIRM = {"Ki_i": 10.0, "Kd_i": 5.0}
+#: There are several valleys, most of them firmer than VRFT's gains: Kp_i over VRFT's, Ki_i and Kd_i over Kp_i in units
+#: of typical sizes (0.5 s and 20 ms).
+FIRMER = ((1.4, 5.5, 0.8), (1.8, 5.5, 1.8), (1.4, 10.0, 5.0))
 #: Weight of the other axis' error: what decoupling costs in following is little.
 OTHER_AXIS = 2.0
 #: Order of the norm over frequencies that stands for the peak: smooth, and a little more than the peak itself.
-SMOOTH = 24.0
+SMOOTH = 48.0
 STEP = 1e-4
+#: See `tuning.doublet.DoubletModel.fly`.
+SOFT = 0.05
 
 Signal = NDArray[np.float64]
-#: From a point and which of its elements are free to the end, its cost and that of either axis.
-Descent = Callable[[Signal, NDArray[np.bool_]], tuple[Signal, float, Signal]]
-
-
-@dataclass(frozen=True, eq=False)
-class DoubletModel:
-    """A doublet around an identified plant.
-
-    Attributes
-    ----------
-    plant : StateSpace
-        From moment to body rates.
-    trim : (2,) array
-        Moment that holds the vehicle level.
-    setpoint : (N,) array, rad
-        Of the axis that moves; the other's is zero.
-    """
-
-    plant: StateSpace
-    trim: Signal
-    setpoint: Signal
-
-    def fly(self, stack: GainStack) -> tuple[Signal, Signal]:
-        """Doublets on roll and on pitch under each of several gain sets, without noise.
-
-        Returns
-        -------
-        angles, moments : (2, sets, N, 2) arrays, rad, dimensionless
-            First index: the axis that moves.
-        """
-        from tuning.compiled_doublet import fly  # takes longer to import than all of the rest
-
-        gains, plant = stack.stacked(), self.plant
-        angles, moments = (np.empty((2, len(gains), len(self.setpoint), 2)) for _ in range(2))
-        matrices = (np.ascontiguousarray(matrix) for matrix in (plant.A, plant.B, plant.C))
-        fly(*matrices, self.trim, self.setpoint, gains, stack.limits, stack.Ts, stack.derivative_pole, angles, moments)
-        return angles, moments
-
-    def spectral_radius(self, stack: GainStack) -> float:
-        """Of the first set: the larger of the rate loop's alone and of the cascade's, limits aside."""
-        Kp_o, Kp_i, Ki_i, Kd_i, Kff_i = stack.stacked()[0]
-        n, Ts, a = len(self.plant.A), stack.Ts, stack.derivative_pole
-        start = np.eye(n + 8)
-        state, rate, slope, integral, angle = np.split(start, [n, n + 2, n + 4, n + 6])
-        now = self.plant.C @ state
-        angle = angle + Ts / 2 * (now + rate)
-        slope = a * slope + (1 - a) / Ts * (now - rate)
-        radius = 0.0
-        for wanted in (np.zeros_like(now), -Kp_o @ angle):
-            summed = integral + Ts * Ki_i @ (wanted - now)
-            moment = Kp_i @ (wanted - now) - Kd_i @ slope + Kff_i @ wanted + summed
-            step = np.vstack([self.plant.A @ state + self.plant.B @ moment, now, slope, summed, angle])
-            if not wanted.any():  # nobody looks at the angle
-                step = step[:-2, :-2]
-            radius = max(radius, float(np.abs(np.linalg.eigvals(step)).max()))
-        return radius
-
-
-def doublet_model(experiment: Experiment, manoeuvre: Manoeuvre) -> DoubletModel:
-    """The manoeuvre around the plant that PBSID finds in an experiment.
-
-    Raises
-    ------
-    TuningError
-        When the log is too short or not excited.
-    """
-    half = round(manoeuvre.period_s / 2 / experiment.Ts)
-    height = np.radians(manoeuvre.amplitude_deg) * np.ones(half)
-    u = np.concatenate([experiment.u[start:stop] for start, stop in experiment.segments])
-    plant = identify_rates(experiment)[0].plant
-    return DoubletModel(plant, np.median(u, axis=0), np.concatenate([height, -height]))
-
-
-def effort(gains: Gains, model: DoubletModel) -> tuple[float, float]:
-    """Predicted RMS of both moments together over the roll and over the pitch doublet."""
-    roll, pitch = _effort(model.fly(GainStack.of(gains))[1])[:, 0]
-    return float(roll), float(pitch)
-
-
-def _effort(moments: Signal) -> Signal:
-    power: Signal = np.sqrt(np.mean(np.sum(moments**2, axis=-1), axis=-1))
-    return power
 
 
 def refine_cascade(
@@ -158,109 +75,133 @@ def refine_cascade(
     Raises
     ------
     TuningError
-        When the measured response is known at too few frequencies.
+        When the measured response is known at too few frequencies, or no gains are found that keep the limits.
     """
-    known = response.at(response.coherent() & (response.relative_error() < ACCURATE))
+    known = response.at(longest_run(np.flatnonzero(response.coherent())))
     if len(known.omega) < MIN_FREQUENCIES:
-        raise TuningError(f"only {len(known.omega)} frequencies of the measured response are known to 10 %")
-    end = response.at(longest_run(np.flatnonzero(response.coherent()))[-1:])
-    allowed = np.array(limit if limit is not None else effort(gains, model))
+        raise TuningError(f"the excitation reaches only {len(known.omega)} frequencies, fewer than {MIN_FREQUENCIES}")
     wanted = np.zeros((2, 1, len(model.setpoint), 2))
     for axis, reference in enumerate(outer):
         wanted[axis, 0, :, axis] = reference.response(model.setpoint)
-    weight = np.where(np.eye(2, dtype=bool), 1.0, OTHER_AXIS)[:, None, None, :] / np.sqrt(len(model.setpoint))
-    sizes, stack = typical_sizes(gains), GainStack.of(gains)
-    scale = np.array([sizes[name] for name in terms])[:, None, None]
-    floor = INTEGRAL * integral_rate(gains.Ki_i, gains.Kp_i)
+    allowed = np.array(limit if limit is not None else effort(gains, model))
+    task = _Task(gains, model, known, known.interpolated(DENSE), wanted, allowed, terms, full)
+    peak = Thresholds.Ms
+    point, cost = min((task.descended(begin, peak) for begin in task.beginnings()), key=lambda end: end[1])
+    if cost == np.inf:
+        raise TuningError("from none of the beginnings gains were found that keep the margins and the effort")
+    # The norm is more than the peak, and what the log leaves open of the peak is known at the end only.
+    kept = None
+    for _ in range(REPEATS):
+        Ms, error = sensitivity_peak(task.gains_at(point), response)
+        room = (Thresholds.Ms - error) / Ms
+        if room >= 1 and (kept is None or cost < kept[1]):
+            kept = point, cost
+        if 1 <= room < 1 + NEAR:
+            break
+        peak *= room / (1 + NEAR / 2)
+        nearby, least = task.descended(point, peak)
+        if least == np.inf or (room > 1 and least > (1 - WORTH) * cost):
+            break
+        point, cost = nearby, least
+    return task.gains_at(kept[0] if kept else point)
 
-    def matrices(points: Signal) -> dict[str, Signal]:
-        parts = points.reshape(-1, len(terms), 2, 2) * scale
-        return dict(zip(terms, np.moveaxis(parts, 1, 0), strict=True))
 
-    def left(candidates: GainStack) -> Signal:
-        """Of the peak of the sensitivity, of the rate loop alone and of the whole loop, of the gain above the band, of
-        the integral; relative, (sets, 4).
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What is refined, and by what it is judged.
+
+    Points are the free matrices in units of typical sizes, one after the other, (4 terms,).
+
+    Attributes
+    ----------
+    start : Gains
+    model : DoubletModel
+    known, dense : PlantResponse
+        Measured response where it is known, and with frequencies between its own.
+    wanted : (2, 1, N, 2) array, rad
+        Angles that the attitude model asks for in the roll and in the pitch doublet.
+    allowed : (2,) array
+        Effort.
+    terms : sequence of str
+    full : bool
+    """
+
+    start: Gains
+    model: DoubletModel
+    known: PlantResponse
+    dense: PlantResponse
+    wanted: Signal
+    allowed: Signal
+    terms: Sequence[str]
+    full: bool
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Which elements of a point change."""
+        pattern = np.ones((2, 2), bool) if self.full else np.eye(2, dtype=bool)
+        return np.tile(pattern.ravel(), len(self.terms))
+
+    def matrices(self, points: Signal) -> dict[str, Signal]:
+        """The matrices of each of several points, (points, 2, 2)."""
+        sizes = typical_sizes(self.start)
+        parts = np.moveaxis(points.reshape(-1, len(self.terms), 2, 2), 1, 0)
+        return {name: sizes[name] * part for name, part in zip(self.terms, parts, strict=True)}
+
+    def gains_at(self, point: Signal) -> Gains:
+        """The gain set at a point."""
+        parts = {name: matrix[0] for name, matrix in self.matrices(point).items()}
+        return replace(self.start, certificate=None, **parts)  # type: ignore[arg-type]
+
+    def beginnings(self) -> Iterator[Signal]:
+        """Where descents begin: VRFT's gains, and firmer ones with the coupling that VRFT found."""
+        sizes, pattern = typical_sizes(self.start), self.free[:4].reshape(2, 2)
+        parts = {name: getattr(self.start, name) / sizes[name] * pattern for name in self.terms}
+        yield _flat(parts)
+        for proportional, *ratios in FIRMER if "Kp_i" in parts else ():
+            firm = {"Kp_i": proportional * parts["Kp_i"]}
+            firm |= {name: ratio * firm["Kp_i"] for name, ratio in zip(("Ki_i", "Kd_i"), ratios, strict=True)}
+            yield _flat({name: firm.get(name, part) for name, part in parts.items()})
+
+    def descended(self, first: Signal, peak: float) -> tuple[Signal, float]:
+        """End and cost of a descent within a limit of the sensitivity's peak; a limit that is missed and a loop that is
+        unstable cost infinity: on the far side of instability nothing else would tell.
         """
-        loops = np.stack(whole_loop(candidates, known)[:2], axis=1)
-        differences = np.concatenate(singular_values(np.eye(2, dtype=complex) + loops), axis=-1)
-        peaks = np.sum(differences**-SMOOTH, axis=-1) ** (1 / SMOOTH)
-        above = loop_above(candidates, end)[:, -1] / HIGH_FREQUENCY_LOOP
-        # VRFT's Kp_i is nearly the inverse of the plant's gain: beside it the directions are alike.
-        integral = np.ones(len(above))
-        if floor > 0:
-            integral = np.array([integral_rate(Ki_i[0], gains.Kp_i) for Ki_i in candidates.Ki_i]) / floor - 1
-        return np.column_stack([1 - peaks / PEAK, 1 - above / SHARE, integral])
-
-    def examine(points: Signal) -> tuple[Signal, Signal]:
-        candidates = stack.varied(matrices(points))
-        angles, moments = model.fly(candidates)
-        residuals = np.moveaxis((angles - wanted) * weight, 1, 0).reshape(len(points), -1)
-        return residuals, np.hstack([1 - _effort(moments).T / allowed, left(candidates)])
-
-    def descended(first: Signal, free: NDArray[np.bool_]) -> tuple[Signal, float, Signal]:
-        """End, cost and cost of either axis from a first point on, some of whose elements are free; a limit that is
-        missed and a loop that is unstable cost infinity: on the far side of instability nothing else would tell.
-        """
+        stack, free, weight = GainStack.of(self.start), self.free, self._weight()
 
         def spread(points: Signal) -> Signal:
             every = np.tile(first, (len(points), 1))
             every[:, free] = points
             return every
 
-        end = spread(descend(lambda points: examine(spread(points)), first[free], STEP)[0][None])
-        residuals, left = examine(end)
-        costs = np.sum(residuals.reshape(2, -1) ** 2, axis=1)
-        if left.min() < -MISSED or model.spectral_radius(stack.varied(matrices(end))) >= 1:
-            costs = np.full(2, np.inf)
-        return end[0], float(costs.sum()), costs
+        def examine(points: Signal) -> tuple[Signal, Signal]:
+            candidates = stack.varied(self.matrices(spread(points)))
+            angles, moments = self.model.fly(candidates, SOFT)
+            residuals = np.moveaxis((angles - self.wanted) * weight, 1, 0).reshape(len(points), -1)
+            return residuals, np.hstack([1 - moment_rms(moments).T / self.allowed, self._margins(candidates, peak)])
 
-    start = np.array([getattr(gains, name) for name in terms]) / scale
-    point = _axis_by_axis(descended, start, terms)
-    if full:
-        point = _coupled(descended, point, terms)
-    found = {name: matrix[0] for name, matrix in matrices(point).items()}
-    return replace(gains, certificate=None, **found)  # type: ignore[arg-type]
+        end, cost = descend(examine, first[free], STEP)
+        point = spread(end[None])[0]
+        stable = self.model.spectral_radius(GainStack.of(self.gains_at(point))) < 1
+        return point, cost if stable else np.inf
 
+    def _weight(self) -> Signal:
+        """Of each residual, so that their sum of squares is a mean square."""
+        axes = np.where(np.eye(2, dtype=bool), 1.0, OTHER_AXIS)[:, None, None, :]
+        weight: Signal = axes / np.sqrt(len(self.model.setpoint))
+        return weight
 
-def _axis_by_axis(descended: Descent, start: Signal, terms: Sequence[str]) -> Signal:
-    """The best diagonal gains, (4 len(terms),): each axis takes its own from the better of several descents.
-
-    From VRFT's coupled gains the way often ends in a worse valley; a rate derivative that damps leads to another.
-    """
-    diagonal = np.tile(np.eye(2, dtype=bool).ravel(), len(terms))
-    ends, parts = [], dict(zip(terms, start * np.eye(2), strict=True))
-    for proportional, derivative in BEGINNINGS if {"Kp_i", "Kd_i"} <= set(terms) else BEGINNINGS[:1]:
-        begin = parts.copy()
-        if derivative is not None:
-            begin["Kp_i"] = proportional * parts["Kp_i"]
-            begin["Kd_i"] = derivative * begin["Kp_i"]
-        ends.append(descended(_flat(begin), diagonal))
-    costs = np.array([costs for _, _, costs in ends])
-    if np.isinf(costs.min(axis=0)).any():
-        return _flat(parts)
-    best = np.argmin(costs, axis=0)
-    rows = [ends[best[axis]][0].reshape(-1, 2, 2)[:, axis] for axis in range(2)]
-    return np.stack(rows, axis=1).ravel()
-
-
-def _coupled(descended: Descent, point: Signal, terms: Sequence[str]) -> Signal:
-    """The best full gains from diagonal ones on, (4 len(terms),).
-
-    The coupling in place, there may be a better valley than each axis had for itself: with firmer integral and
-    derivative action. Where no end keeps the limits the point stays where it was.
-    """
-    every = np.ones(len(point), bool)
-    end, cost, _ = descended(point, every)
-    point = end if cost < np.inf else point
-    for _ in range(HOPS):
-        parts = dict(zip(terms, point.reshape(-1, 2, 2), strict=True))
-        doubled = parts | {name: 2 * parts[name] for name in ("Ki_i", "Kd_i") if name in parts}
-        firm = parts | {name: FIRM[name] * parts["Kp_i"] for name in FIRM if {name, "Kp_i"} <= parts.keys()}
-        following, lower, _ = min((descended(_flat(begin), every) for begin in (doubled, firm)), key=lambda end: end[1])
-        if not lower < (1 - WORTH) * cost:
-            break
-        point, cost = following, lower
-    return point
+    def _margins(self, candidates: GainStack, peak: float) -> Signal:
+        """What is left of the peak of the sensitivity, of the rate loop alone and of the whole loop, of the gain above
+        the band, of the integral; relative, (sets, 4).
+        """
+        loops = np.stack(whole_loop(candidates, self.dense)[:2], axis=1)
+        differences = np.concatenate(singular_values(np.eye(2, dtype=complex) + loops), axis=-1)
+        peaks = np.sum(differences**-SMOOTH, axis=-1) ** (1 / SMOOTH)
+        above = loop_above(candidates, self.known)[:, -1] / HIGH_FREQUENCY_LOOP
+        integral, floor = np.ones(len(above)), INTEGRAL * float(integral_action(self.start.Ki_i, self.known))
+        if floor > 0:
+            integral = integral_action(candidates.Ki_i[:, 0], self.known) / floor - 1
+        return np.column_stack([1 - peaks / peak, 1 - above / SHARE, integral])
 
 
 def _flat(parts: Mapping[str, Signal]) -> Signal:
@@ -277,9 +218,3 @@ def typical_sizes(gains: Gains) -> dict[str, float]:
         "Kd_i": 0.02 * proportional,
         "Kff_i": proportional,
     }
-
-
-def integral_rate(Ki_i: Signal, Kp_i: Signal) -> float:
-    """Least integral action beside the proportional one, in any direction, 1/s."""
-    action = Ki_i @ np.linalg.inv(Kp_i)
-    return float(np.linalg.eigvalsh((action + action.T) / 2)[0])

@@ -18,11 +18,11 @@ from sitl.airframe import Airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import Flight, fly
 from sitl.scenario import Scenario
-from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
+from tuning.certificate import HIGH_FREQUENCY_LOOP, integral_action, loop_above
 from tuning.closed_loop import PlantResponse, cascade_loop
 from tuning.descent import MISSED, descend
 from tuning.gains import Gains
-from tuning.manoeuvre import OTHER_AXIS, integral_rate, typical_sizes
+from tuning.manoeuvre import OTHER_AXIS, typical_sizes
 from tuning.reference import ReferenceModel
 
 #: Every gain of the structure that the thesis' tables have.
@@ -55,7 +55,7 @@ class Task:
     effort : sequence of 2 float or None
         RMS of the moments allowed in each doublet; None: as much as it takes.
     integral : float, 1/s
-        Integral action that is needed, see `tuning.manoeuvre.integral_rate`: a vehicle must find its trim.
+        Integral action that is needed, see `tuning.certificate.integral_action`: a vehicle must find its trim.
     """
 
     airframe: Airframe
@@ -97,7 +97,7 @@ class Task:
             *(1 - moment_rms(flight) / most for flight, most in zip(flights, allowed, strict=True)),
             1 - float((1 / loop).max()) / self.peak,
             1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
-            integral_rate(gains.Ki_i, gains.Kp_i) / self.integral - 1,
+            float(integral_action(gains.Ki_i, self.plant)) / self.integral - 1,
         ]
 
 

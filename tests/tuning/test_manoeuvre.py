@@ -15,10 +15,10 @@ from tests.tuning.test_certificate import experiment
 from tuning.cascade import tune
 from tuning.controller import Controller
 from tuning.descent import descend
+from tuning.doublet import DoubletModel, doublet_model, effort
 from tuning.errors import TuningError
 from tuning.gain_stack import GainStack
 from tuning.gains import Limits
-from tuning.manoeuvre import DoubletModel, doublet_model, effort
 from tuning.reference import second_order
 from tuning.spec import Manoeuvre, load_spec, parse_doublet
 from tuning.statespace import StateSpace
@@ -58,14 +58,12 @@ def test_refined_gains_follow_three_times_better_with_the_effort_that_was_asked(
     assert flown["refined"].offaxis_peak_deg < flown["siso"].offaxis_peak_deg / 3
     assert flown["refined"].effort_rms < 1.1 * flown["siso"].effort_rms
     # Without off-diagonals the other axis cannot be helped.
-    assert flown["refined siso"].offaxis_rms_deg > 2 * flown["refined"].offaxis_rms_deg
+    assert flown["refined siso"].offaxis_peak_deg > 2 * flown["refined"].offaxis_peak_deg
 
 
-def test_refined_gains_are_stable_and_say_what_they_are_for(sets):
+def test_refined_gains_are_certified_and_say_what_they_are_for(sets):
     refined = sets["refined"]
-    # The limit is on Ms itself: where this log's error of it is large, the margin is called thin.
-    assert refined.verdict()[0] in ("certified", "stable, thin margin")
-    assert refined.certificate["figures"]["Ms"] < 2.5
+    assert refined.verdict()[0] == "certified"
     assert refined.provenance["manoeuvre"]["amplitude_deg"] == DOUBLET["amplitude_deg"]
     # VRFT's deviations are those of other gains.
     assert refined.provenance["standard_deviation"] == {}

@@ -13,7 +13,8 @@ from tuning.flown import flown_gains
 from tuning.logs.columns import Columns
 from tuning.logs.flight import flying_parts
 from tuning.logs.recording import Recording
-from tuning.logs.resample import on_common_grid
+from tuning.logs.resample import Interval, on_common_grid
+from tuning.motors import Motors, fit_motors
 
 ULOG = b"ULog\x01\x12\x35"
 DATAFLASH = b"\xa3\x95"
@@ -99,10 +100,21 @@ def experiment_of(recording: Recording) -> Experiment:
         source=recording.path.name,
         sha256=sha256(recording.path.read_bytes()),
         flown=flown_gains(recording.parameters, grid.Ts),
+        motors=_motors(recording, parts),
         **grid.signals,
     )
     _check_units(experiment, recording)
     return experiment
+
+
+def _motors(recording: Recording, parts: tuple[Interval, ...]) -> Motors | None:
+    """How the allocator moved the motors in the usable parts of a log, where it holds their commands."""
+    commands, torque = recording.commands, recording.signals["u"]
+    if commands is None:
+        return None
+    made = np.searchsorted(torque.time, commands.time + 1e-6, side="right") - 1
+    used = (made >= 0) & np.any([(a <= commands.time) & (commands.time <= b) for a, b in parts], axis=0)
+    return fit_motors(torque.values[made[used]], commands.values[used])
 
 
 def _check_units(experiment: Experiment, recording: Recording) -> None:

@@ -43,6 +43,8 @@ class Recording:
         The vehicle's parameters, by name.
     notes : sequence of str
         What the reader of an inspection should know besides.
+    commands : Series or None
+        Motor commands as thrust fractions, a column each. None: the log does not hold them.
     """
 
     path: Path
@@ -55,6 +57,7 @@ class Recording:
     evidence: str = ""
     parameters: Mapping[str, float] = field(default_factory=dict)
     notes: Sequence[str] = ()
+    commands: Series | None = None
 
     def __post_init__(self) -> None:
         cleaned = {name: _believable(name, signal, str(self.path)) for name, signal in self.signals.items()}

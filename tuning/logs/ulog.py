@@ -31,6 +31,9 @@ EXCITATION_TOPIC, EXCITATION_NAME = "debug_vect", "MIMO_EXC"
 #: Upward thrust, newest PX4 first: (topic, field, sign).
 THRUSTS = (("vehicle_thrust_setpoint", "xyz[2]", -1.0), ("actuator_controls_0", "control[3]", 1.0))
 MIN_THRUST = 0.1
+MOTORS_TOPIC, MOTORS = "actuator_motors", tuple(f"control[{i}]" for i in range(12))
+#: PX4's share of the quadratic term in the thrust curve that it makes up for: 0 leaves commands that set the speed.
+THRUST_CURVE = "THR_MDL_FAC"
 ARMED = (("actuator_armed", "armed", 1), ("vehicle_status", "arming_state", 2))
 
 
@@ -73,6 +76,7 @@ def record_ulog(path: Path) -> Recording:
     parameters = {
         name: float(value) for name, value in log.ulog.initial_parameters.items() if isinstance(value, int | float)
     }
+    commands = _commands(log) if parameters.get(THRUST_CURVE) != 0 else None
     profile = parameters.get("SDLOG_PROFILE")
     now = f", it is {profile:.0f}" if profile is not None else ""
     wanted = {
@@ -90,6 +94,7 @@ def record_ulog(path: Path) -> Recording:
         evidence,
         parameters,
         ("the file is damaged: what could be read of it is used",) if log.ulog.file_corruption else (),
+        commands,
     )
 
 
@@ -153,6 +158,17 @@ def _excitation(log: _Log) -> Series | None:
     ours = (series.values[:, 2:] == np.frombuffer(EXCITATION_NAME.encode(), np.uint8)).all(axis=1)
     values = series.values[ours, :2]
     return Series(series.time[ours], values, series.topic) if values.any() else None
+
+
+def _commands(log: _Log) -> Series | None:
+    """The commands of the motors that there are, at the gyro sample that they were made of."""
+    series = log.series(MOTORS_TOPIC, MOTORS[: sum(name in log.fields(MOTORS_TOPIC) for name in MOTORS)])
+    if series is None:
+        return None
+    turning = np.isfinite(series.values).any(axis=0)
+    values = series.values[:, turning]
+    whole = np.isfinite(values).all(axis=1)
+    return Series(series.time[whole], values[whole], series.topic) if values.size and whole.any() else None
 
 
 def _at_cycle(series: Series, torque: tuple[NDArray[np.float64], NDArray[np.float64]]) -> Series:

@@ -1,0 +1,155 @@
+"""The motors in a log: what the allocator does, how rotors lag, what a doublet is that drives them to their limits."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sitl.airframe import load_airframe
+from sitl.allocation import allocate
+from sitl.autopilot import Autopilot
+from sitl.loop import fly
+from sitl.recorder import record_flight, save_flight
+from sitl.scenario import doublet, excitation_flight
+from sitl.ulog_writer import ulog_bytes
+from tuning.cascade import NO_MOTORS, tune
+from tuning.compiled_doublet import allocated
+from tuning.doublet import doublet_model
+from tuning.gain_stack import GainStack
+from tuning.identification import identify_rates
+from tuning.logs.reader import read_log
+from tuning.motors import fit_motors, rotor_lag
+from tuning.spec import Manoeuvre, load_spec
+
+TS = 0.004
+UNIT = st.floats(-1, 1)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory):
+    """Experiments read from ULog files, by airframe."""
+    folder, found = tmp_path_factory.mktemp("motors"), {}
+    for name, amplitude in (("adam0_nominal", 0.15), ("adam0_perturbed", 0.15), ("antr", 0.05)):
+        vehicle = load_airframe(name)
+        task = excitation_flight(20.0, amplitude, 50.0, TS, np.random.default_rng(4))
+        gains = vehicle.default_gains()
+        flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), task, 4)
+        save_flight(folder / f"{name}.ulg", flight, vehicle.airframe, gains)
+        found[name] = read_log(folder / f"{name}.ulg")
+    return found
+
+
+@pytest.mark.parametrize("name", ["adam0_nominal", "adam0_perturbed", "antr"])
+def test_a_log_says_how_the_allocator_moves_the_motors(logs, name):
+    motors, airframe = logs[name].motors, load_airframe(name).airframe
+    assert motors.mixer == pytest.approx(airframe.allocation().mixer[:, :2], abs=0.005)
+    weight = airframe.plant().mass * 9.80665 / (4 * airframe.motors.thrust_max)
+    assert motors.hover.mean() == pytest.approx(weight, rel=0.02)
+
+
+def test_the_motor_that_carries_a_mass_hovers_higher(logs):
+    hover = logs["adam0_perturbed"].motors.hover
+    assert np.argmax(hover) == 2
+    assert hover[2] - hover.mean() > 0.05
+
+
+@pytest.mark.parametrize("name", ["adam0_nominal", "adam0_perturbed", "antr"])
+def test_the_lag_of_the_rotors_is_a_pole_of_the_identified_plant(logs, name):
+    lag = rotor_lag(identify_rates(logs[name])[0].plant)
+    # Half a period is the hold's.
+    assert lag == pytest.approx(load_airframe(name).airframe.motors.time_constant, rel=0.08)
+
+
+def test_the_mixer_of_linear_commands_is_found_exactly():
+    rng = np.random.default_rng(1)
+    mixer = rng.normal(size=(6, 2))
+    u = 0.05 * rng.normal(size=(500, 2)) + [0.02, -0.01]
+    commands = 0.5 + (u - np.median(u, axis=0)) @ mixer.T
+    motors = fit_motors(u, commands)
+    assert motors.mixer == pytest.approx(mixer, abs=1e-9)
+    assert motors.hover == pytest.approx(np.full(6, 0.5), abs=1e-9)
+
+
+def test_commands_that_the_moment_does_not_explain_are_not_taken():
+    rng = np.random.default_rng(2)
+    u, other = 0.1 * rng.normal(size=(500, 2)), 0.1 * rng.normal(size=(500, 2))
+    commands = 0.5 + other @ np.array([[0.5, 0.5, -0.5, -0.5], [0.5, -0.5, 0.5, -0.5]])
+    assert fit_motors(u, commands) is None
+    assert fit_motors(u, np.full((500, 4), np.nan)) is None
+    assert fit_motors(u[:20], commands[:20]) is None
+
+
+@given(roll=UNIT, pitch=UNIT, collective=st.floats(0.05, 1))
+@settings(max_examples=300, deadline=None)
+def test_commands_are_those_of_the_flown_allocator(roll, pitch, collective):
+    """Two statements of one law: the bench's, for any geometry and with yaw, and the prediction's."""
+    allocation = load_airframe("adam0").airframe.allocation()
+    flown, unallocated = np.zeros(4), np.zeros(3)
+    allocate(np.array([roll, pitch, 0.0]), collective, allocation, flown, unallocated)
+    predicted = np.zeros(4)
+    share = allocated(allocation.mixer[:, :2] @ np.array([roll, pitch]), np.full(4, collective), predicted)
+    assert predicted == pytest.approx(flown, abs=1e-7)
+    if abs(share - 1) > 1e-6 and roll * pitch != 0:
+        assert bool(unallocated[:2].any()) == (share < 1)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axis):
+    log, vehicle = logs["adam0_nominal"], load_airframe("adam0_nominal")
+    gains = dataclasses.replace(tune(log, load_spec(method="siso")), certificate=None)
+    gains = dataclasses.replace(gains, Kp_i=1.6 * gains.Kp_i, Kd_i=2.0 * gains.Kd_i)
+    task = doublet(("roll", "pitch")[axis], np.radians(40.0), 0.45, TS)
+    flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), task, 0, noise=False)
+    flown = flight.truth["attitude"][slice(*task.window), axis]
+    assert flight.record["commands"][slice(*task.window), :4].min() == 0  # a motor stood
+
+    def deviation_deg(model):
+        angles, _ = model.fly(GainStack.of(gains))
+        return np.degrees(np.sqrt(np.mean((angles[axis, 0, :, axis] - flown) ** 2)))
+
+    model = doublet_model(log, Manoeuvre(amplitude_deg=40.0, period_s=0.45))
+    without = deviation_deg(dataclasses.replace(model, motors=None))
+    assert deviation_deg(model) < 0.25  # of 40
+    assert deviation_deg(model) < without / 3
+
+
+def test_the_drawn_out_switch_of_the_integral_hardly_changes_a_doublet(logs):
+    log = logs["adam0_nominal"]
+    model = doublet_model(log, Manoeuvre(amplitude_deg=40.0, period_s=0.45))
+    stack = GainStack.of(tune(log))
+    sharp, soft = model.fly(stack)[0], model.fly(stack, 0.05)[0]
+    assert 0 < np.degrees(np.abs(soft - sharp).max()) < 0.5
+
+
+def test_commands_that_set_the_speed_are_not_thrust_fractions(logs, tmp_path):
+    """PX4 without its thrust curve, THR_MDL_FAC 0: the log is read, but not for the motors, and a tuning says so."""
+    from pyulog import ULog
+
+    vehicle = load_airframe("adam0_nominal")
+    task = excitation_flight(5.0, 0.15, 50.0, TS, np.random.default_rng(4))
+    flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, vehicle.default_gains()), task, 4)
+    path = tmp_path / "speed.ulg"
+    path.write_bytes(record_flight(flight, vehicle.airframe, vehicle.default_gains()))
+    assert read_log(path).motors is not None
+    log = ULog(str(path))
+    topics = {
+        data.name: {"xyz": np.column_stack([data.data[f"xyz[{i}]"] for i in range(3)])}
+        for data in log.data_list
+        if data.name in ("vehicle_torque_setpoint", "vehicle_angular_velocity")
+    }
+    topics |= {
+        name: {field: np.column_stack([log.get_dataset(name).data[f"{field}[{i}]"] for i in range(4)])}
+        for name, field in (("vehicle_attitude", "q"), ("actuator_motors", "control"))
+    }
+    excitation = log.get_dataset("debug_vect").data
+    letters = np.full(len(excitation["x"]), b"MIMO_EXC", "S10")
+    topics["debug_vect"] = {"x": excitation["x"], "y": excitation["y"], "name": letters}
+    parameters = {**log.initial_parameters, "THR_MDL_FAC": 0.0}
+    path.write_bytes(ulog_bytes(TS, topics, parameters, {"sys_name": "PX4"}))
+    read = read_log(path)
+    assert read.motors is None
+    spec = load_spec(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
+    assert NO_MOTORS in tune(read, spec).provenance["warnings"]
+    assert NO_MOTORS not in tune(logs["adam0_nominal"], spec).provenance["warnings"]

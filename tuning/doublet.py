@@ -1,0 +1,117 @@
+"""A doublet predicted from a log: the flown difference equation around the plant and the motors that the log gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.experiment import Experiment
+from tuning.gain_stack import GainStack
+from tuning.gains import Gains
+from tuning.identification import identify_rates
+from tuning.motors import Motors, rotor_lag
+from tuning.spec import Manoeuvre
+from tuning.statespace import StateSpace
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DoubletModel:
+    """A doublet around an identified plant.
+
+    Attributes
+    ----------
+    plant : StateSpace
+        From moment to body rates.
+    trim : (2,) array
+        Moment that holds the vehicle level.
+    setpoint : (N,) array, rad
+        Of the axis that moves; the other's is zero.
+    motors : Motors or None
+        Behind the moment; None: it is given whatever it is.
+    """
+
+    plant: StateSpace
+    trim: Signal
+    setpoint: Signal
+    motors: Motors | None = None
+
+    def fly(self, stack: GainStack, soft: float = 0.0) -> tuple[Signal, Signal]:
+        """Doublets on roll and on pitch under each of several gain sets, without noise.
+
+        Parameters
+        ----------
+        stack : GainStack
+        soft : float
+            Moment over which the anti-windup's switch is drawn out, so that angles depend on gains without a jump.
+
+        Returns
+        -------
+        angles, moments : (2, sets, N, 2) arrays, rad, dimensionless
+            First index: the axis that moves.
+        """
+        from tuning.compiled_doublet import fly  # takes longer to import than all of the rest
+
+        gains, plant = stack.stacked(), self.plant
+        angles, moments = (np.empty((2, len(gains), len(self.setpoint), 2)) for _ in range(2))
+        matrices = (np.ascontiguousarray(matrix) for matrix in (plant.A, plant.B, plant.C))
+        limited = (gains, stack.limits, stack.Ts, stack.derivative_pole, soft)
+        fly(*matrices, self.trim, self._motors(), self.setpoint, *limited, angles, moments)
+        return angles, moments
+
+    def _motors(self) -> tuple[Signal, Signal, Signal, float]:
+        """What the compiled doublet takes."""
+        if self.motors is None:
+            return np.empty((0, 2)), np.empty((2, 0)), np.empty(0), 0.0
+        lag = rotor_lag(self.plant)
+        inverse = np.ascontiguousarray(np.linalg.pinv(self.motors.mixer))
+        return self.motors.mixer, inverse, self.motors.hover, float(np.exp(-self.plant.Ts / lag)) if lag else 0.0
+
+    def spectral_radius(self, stack: GainStack) -> float:
+        """Of the first set: the larger of the rate loop's alone and of the cascade's, limits aside."""
+        Kp_o, Kp_i, Ki_i, Kd_i, Kff_i = stack.stacked()[0]
+        n, Ts, a = len(self.plant.A), stack.Ts, stack.derivative_pole
+        start = np.eye(n + 8)
+        state, rate, slope, integral, angle = np.split(start, [n, n + 2, n + 4, n + 6])
+        now = self.plant.C @ state
+        angle = angle + Ts / 2 * (now + rate)
+        slope = a * slope + (1 - a) / Ts * (now - rate)
+        radius = 0.0
+        for wanted in (np.zeros_like(now), -Kp_o @ angle):
+            summed = integral + Ts * Ki_i @ (wanted - now)
+            moment = Kp_i @ (wanted - now) - Kd_i @ slope + Kff_i @ wanted + summed
+            step = np.vstack([self.plant.A @ state + self.plant.B @ moment, now, slope, summed, angle])
+            if not wanted.any():  # nobody looks at the angle
+                step = step[:-2, :-2]
+            radius = max(radius, float(np.abs(np.linalg.eigvals(step)).max()))
+        return radius
+
+
+def doublet_model(experiment: Experiment, manoeuvre: Manoeuvre) -> DoubletModel:
+    """The manoeuvre around the plant that PBSID finds in an experiment.
+
+    Raises
+    ------
+    TuningError
+        When the log is too short or not excited.
+    """
+    half = round(manoeuvre.period_s / 2 / experiment.Ts)
+    height = np.radians(manoeuvre.amplitude_deg) * np.ones(half)
+    u = np.concatenate([experiment.u[start:stop] for start, stop in experiment.segments])
+    plant = identify_rates(experiment)[0].plant
+    return DoubletModel(plant, np.median(u, axis=0), np.concatenate([height, -height]), experiment.motors)
+
+
+def effort(gains: Gains, model: DoubletModel) -> tuple[float, float]:
+    """Predicted RMS of both moments together over the roll and over the pitch doublet."""
+    roll, pitch = moment_rms(model.fly(GainStack.of(gains))[1])[:, 0]
+    return float(roll), float(pitch)
+
+
+def moment_rms(moments: Signal) -> Signal:
+    """RMS of both moments (..., N, 2) together over the N samples, (...)."""
+    power: Signal = np.sqrt(np.mean(np.sum(moments**2, axis=-1), axis=-1))
+    return power
