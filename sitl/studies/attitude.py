@@ -20,7 +20,7 @@ from sitl.studies.autotune import autotune
 from sitl.studies.benchmarks import TABLES
 from sitl.studies.optimum import Task, best_gains, moment_rms
 from tuning.cascade import measured_plant, tune
-from tuning.certificate import Thresholds, certify, integral_action
+from tuning.certificate import DENSE, Thresholds, certify, integral_action
 from tuning.closed_loop import PlantResponse, longest_run
 from tuning.doublet import doublet_model, effort
 from tuning.experiment import Experiment
@@ -283,7 +283,7 @@ def optimum(study: Study) -> dict[str, Gains]:
     # The margins are those of the true plant, as a log without noise shows it, in the band of a log with noise and less
     # what that leaves open.
     plant = measured_plant(experiment(study, study.airframe, TYPICAL[0], noise=False)[1])
-    plant = plant.at(sorted(bands, key=len)[len(bands) // 2])
+    plant = plant.at(sorted(bands, key=len)[len(bands) // 2]).interpolated(DENSE)
     vehicle, _, library = _bench(study.airframe)
     task = Task(
         vehicle.airframe,
