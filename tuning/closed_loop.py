@@ -110,7 +110,7 @@ class PlantResponse:
 
         w G_i and w^2 G_o hardly change from one to the next: they are interpolated. All else is the nearest's.
         """
-        counts = np.ceil(np.log(self.omega[1:] / self.omega[:-1]) / np.log1p(share)).astype(int)
+        counts = np.ceil(np.diff(self.omega) / (share * self.omega[:-1])).astype(int)
         place = np.concatenate([*(k + np.arange(n) / n for k, n in enumerate(counts)), [len(counts)]])
         index = np.arange(len(self.omega))
         omega = np.interp(place, index, self.omega)

@@ -11,7 +11,7 @@ from sitl.autopilot import Autopilot
 from sitl.loop import fly
 from sitl.scenario import excitation_flight
 from tuning.cascade import certify_from_log, tune
-from tuning.certificate import CERTIFIED, NOT_CERTIFIED, THIN, UNSTABLE, certify
+from tuning.certificate import CERTIFIED, DENSE, NOT_CERTIFIED, THIN, UNSTABLE, certify, loop_above
 from tuning.closed_loop import PlantResponse, cascade_loop, plant_response
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
@@ -133,6 +133,59 @@ def test_no_unstable_set_is_certified_and_most_well_damped_ones_are(flights):
     assert wrong == 0
     assert good >= 15
     assert certified >= 0.8 * good
+
+
+def test_a_loop_whose_peak_lies_between_two_frequencies_is_not_certified(flights):
+    """Found by the random sets above: it oscillates for ever, and no frequency of the response is near to tell."""
+    _, plant, linear = flights["adam0"]
+    gains = dataclasses.replace(
+        load_airframe("adam0").default_gains(),
+        Kp_o=np.array([[3.60637712, 0.5622347], [-0.21474633, 2.40205198]]),
+        Kp_i=np.array([[0.04127214, 0.01336016], [-0.00997128, 0.0399068]]),
+        Ki_i=np.array([[0.42462993, 0.01774655], [-0.0068396, 0.37196562]]),
+        Kd_i=np.array([[0.00359859, -0.00103487], [-0.00096178, 0.00885978]]),
+    )
+    assert linear.spectral_radius(gains) > 1
+    coarse = np.linalg.inv(np.eye(2) + cascade_loop(gains, plant).L_u)
+    fine = np.linalg.inv(np.eye(2) + cascade_loop(gains, plant.interpolated(DENSE)).L_u)
+    seen, there = (np.linalg.norm(S, ord=2, axis=(1, 2)).max() for S in (coarse, fine))
+    assert there > 1.5 * seen
+    assert certify(gains, plant, *MODELS).verdict not in (CERTIFIED, THIN)
+
+
+def test_the_response_between_its_frequencies_is_that_of_a_body(flights):
+    """Exact for a rigid body, and near for a vehicle with motors."""
+    omega = np.arange(2.0, 100.0, 2.0)
+    K = np.array([[80.0, -8.0], [-7.0, 90.0]])
+    empty = np.zeros((len(omega), 6, 6)), np.zeros((len(omega), 2, 2))
+    s = 1j * omega[:, None, None]
+    body = PlantResponse(omega, K / s, K / s**2, *empty, np.ones((len(omega), 2)), TS).interpolated(0.05)
+    s = 1j * body.omega[:, None, None]
+    assert body.G_i == pytest.approx(K / s, rel=1e-12)
+    assert body.G_o == pytest.approx(K / s**2, rel=1e-12)
+    assert np.max(body.omega[1:] / body.omega[:-1]) < 1.05 + 1e-9
+    assert set(omega) <= set(body.omega)
+    linear = flights["adam0"][2]
+    between = linear.response(omega).interpolated(0.05)
+    true = linear.response(between.omega).G_i
+    error = np.linalg.norm(between.G_i - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
+    assert error.max() < 0.01
+
+
+def test_what_the_loop_reaches_above_the_band_is_less_moved_by_noise(flights):
+    """w |G| does not rise: the fit by such a sequence is nearer to the truth than the last value alone."""
+    linear, gains = flights["adam0"][2], load_airframe("adam0").default_gains()
+    plant, rng = linear.response(np.linspace(2.0, 110.0, 50)), np.random.default_rng(3)
+    true = loop_above(gains, plant)[-1]
+    fitted, last = [], []
+    for _ in range(100):
+        shape = (50, 2, 2)
+        noise = (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * 0.1
+        noisy = dataclasses.replace(plant, G_i=plant.G_i + noise * np.abs(plant.G_i).max(axis=(1, 2), keepdims=True))
+        fitted.append(loop_above(gains, noisy)[-1] / true - 1)
+        last.append(loop_above(gains, noisy.at([-1]))[-1] / true - 1)
+    assert np.std(fitted) < 0.8 * np.std(last)
+    assert abs(np.mean(fitted)) < abs(np.mean(last))
 
 
 def test_the_peak_of_the_sensitivity_is_the_true_one(flights):
