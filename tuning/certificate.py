@@ -31,6 +31,8 @@ from tuning.reference import ReferenceModel
 
 #: Above the band the rate loop's gain may be at most this, if the plant falls like an integrator from its end on.
 HIGH_FREQUENCY_LOOP = 0.5
+#: Where the band begins the sensitivity may at most be this: the loop must be in charge of what nobody measured below.
+LOW_FREQUENCY_SENSITIVITY = 0.5
 #: Neighbouring frequencies differ by this share at most: a loop at the limit has a peak that is narrower than the
 #: response's own grid.
 DENSE = 0.05
@@ -246,6 +248,14 @@ def _beyond_the_band(gains: Gains, plant: PlantResponse, loop: float) -> str:
         return (
             f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the whole cascade's gain may still reach 1: "
             "excite a wider band"
+        )
+    S = np.linalg.inv(np.eye(2) + cascade_loop(gains, plant.at(np.array([0]))).L_u[0])
+    remaining = float(np.linalg.norm(S, ord=2))
+    if remaining > LOW_FREQUENCY_SENSITIVITY:
+        return (
+            f"excitation begins at {plant.omega[0]:.1f} rad/s, where the sensitivity is still {remaining:.2f} (at most "
+            f"{LOW_FREQUENCY_SENSITIVITY:g}), and nothing is known of the loop below: excite lower frequencies, or ask "
+            "for a faster attitude loop"
         )
     if np.any(gains.Ki_i) and integral_action(gains.Ki_i, plant) <= 0:
         return (

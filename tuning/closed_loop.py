@@ -108,21 +108,21 @@ class PlantResponse:
     def interpolated(self, share: float) -> PlantResponse:
         """The response with frequencies between its own, none further from the next than a share of itself.
 
-        w G_i and w^2 G_o hardly change from one to the next: they are interpolated. All else is the nearest's.
+        A damped body has G_i^-1 and G_o^-1 / w that are linear in w: they are interpolated. All else is the nearest's.
         """
         counts = np.ceil(np.diff(self.omega) / (share * self.omega[:-1])).astype(int)
         place = np.concatenate([*(k + np.arange(n) / n for k, n in enumerate(counts)), [len(counts)]])
-        index = np.arange(len(self.omega))
-        omega = np.interp(place, index, self.omega)
-        low = np.minimum(place.astype(int), len(index) - 2)
+        omega = np.interp(place, np.arange(len(self.omega)), self.omega)
+        low = np.minimum(place.astype(int), len(counts) - 1)
         part, new, old = (place - low)[:, None, None], omega[:, None, None], self.omega[:, None, None]
 
-        def between(smooth: Complex) -> Complex:
-            value: Complex = (1 - part) * smooth[low] + part * smooth[low + 1]
+        def between(G: Complex) -> Complex:
+            inverse = np.linalg.inv(G)
+            value: Complex = np.linalg.inv((1 - part) * inverse[low] + part * inverse[low + 1])
             return value
 
         dense = self.at(np.rint(place).astype(int))
-        return replace(dense, omega=omega, G_i=between(old * self.G_i) / new, G_o=between(old**2 * self.G_o) / new**2)
+        return replace(dense, omega=omega, G_i=between(self.G_i), G_o=between(old * self.G_o) / new)
 
     def draw(self, generator: np.random.Generator) -> PlantResponse:
         """Another plant that the experiment allows, from its error distribution."""

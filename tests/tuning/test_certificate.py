@@ -153,23 +153,41 @@ def test_a_loop_whose_peak_lies_between_two_frequencies_is_not_certified(flights
     assert certify(gains, plant, *MODELS).verdict not in (CERTIFIED, THIN)
 
 
+def test_a_loop_that_is_unstable_below_the_excitation_is_not_certified(flights):
+    """Found by random sets, too: with little gain it oscillates at 0.75 rad/s, where the experiment says nothing."""
+    _, plant, linear = flights["adam0_perturbed"]
+    gains = dataclasses.replace(
+        load_airframe("adam0_perturbed").default_gains(),
+        Kp_o=np.array([[3.9007844, -0.984454], [0.2805008, 2.474772]]),
+        Kp_i=np.array([[0.01589068, 0.003974913], [0.01549479, 0.02283862]]),
+        Ki_i=np.array([[0.006566379, 0.02338456], [-0.006409221, 0.01000748]]),
+        Kd_i=np.array([[0.002297327, 9.970663e-05], [0.0004827753, 0.00801818]]),
+    )
+    assert linear.spectral_radius(gains) > 1.0005
+    certificate = certify(gains, plant, *MODELS)
+    assert certificate.verdict == NOT_CERTIFIED
+    assert "excitation begins at 1.3 rad/s, where the sensitivity is still" in certificate.reason
+
+
 def test_the_response_between_its_frequencies_is_that_of_a_body(flights):
-    """Exact for a rigid body, and near for a vehicle with motors."""
-    omega = np.arange(2.0, 100.0, 2.0)
+    """Exact for a body with damping, and near for a vehicle with motors."""
+    omega = np.arange(1.3, 100.0, 1.3)
     K = np.array([[80.0, -8.0], [-7.0, 90.0]])
     empty = np.zeros((len(omega), 6, 6)), np.zeros((len(omega), 2, 2))
     s = 1j * omega[:, None, None]
-    body = PlantResponse(omega, K / s, K / s**2, *empty, np.ones((len(omega), 2)), TS).interpolated(0.05)
+    body = PlantResponse(omega, K / (s + 1.5), K / (s + 1.5) / s, *empty, np.ones((len(omega), 2)), TS).interpolated(
+        0.05
+    )
     s = 1j * body.omega[:, None, None]
-    assert body.G_i == pytest.approx(K / s, rel=1e-12)
-    assert body.G_o == pytest.approx(K / s**2, rel=1e-12)
+    assert body.G_i == pytest.approx(K / (s + 1.5), rel=1e-12)
+    assert body.G_o == pytest.approx(K / (s + 1.5) / s, rel=1e-12)
     assert np.max(body.omega[1:] / body.omega[:-1]) < 1.05 + 1e-9
     assert set(omega) <= set(body.omega)
     linear = flights["adam0"][2]
     between = linear.response(omega).interpolated(0.05)
     true = linear.response(between.omega).G_i
     error = np.linalg.norm(between.G_i - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
-    assert error.max() < 0.01
+    assert error.max() < 0.02
 
 
 def test_what_the_loop_reaches_above_the_band_is_less_moved_by_noise(flights):
