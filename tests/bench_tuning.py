@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from sitl.studies.benchmark_studies import gain_spread
 from sitl.studies.benchmarks import lv100, numerical_example
-from sitl.studies.reproduce import gain_spread
 from tests.tuning.literal import literal_cascade
 from tuning.cascade import estimate, measured_plant, tune
 from tuning.certificate import certify

@@ -1,6 +1,7 @@
 """Who may import whom: no arrow points upwards."""
 
 import ast
+import importlib
 from pathlib import Path
 
 import pytest
@@ -37,3 +38,8 @@ def test_only_studies_use_how_gains_are_found_and_only_the_front_door_uses_studi
 
 def test_the_templates_hold_no_python():
     assert not list((TOP / "firmware_templates").rglob("*.py"))
+
+
+def test_the_benchmarks_can_be_run():
+    """No test runs them: what they import may not move away unseen."""
+    assert importlib.import_module("tests.bench").main

@@ -20,7 +20,7 @@ from sitl.studies.autotune import autotune
 from sitl.studies.benchmarks import TABLES
 from sitl.studies.optimum import Task, best_gains, moment_rms
 from tuning.cascade import measured_plant, tune
-from tuning.certificate import DENSE, Thresholds, certify, integral_action
+from tuning.certificate import DENSE, Thresholds, certify, integral_action, sensitivity_peak
 from tuning.closed_loop import PlantResponse, longest_run
 from tuning.doublet import doublet_model, effort
 from tuning.experiment import Experiment
@@ -266,13 +266,11 @@ def optimum(study: Study) -> dict[str, Gains]:
     those margins and as much effort as it takes.
     """
     found, errors, bands = [], [], []
-    inner, outer = study.models(REFINED, _bench(study.airframe)[1].Ts)
     for seed in TYPICAL:
         _, log, siso_log = logs(study, seed)
         plant = measured_plant(log)
         found.append(tune_all(study, log, siso_log, plant))
-        certificate = certify(found[-1][REFINED], plant, [inner] * 2, [outer] * 2)
-        errors.append(certificate.figures["Ms_error"])
+        errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
         bands.append(longest_run(np.flatnonzero(plant.coherent())))
     # Without noise a vehicle in balance needs no hover, and what comes after the doublet does not count.
     doublets = study.doublets(log.Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
@@ -289,7 +287,7 @@ def optimum(study: Study) -> dict[str, Gains]:
         vehicle.airframe,
         library,
         doublets,
-        outer,
+        study.models(BEST, log.Ts)[1],
         plant,
         Thresholds.Ms - float(np.median(errors)),
         [float(rms) for rms in np.median(spent, axis=0)],

@@ -33,9 +33,9 @@ METHODS = (
     f"{DEFAULT}: the gains that flew the experiment. {AUTOTUNE}: one axis at a time by the rule of PX4's autotune, "
     f"from the same log. {SISO} and {MIMO}: VRFT with the thesis' reference models. {REFINED}: {MIMO} refined on a "
     f"model from the same log, for this doublet, with {EFFORT - 1:.0%} more effort than {SISO} is predicted to need. "
-    f"{BEST}: all gains found by direct optimisation in the bench, with the effort that the first seed's {REFINED} "
-    "spends there, an Ms that the log would certify and the integral action of the default gains; no method knows the "
-    f"true plant. {BOUND}: with as much effort as it takes. Effort: RMS of both moments together."
+    f"{BEST}: all gains found by direct optimisation in the bench, with the effort that {REFINED} spends there (median "
+    "of the first seeds) and the certificate's limits on the true plant, Ms less what a log leaves open of it; no "
+    f"method knows the true plant. {BOUND}: with as much effort as it takes. Effort: RMS of both moments together."
 )
 SPREAD_COLUMNS = ("gain", *ELEMENTS)
 COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].partition(":")[0] for text in COSTS.values()))

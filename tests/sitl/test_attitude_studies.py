@@ -70,7 +70,7 @@ def test_following_is_near_the_best_possible(found):
 def test_the_best_on_the_true_plant_keeps_its_limits_and_is_the_best_within_them(found, name):
     statistics = found[name]
     for axis in AXES:
-        # 6 % without noise; what brisk gains make of the noise comes on top.
+        # 5 % without noise; what brisk gains make of the noise comes on top.
         assert statistics.median(BEST, axis, "effort_rms") < EFFORT * statistics.median(SISO, axis, "effort_rms")
         for method in (SISO, MIMO):
             assert statistics.median(BEST, axis, "J_M_o") < statistics.median(method, axis, "J_M_o")
