@@ -22,7 +22,6 @@ from tuning.closed_loop import (
     PlantResponse,
     cascade_loop,
     inner_controllers,
-    longest_run,
     singular_values,
 )
 from tuning.gain_stack import GainStack
@@ -178,7 +177,7 @@ def _certified_band(gains: Gains, plant: PlantResponse) -> tuple[PlantResponse, 
     """The longest coherent stretch, up to where the loop is small for good: nothing more has to be known above, and
     the noisy end of the band is left out. With it what the loop's gain may still reach above.
     """
-    plant = plant.at(longest_run(np.flatnonzero(plant.coherent())))
+    plant = plant.at(plant.coherent_run())
     if len(plant.omega) < MIN_FREQUENCIES:
         return plant, np.inf
     above = loop_above(gains, plant)
@@ -279,10 +278,10 @@ def loop_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
     C_e, C_d = inner_controllers(gains, grid)
     falling = singular_values(C_e + C_d)[0] / grid
     highest = np.maximum.accumulate(falling[..., ::-1], axis=-1)[..., ::-1][..., : len(plant.omega)]
-    rising: Signal = singular_values(plant.G_i)[0] * plant.omega
-    top = int(np.argmax(rising))
-    rising[top:] = isotonic_regression(rising[top:], increasing=False).x
-    reached: Signal = rising * highest
+    gain: Signal = singular_values(plant.G_i)[0] * plant.omega
+    top = int(np.argmax(gain))
+    gain[top:] = isotonic_regression(gain[top:], increasing=False).x
+    reached: Signal = gain * highest
     return reached
 
 

@@ -65,6 +65,10 @@ class PlantResponse:
         """Where the excitation explains both rates, (K,)."""
         return np.asarray(np.all(self.coherence > COHERENT, axis=1))
 
+    def coherent_run(self) -> NDArray[np.intp]:
+        """The longest stretch of coherent frequencies, as indices."""
+        return longest_run(np.flatnonzero(self.coherent()))
+
     def band(self, axis: int) -> tuple[float, float] | None:
         """Where the excitation explains an axis' rate, rad/s: the longest stretch; None: nowhere."""
         run = longest_run(np.flatnonzero(self.coherence[:, axis] > COHERENT))
@@ -156,6 +160,11 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float) -> 
     T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
     if np.any(np.linalg.matrix_rank(T_u) < 2):
         raise TuningError("not excited: the external signal does not move both moments independently")
+    for name, T in (("rates", T_i), ("angles", T_o)):
+        if np.any(np.linalg.matrix_rank(T) < 2):
+            raise TuningError(
+                f"{experiment.source}: roll and pitch {name} are one signal; check what was logged as pitch"
+            )
     inverse = np.linalg.inv(T_u)
     return PlantResponse(
         omega=found.omega,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,9 +60,10 @@ class DoubletModel:
         angles, moments = (np.empty((2, len(gains), len(self.setpoint), 2)) for _ in range(2))
         matrices = (np.ascontiguousarray(matrix) for matrix in (plant.A, plant.B, plant.C))
         limited = (gains, stack.limits, stack.Ts, stack.derivative_pole, soft)
-        fly(*matrices, self.trim, self._motors(), self.setpoint, *limited, angles, moments)
+        fly(*matrices, self.trim, self._motors, self.setpoint, *limited, angles, moments)
         return angles, moments
 
+    @cached_property
     def _motors(self) -> tuple[Signal, Signal, Signal, float]:
         """What the compiled doublet takes."""
         if self.motors is None:

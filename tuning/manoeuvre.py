@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.certificate import DENSE, HIGH_FREQUENCY_LOOP, Thresholds, integral_action, loop_above, sensitivity_peak
-from tuning.closed_loop import MIN_FREQUENCIES, PlantResponse, longest_run, singular_values, whole_loop
+from tuning.closed_loop import MIN_FREQUENCIES, PlantResponse, singular_values, whole_loop
 from tuning.descent import descend
 from tuning.doublet import DoubletModel, effort, moment_rms
 from tuning.errors import TuningError
@@ -77,7 +77,7 @@ def refine_cascade(
     TuningError
         When the measured response is known at too few frequencies, or no gains are found that keep the limits.
     """
-    known = response.at(longest_run(np.flatnonzero(response.coherent())))
+    known = response.at(response.coherent_run())
     if len(known.omega) < MIN_FREQUENCIES:
         raise TuningError(f"the excitation reaches only {len(known.omega)} frequencies, fewer than {MIN_FREQUENCIES}")
     wanted = np.zeros((2, 1, len(model.setpoint), 2))

@@ -18,10 +18,10 @@ from sitl.metrics import Performance, performance
 from sitl.scenario import AXES, Scenario, doublet, excitation_flight
 from sitl.studies.autotune import autotune
 from sitl.studies.benchmarks import TABLES
-from sitl.studies.optimum import Task, best_gains, moment_rms
+from sitl.studies.optimum import Task, best_gains, flown_effort
 from tuning.cascade import measured_plant, tune
 from tuning.certificate import DENSE, Thresholds, certify, integral_action, sensitivity_peak
-from tuning.closed_loop import PlantResponse, longest_run
+from tuning.closed_loop import PlantResponse
 from tuning.doublet import doublet_model, effort
 from tuning.experiment import Experiment
 from tuning.gains import Gains
@@ -227,13 +227,12 @@ def _safe(flight: Flight, airframe: str, scenario: Scenario) -> Flight:
 
 def experiment(study: Study, airframe: str, seed: int, noise: bool = True) -> tuple[Flight, Experiment]:
     """The excitation flight of a study on a vehicle, and its signals as they are logged; with or without noise."""
-    default = _bench(airframe)[1]
+    vehicle, default, _ = _bench(airframe)
     scenario = excitation_flight(*study.excitation, default.Ts, np.random.default_rng(seed))
     flight = _safe(fly_set(airframe, default, scenario, seed, noise), airframe, scenario)
     names = {"u": "moment", "y_i": "rates", "y_o": "attitude", "u_bar": "excitation", "r_o": "setpoint"}
     signals: Any = {name: flight.record[field][:, :2].astype(np.float64) for name, field in names.items()}
-    commands = flight.record["commands"][:, : len(_bench(airframe)[0].airframe.rotors)].astype(np.float64)
-    motors = fit_motors(signals["u"], commands)
+    motors = fit_motors(signals["u"], flight.record["commands"][:, : len(vehicle.airframe.rotors)].astype(np.float64))
     return flight, Experiment(Ts=default.Ts, source=f"{airframe}, seed {seed}", flown=default, motors=motors, **signals)
 
 
@@ -271,11 +270,11 @@ def optimum(study: Study) -> dict[str, Gains]:
         plant = measured_plant(log)
         found.append(tune_all(study, log, siso_log, plant))
         errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
-        bands.append(longest_run(np.flatnonzero(plant.coherent())))
+        bands.append(plant.coherent_run())
     # Without noise a vehicle in balance needs no hover, and what comes after the doublet does not count.
     doublets = study.doublets(log.Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
     spent = [
-        [moment_rms(fly_set(study.airframe, gains[REFINED], task, 0, noise=False)) for task in doublets]
+        [flown_effort(fly_set(study.airframe, gains[REFINED], task, 0, noise=False)) for task in doublets]
         for gains in found
     ]
     # The margins are those of the true plant, as a log without noise shows it, in the band of a log with noise and less

@@ -21,6 +21,7 @@ from sitl.scenario import Scenario
 from tuning.certificate import HIGH_FREQUENCY_LOOP, integral_action, loop_above
 from tuning.closed_loop import PlantResponse, cascade_loop
 from tuning.descent import MISSED, descend
+from tuning.doublet import moment_rms
 from tuning.gains import Gains
 from tuning.manoeuvre import OTHER_AXIS, typical_sizes
 from tuning.reference import ReferenceModel
@@ -94,17 +95,16 @@ class Task:
         allowed = self.effort or (np.inf, np.inf)
         loop = np.linalg.svd(np.eye(2) + cascade_loop(gains, self.plant).L_u, compute_uv=False)
         return residuals, [
-            *(1 - moment_rms(flight) / most for flight, most in zip(flights, allowed, strict=True)),
+            *(1 - flown_effort(flight) / most for flight, most in zip(flights, allowed, strict=True)),
             1 - float((1 / loop).max()) / self.peak,
             1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
             float(integral_action(gains.Ki_i, self.plant)) / self.integral - 1,
         ]
 
 
-def moment_rms(flight: Flight) -> float:
+def flown_effort(flight: Flight) -> float:
     """RMS of the roll and pitch moments together over the manoeuvre."""
-    moments = flight.record["moment"][slice(*flight.scenario.window), :2].astype(np.float64)
-    return float(np.sqrt(np.mean(np.sum(moments**2, axis=1))))
+    return float(moment_rms(flight.record["moment"][slice(*flight.scenario.window), :2].astype(np.float64)))
 
 
 def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:

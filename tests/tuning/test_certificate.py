@@ -169,6 +169,14 @@ def test_a_loop_that_is_unstable_below_the_excitation_is_not_certified(flights):
     assert "excitation begins at 1.3 rad/s, where the sensitivity is still" in certificate.reason
 
 
+@pytest.mark.parametrize("name", ["y_i", "y_o"])
+def test_a_log_with_roll_in_place_of_pitch_is_refused(flights, name):
+    log = flights["adam0"][0]
+    twice = dataclasses.replace(log, **{name: np.repeat(getattr(log, name)[:, :1], 2, axis=1)})
+    with pytest.raises(TuningError, match="are one signal"):
+        certify_from_log(twice, log.flown)
+
+
 def test_the_response_between_its_frequencies_is_that_of_a_body(flights):
     """Exact for a body with damping, and near for a vehicle with motors."""
     omega = np.arange(1.3, 100.0, 1.3)

@@ -11,9 +11,9 @@ from sitl.airframe import load_airframe
 from sitl.allocation import allocate
 from sitl.autopilot import Autopilot
 from sitl.loop import fly
-from sitl.recorder import record_flight, save_flight
+from sitl.recorder import save_flight
 from sitl.scenario import doublet, excitation_flight
-from sitl.ulog_writer import ulog_bytes
+from tests.tuning.logs.flights import make_flight, microseconds, px4_topics, write_ulog
 from tuning.cascade import NO_MOTORS, tune
 from tuning.compiled_doublet import allocated
 from tuning.doublet import doublet_model
@@ -123,33 +123,26 @@ def test_the_drawn_out_switch_of_the_integral_hardly_changes_a_doublet(logs):
     assert 0 < np.degrees(np.abs(soft - sharp).max()) < 0.5
 
 
-def test_commands_that_set_the_speed_are_not_thrust_fractions(logs, tmp_path):
-    """PX4 without its thrust curve, THR_MDL_FAC 0: the log is read, but not for the motors, and a tuning says so."""
-    from pyulog import ULog
+def test_commands_are_read_at_any_rate_and_only_where_they_are_thrust_fractions(tmp_path):
+    """A PX4 log with four of twelve motors, logged at 10 Hz; without its thrust curve commands set the speed."""
+    flight = make_flight()
+    mixer = np.sqrt(0.5) * np.array([[-1.0, 1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, -1.0]])
+    control = np.full((len(flight.t), 12), np.nan, np.float32)
+    control[:, :4] = 0.45 + flight.u @ mixer.T
+    motors = {
+        "timestamp": microseconds(flight.t + 0.0005),
+        "timestamp_sample": microseconds(flight.t),
+        "control": control,
+    }
+    topics = px4_topics(flight, actuator_motors={name: values[::25] for name, values in motors.items()})
+    read = read_log(write_ulog(tmp_path / "thrust.ulg", topics, {"THR_MDL_FAC": 0.3})).motors
+    middle = np.median(flight.u[::25], axis=0)
+    assert read.mixer == pytest.approx(mixer, abs=1e-5)
+    assert read.hover == pytest.approx(0.45 + mixer @ middle, abs=1e-5)
+    assert read_log(write_ulog(tmp_path / "speed.ulg", topics, {"THR_MDL_FAC": 0.0})).motors is None
 
-    vehicle = load_airframe("adam0_nominal")
-    task = excitation_flight(5.0, 0.15, 50.0, TS, np.random.default_rng(4))
-    flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, vehicle.default_gains()), task, 4)
-    path = tmp_path / "speed.ulg"
-    path.write_bytes(record_flight(flight, vehicle.airframe, vehicle.default_gains()))
-    assert read_log(path).motors is not None
-    log = ULog(str(path))
-    topics = {
-        data.name: {"xyz": np.column_stack([data.data[f"xyz[{i}]"] for i in range(3)])}
-        for data in log.data_list
-        if data.name in ("vehicle_torque_setpoint", "vehicle_angular_velocity")
-    }
-    topics |= {
-        name: {field: np.column_stack([log.get_dataset(name).data[f"{field}[{i}]"] for i in range(4)])}
-        for name, field in (("vehicle_attitude", "q"), ("actuator_motors", "control"))
-    }
-    excitation = log.get_dataset("debug_vect").data
-    letters = np.full(len(excitation["x"]), b"MIMO_EXC", "S10")
-    topics["debug_vect"] = {"x": excitation["x"], "y": excitation["y"], "name": letters}
-    parameters = {**log.initial_parameters, "THR_MDL_FAC": 0.0}
-    path.write_bytes(ulog_bytes(TS, topics, parameters, {"sys_name": "PX4"}))
-    read = read_log(path)
-    assert read.motors is None
-    spec = load_spec(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
-    assert NO_MOTORS in tune(read, spec).provenance["warnings"]
-    assert NO_MOTORS not in tune(logs["adam0_nominal"], spec).provenance["warnings"]
+
+def test_a_tuning_says_that_it_does_not_know_the_motors(logs):
+    log, spec = logs["adam0_nominal"], load_spec(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
+    assert NO_MOTORS in tune(dataclasses.replace(log, motors=None), spec).provenance["warnings"]
+    assert NO_MOTORS not in tune(log, spec).provenance["warnings"]

@@ -162,7 +162,8 @@ def _excitation(log: _Log) -> Series | None:
 
 def _commands(log: _Log) -> Series | None:
     """The commands of the motors that there are, at the gyro sample that they were made of."""
-    logged = tuple(name for name in MOTORS if name in log.fields(MOTORS_TOPIC))
+    fields = log.fields(MOTORS_TOPIC)
+    logged = tuple(name for name in MOTORS if name in fields)
     series = log.series(MOTORS_TOPIC, logged) if logged else None
     if series is None:
         return None
