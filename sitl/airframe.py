@@ -60,6 +60,16 @@ class Noise(_Table):
     rate: NotNegative
 
 
+class Frame(_Table):
+    """A frame that bends on roll and pitch, see `sitl.sensors.frame_mode`: Hz, share of critical damping, and modal gain
+    over that of the rigid body (negative where the sensors move against the rotors).
+    """
+
+    frequency_hz: Annotated[float, Field(gt=0, le=500)]
+    damping: Annotated[float, Field(gt=0, le=1)]
+    gain: Annotated[float, Field(ge=-2, le=2)]
+
+
 class Airframe(_Table):
     """A vehicle as its TOML file describes it.
 
@@ -81,7 +91,7 @@ class Airframe(_Table):
         Of the second-order low-pass that the measured rates pass; 0: none.
     gains : str
         The gains file that it flies under until tuned, beside the TOML file.
-    motors, rotors, noise, point_masses
+    motors, rotors, noise, point_masses, frame
         See their classes.
     """
 
@@ -99,6 +109,7 @@ class Airframe(_Table):
     rotors: Annotated[tuple[Rotor, ...], Field(min_length=4, max_length=16)]
     noise: Noise
     point_masses: tuple[PointMass, ...] = ()
+    frame: Frame | None = None
 
     def geometry(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rotor positions (n, 3), m, from the reference point, and spin (n,)."""

@@ -10,7 +10,7 @@ import typer
 
 AirframeArgument = Annotated[
     str,
-    typer.Argument(help="Airframe: adam0, adam0_boom, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file."),
+    typer.Argument(help="Airframe: adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file."),
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
 FaultOption = Annotated[

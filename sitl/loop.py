@@ -14,7 +14,7 @@ from sitl.compiled import compiled
 from sitl.injection import Injection
 from sitl.plant import HISTORY, ROTORS, STEP, advance, hover_state
 from sitl.scenario import Scenario
-from sitl.sensors import NOISES, SIZE, Sensors, euler_angles, low_pass, measure
+from sitl.sensors import NOISES, SIZE, Sensors, euler_angles, frame_mode, low_pass, measure
 
 CRASH_ANGLE = np.radians(60.0)
 CRASH_SECONDS = 0.3
@@ -155,7 +155,10 @@ class Simulator:
         self.generator = np.random.default_rng(seed)
         scale = 1.0 if noise else 0.0
         gyro = low_pass(airframe.gyro_cutoff_hz, Ts)
-        self.sensors = Sensors.sound(scale * airframe.noise.angle, scale * airframe.noise.rate, gyro)
+        frame = np.zeros(7)
+        if (mode := airframe.frame) is not None:
+            frame = np.append(frame_mode(mode.frequency_hz, mode.damping, mode.gain, Ts), 1 / Ts)
+        self.sensors = Sensors.sound(scale * airframe.noise.angle, scale * airframe.noise.rate, gyro, frame)
         self.seen = np.zeros(SIZE)
         self.before: NDArray[Any] = np.zeros(1, RECORD)
         self.restart(hover_state(self.plant, altitude))
@@ -166,8 +169,7 @@ class Simulator:
         self.history[:] = state[ROTORS] ** 2 * self.plant.thrust_coefficient / self.plant.thrust_max
         self.count = 0
         self.seen[:], self.before[:] = 0, np.zeros(1, RECORD)
-        sensors = self.sensors
-        sensors.memory[:], sensors.bias[:], sensors.stuck[:], sensors.failed[:] = 0, 0, False, False
+        self.sensors.restart(state[10:13])
 
     def noise(self, samples: int) -> NDArray[np.float64]:
         """The next standard normal numbers of the noise, (samples, 6); the same whatever the block size."""

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.signal import butter
 
 from sitl.compiled import inlined
@@ -51,6 +52,44 @@ def low_pass(cutoff_hz: float, Ts: float) -> NDArray[np.float64]:
     return np.concatenate([b, a[1:]]).astype(np.float64)
 
 
+def frame_mode(frequency_hz: float, damping: float, gain: float, Ts: float) -> NDArray[np.float64]:
+    """A frame that bends between the rotors and the sensors: one mode on roll and one on pitch.
+
+    The bend b obeys b'' + 2 damping w b' + w^2 b = gain a, a the body's angular acceleration; what is measured is the
+    body's angle plus b and its rate plus b': the rigid response times 1 + gain s^2 / (s^2 + 2 damping w s + w^2).
+    Solved exactly with the mean acceleration of a period held over it.
+
+    Parameters
+    ----------
+    frequency_hz : float, Hz
+        w / (2 pi); below half of the rate.
+    damping : float
+        Share of the critical one.
+    gain : float
+        Modal gain over that of the rigid body; 0: a rigid frame.
+    Ts : float, s
+        Period of the measurement.
+
+    Returns
+    -------
+    (6,) array
+        A row by row, then B, of (b, b') from one measurement to the next under the acceleration.
+
+    Raises
+    ------
+    SitlError
+        When the frequency is at half of the rate or above.
+    """
+    if not frequency_hz < 0.5 / Ts:
+        raise SitlError(
+            f"frame.frequency_hz: got {frequency_hz:g} Hz, expected below {0.5 / Ts:g} Hz, half of the control rate"
+        )
+    w = 2 * np.pi * frequency_hz
+    augmented = np.array([[0.0, 1.0, 0.0], [-(w**2), -2 * damping * w, gain], [0.0, 0.0, 0.0]])
+    moved = expm(augmented * Ts)
+    return np.concatenate([moved[:2, :2].ravel(), moved[:2, 2]]).astype(np.float64)
+
+
 class Sensors(NamedTuple):
     """Constants and memory of the measurement; the arrays may be changed between samples.
 
@@ -62,6 +101,10 @@ class Sensors(NamedTuple):
         From `low_pass`.
     memory : (2, 3) array
         Of that filter.
+    frame : (7,) array
+        From `frame_mode`, then 1 / Ts; all zeros for a rigid frame.
+    bend : (2, 3) array
+        Of the frame on roll and pitch: angle (rad), rate (rad/s), and the body's rate (rad/s) at the last measurement.
     bias : (3,) array, rad/s
         Added to the body rates.
     stuck, failed : (3,) arrays of bool
@@ -72,15 +115,26 @@ class Sensors(NamedTuple):
     rate_deviation: float
     gyro: NDArray[np.float64]
     memory: NDArray[np.float64]
+    frame: NDArray[np.float64]
+    bend: NDArray[np.float64]
     bias: NDArray[np.float64]
     stuck: NDArray[np.bool_]
     failed: NDArray[np.bool_]
 
     @staticmethod
-    def sound(angle_deviation: float, rate_deviation: float, gyro: NDArray[np.float64]) -> Sensors:
+    def sound(
+        angle_deviation: float, rate_deviation: float, gyro: NDArray[np.float64], frame: NDArray[np.float64]
+    ) -> Sensors:
         """Sensors without a fault."""
         nothing, never = np.zeros(3), np.zeros(3, np.bool_)
-        return Sensors(angle_deviation, rate_deviation, gyro, np.zeros((2, 3)), nothing, never, never.copy())
+        memory, bend = np.zeros((2, 3)), np.zeros((2, 3))
+        return Sensors(angle_deviation, rate_deviation, gyro, memory, frame, bend, nothing, never, never.copy())
+
+    def restart(self, rates: NDArray[np.float64]) -> None:
+        """Forget all that was measured, and every fault; the body turns with `rates` (3,), rad/s."""
+        for array in (self.memory, self.bend, self.bias, self.stuck, self.failed):
+            array[:] = 0
+        self.bend[:, 2] = rates[:2]
 
 
 @inlined
@@ -91,7 +145,16 @@ def measure(state, noise, sensors, seen):  # type: ignore[no-untyped-def]
     w, x, y, z = state[6], state[7], state[8], state[9]
     half = 0.5 * sensors.angle_deviation
     a, b, c = half * noise[0], half * noise[1], half * noise[2]
-    # A small rotation about the body axes, 1 + (a, b, c), then back to length one.
+    frame, bend = sensors.frame, sensors.bend
+    if frame[6] > 0.0:
+        for i in range(2):
+            acceleration = (state[10 + i] - bend[i, 2]) * frame[6]
+            angle, rate = bend[i, 0], bend[i, 1]
+            bend[i, 0] = frame[0] * angle + frame[1] * rate + frame[4] * acceleration
+            bend[i, 1] = frame[2] * angle + frame[3] * rate + frame[5] * acceleration
+            bend[i, 2] = state[10 + i]
+        a, b = a + 0.5 * bend[0, 0], b + 0.5 * bend[1, 0]
+    # A small rotation about the body axes, 1 + (a, b, c), noise and bend, then back to length one.
     qw, qx = w - x * a - y * b - z * c, x + w * a + y * c - z * b
     qy, qz = y + w * b + z * a - x * c, z + w * c + x * b - y * a
     scale = 1.0 / np.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
@@ -104,6 +167,8 @@ def measure(state, noise, sensors, seen):  # type: ignore[no-untyped-def]
     gyro, memory = sensors.gyro, sensors.memory
     for i in range(3):
         rate = state[10 + i] + sensors.rate_deviation * noise[3 + i] + sensors.bias[i]
+        if i < 2:
+            rate += bend[i, 1]
         filtered = gyro[0] * rate + memory[0, i]
         memory[0, i] = gyro[1] * rate - gyro[3] * filtered + memory[1, i]
         memory[1, i] = gyro[2] * rate - gyro[4] * filtered

@@ -13,14 +13,15 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.cascade import measured_plant, tune
+from tuning.cascade import tune
 from tuning.certificate import CERTIFIED
-from tuning.closed_loop import ACCURATE, PlantResponse, cascade_loop, doublet_spectrum
+from tuning.closed_loop import ACCURATE, cascade_loop, doublet_spectrum
 from tuning.errors import TuningError
-from tuning.experiment import Experiment
+from tuning.experiment import Experiment, external_signal
 from tuning.flexible import flexible_model, slowest_zero
 from tuning.gains import Gains
-from tuning.instruments import external_signal
+from tuning.measured import Measured
+from tuning.plant_response import PlantResponse
 from tuning.reference import second_order
 from tuning.spec import TuningSpec
 
@@ -112,7 +113,7 @@ def predict(
     The mean is over twice the doublet's length. Above the frequencies that the log knows nothing is counted, below
     them the plant goes on as a rigid body.
     """
-    known = plant.at(plant.coherent() & (plant.relative_error() < 3 * ACCURATE)).extended()
+    known = plant.at(plant.known() & (plant.relative_error() < 3 * ACCURATE)).extended()
     loop = cascade_loop(gains, known)
     omega = np.arange(RESOLUTION, known.omega[-1], RESOLUTION)
     signal = np.radians(doublet.amplitude_deg) * doublet_spectrum(omega, doublet.period_s)
@@ -160,7 +161,8 @@ def advise(
         When the log cannot be tuned from at all, no candidate is certified, or a non-minimum-phase zero forbids all.
     """
     doublet = doublet or Doublet()
-    plant = measured_plant(experiment)
+    measured = Measured(experiment)
+    plant = measured.response
     candidates: list[Candidate] = []
     cutoffs = _cutoffs(experiment, spec)
     zero = _slowest_zero(experiment, cutoffs[0])
@@ -174,7 +176,7 @@ def advise(
     for inner, cutoff in watch(list(product(product(bandwidths, DAMPINGS, DELAYS), cutoffs))):
         task = spec.model_copy(update={"inner": (inner, inner), "derivative_cutoff_hz": cutoff})
         try:
-            gains = tune(experiment, task, plant)
+            gains = tune(experiment, task, measured)
         except TuningError as error:
             candidates.append(Candidate(inner, cutoff, None, "refused", str(error)))
             continue

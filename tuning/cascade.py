@@ -9,22 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.certificate import certify
-from tuning.closed_loop import PlantResponse, plant_response, refine_outer
+from tuning.closed_loop import refine_outer
 from tuning.controller import rebuild_rate_setpoint
 from tuning.doublet import doublet_model
 from tuning.errors import NotMinimumPhaseError, TuningError
 from tuning.experiment import Experiment
 from tuning.gains import Gains, Limits, YawGains
 from tuning.gates import examine_band, examine_estimates, examine_saturation
-from tuning.instruments import Instruments, Stretches, align, excited_stretches, external_signal, instruments
+from tuning.instruments import Instruments, Stretches, align, excited_stretches, instruments
 from tuning.manoeuvre import refine_cascade
+from tuning.measured import Measured
 from tuning.reference import ReferenceModel
 from tuning.siso import siso_vrft
 from tuning.spec import TuningSpec
 from tuning.vrft import LoopEstimate, vrft
 
-#: Highest frequency of the measured response, rad/s.
-UPPER = 300.0
 #: Periods of a log and of a gain set may differ by this share.
 PERIOD_TOLERANCE = 0.02
 NO_MOTORS = (
@@ -199,7 +198,7 @@ def _rate_setpoint(
 def tune(
     experiment: Experiment,
     spec: TuningSpec | None = None,
-    plant: PlantResponse | None = None,
+    measured: Measured | None = None,
     repeat: Experiment | None = None,
 ) -> Gains:
     """Gains of the whole cascade: VRFT of both loops, quality gates, refinement, certificate.
@@ -210,8 +209,8 @@ def tune(
         One flight with excitation.
     spec : TuningSpec, optional
         Method and reference models.
-    plant : PlantResponse, optional
-        The experiment's `measured_plant`, when it is at hand already.
+    measured : Measured, optional
+        What the experiment says of the vehicle, when it is at hand already.
     repeat : Experiment, optional
         See `estimate`.
 
@@ -223,12 +222,14 @@ def tune(
     Raises
     ------
     TuningError
-        As `estimate`, or when the gains would be nonsense.
+        As `estimate`, or when the gains would be nonsense, or unstable.
     """
     spec = spec or TuningSpec()
+    measured = measured or Measured(experiment)
     found = estimate(experiment, spec, repeat)
-    plant = plant or measured_plant(experiment)
+    plant = measured.response
     warnings = [
+        *experiment.warnings,
         *found.warnings,
         *examine_saturation(experiment),
         *examine_estimates(experiment.source, found.stretches, found.inner),
@@ -248,7 +249,7 @@ def tune(
         try:
             gains = refine_cascade(
                 gains,
-                doublet_model(experiment, spec.manoeuvre),
+                doublet_model(measured, spec.manoeuvre),
                 plant,
                 outer_models,
                 terms=[*(TERMS[term] for term in spec.structure), "Kp_o"],
@@ -260,7 +261,6 @@ def tune(
             warnings.append(f"the gains are not refined for the manoeuvre: {error}")
     if deviations and "Kp_o" not in deviations:
         deviations["Kp_o"] = found.outer_deviation()
-    certificate = certify(gains, plant, spec.models("inner", experiment.Ts), outer_models, experiment.sha256)
     provenance = {
         "method": spec.method,
         "structure": spec.structure,
@@ -280,16 +280,26 @@ def tune(
         "samples": [found.inner[0].samples, found.outer[0].samples],
         "standard_deviation": {matrix: value.tolist() for matrix, value in deviations.items()},
     }
-    return replace(gains, certificate=certificate.as_table(), provenance=provenance)
+    return _certified(replace(gains, provenance=provenance), measured, spec)
 
 
-def measured_plant(experiment: Experiment) -> PlantResponse:
-    """The plant's frequency response from the experiment's external signal; see `plant_response`."""
-    return plant_response(experiment, external_signal(experiment)[0], UPPER)
+def _certified(gains: Gains, measured: Measured, spec: TuningSpec) -> Gains:
+    """The gains with their certificate."""
+    inner, outer = spec.models("inner", gains.Ts), spec.models("outer", gains.Ts)
+    sha256, thresholds = measured.experiment.sha256, spec.certificate
+    found = certify(gains, measured.response, inner, outer, sha256, thresholds, lambda: measured.model)
+    return found.bound_to(gains)
 
 
-def certify_from_log(experiment: Experiment, gains: Gains) -> Gains:
+def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | None = None) -> Gains:
     """The gains with a certificate made from a flight of the vehicle, whatever they come from.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    gains : Gains
+    spec : TuningSpec, optional
+        Whose thresholds count.
 
     Raises
     ------
@@ -309,12 +319,7 @@ def certify_from_log(experiment: Experiment, gains: Gains) -> Gains:
             f"{experiment.source}: one unit of moment stands for {theirs} N m (roll, pitch), in the gains for {ours}; "
             "convert the gains (mimopilot convert), or certify them with a log of their own allocator"
         )
-    plant = measured_plant(experiment)
-    spec = TuningSpec()
-    certificate = certify(
-        gains, plant, spec.models("inner", gains.Ts), spec.models("outer", gains.Ts), experiment.sha256
-    )
-    return replace(gains, certificate=certificate.as_table())
+    return _certified(gains, Measured(experiment), spec or TuningSpec())
 
 
 def _base(experiment: Experiment, spec: TuningSpec) -> Gains:

@@ -2,12 +2,13 @@
 
 The measured frequency response decides by Nyquist's count: det(n (I + L)) must not go round 0, for the rate loop
 alone and for the whole cascade cut at u, n = 1 - m cancelling the integrators at z = 1. Other plants that the
-experiment allows are drawn from its error; what happens to any of them counts.
+experiment allows are drawn from its error; what happens to any of them counts. Every frequency that the log knows
+counts: once the loop has become small it must stay small, or a mode of the frame is in it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -15,26 +16,28 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
-from tuning.closed_loop import (
-    DRAWS,
-    MIN_FREQUENCIES,
-    CascadeLoop,
-    PlantResponse,
-    cascade_loop,
-    inner_controllers,
-    singular_values,
-)
+from tuning import margins
+from tuning.closed_loop import CascadeLoop, cascade_loop, inner_controllers, model_spectral_radius, singular_values
+from tuning.errors import TuningError
 from tuning.gain_stack import GainStack
 from tuning.gains import Gains
+from tuning.plant_response import COHERENT, DRAWS, MIN_FREQUENCIES, PlantResponse
 from tuning.reference import ReferenceModel
+from tuning.rigid_body import RigidBody, rigid_body
+from tuning.statespace import StateSpace
+from tuning.thresholds import DEFAULT_THRESHOLDS, Thresholds
 
 #: Above the band the rate loop's gain may be at most this, if the plant falls like an integrator from its end on.
 HIGH_FREQUENCY_LOOP = 0.5
+#: A loop that has become small once may be larger again up to this ratio of frequencies: noise about the limit.
+ABOUT = 1.25
 #: Where the band begins the sensitivity may at most be this: the loop must be in charge of what nobody measured below.
 LOW_FREQUENCY_SENSITIVITY = 0.5
 #: Neighbouring frequencies differ by this share at most: a loop at the limit has a peak that is narrower than the
 #: response's own grid.
 DENSE = 0.05
+#: The identified model calls a loop unstable from this spectral radius on: a mode that grows by e in 8 s at 250 Hz.
+GROWING = 1.0005
 
 CERTIFIED = "certified"
 THIN = "stable, thin margin"
@@ -43,22 +46,6 @@ UNSTABLE = "unstable"
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Thresholds:
-    """What makes a margin thin.
-
-    Attributes
-    ----------
-    Ms : float
-        Largest peak of the sensitivity.
-    phase_deg : float, deg
-        Smallest phase margin.
-    """
-
-    Ms: float = 2.5
-    phase_deg: float = 25.0
 
 
 @dataclass(frozen=True)
@@ -73,26 +60,29 @@ class Certificate:
         Why, and the assumptions made outside of the band.
     figures : mapping
         ``Ms``, ``Ms_error`` (two standard errors), ``delta``, ``delta_error``, ``distance`` of the determinant to
-        0, ``disk_margin``, and by axis ``gain_margin_db``, ``phase_margin_deg``, ``delay_margin_ms``;
+        0, ``disk_margin``, and by axis ``gain_margin_db``, ``gain_margin`` (``exact``, ``at least``, ``not known``),
+        ``phase_margin_deg``, ``phase_margin_error_deg`` (two standard errors), ``delay_margin_ms``;
         ``simultaneous_gain_db`` and ``simultaneous_phase_deg`` for all axes at once.
     band : tuple of 2 float, rad/s
         Where the response is known.
-    log_sha256, matrices_sha256 : str
-        What it was made from, and for which matrices: an edited matrix voids it.
+    thresholds : mapping
+        `Thresholds` of the verdict.
+    log_sha256 : str
+        What it was made from.
     """
 
     verdict: str
     reason: str
     figures: Mapping[str, Any]
     band: tuple[float, float]
+    thresholds: Mapping[str, float]
     log_sha256: str
-    matrices_sha256: str
 
-    def as_table(self) -> dict[str, Any]:
-        """Plain values, for the gains file and JSON."""
+    def bound_to(self, gains: Gains) -> Gains:
+        """The gains with this certificate, sealed: editing either voids it."""
         table = asdict(self)
         table["band"] = list(self.band)
-        return table
+        return gains.with_certificate(table)
 
 
 def certify(
@@ -101,7 +91,8 @@ def certify(
     inner: Sequence[ReferenceModel],
     outer: Sequence[ReferenceModel],
     log_sha256: str = "",
-    thresholds: Thresholds | None = None,
+    thresholds: Thresholds = DEFAULT_THRESHOLDS,
+    model: Callable[[], StateSpace | None] = lambda: None,
 ) -> Certificate:
     """Verdict on a gain set.
 
@@ -110,34 +101,48 @@ def certify(
     gains : Gains
         The set.
     plant : PlantResponse
-        Measured response, from `tuning.closed_loop.plant_response`.
+        Measured response, from `tuning.plant_response.plant_response`.
     inner, outer : sequence of 2 ReferenceModel
         Of the rate and the attitude loop, roll and pitch; they only normalise the determinants.
     log_sha256 : str
         Of the log that the response comes from.
-    thresholds : Thresholds, optional
-        What is thin.
+    thresholds : Thresholds
+        Margins that the verdict needs.
+    model : callable, optional
+        Gives the plant from torque to body rates, identified from the same log, or None. It cannot certify; but where the response leaves a loop
+        open that is unstable around it, the verdict is ``unstable``.
     """
-    thresholds = thresholds or Thresholds()
 
     def verdict(text: str, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
-        return Certificate(text, reason, figures, band, log_sha256, gains.matrices_sha256())
+        identified = model() if text == NOT_CERTIFIED else None
+        if identified is not None:
+            radius = model_spectral_radius(gains, identified)
+            if radius > GROWING:
+                text = UNSTABLE
+                reason = f"around the model identified from the log the loop has a spectral radius of {radius:.4f}; {reason}"
+        return Certificate(text, reason, figures, band, thresholds.model_dump(), log_sha256)
 
-    plant, above = _certified_band(gains, plant)
-    if len(plant.omega) < MIN_FREQUENCIES:
-        return verdict(NOT_CERTIFIED, "the excitation reaches fewer than 8 frequencies", {}, (0.0, 0.0))
-    band = (float(plant.omega[0]), float(plant.omega[-1]))
-    dense, nominal, draws = _loops(gains, plant)
+    try:
+        body = rigid_body(plant)
+    except TuningError as error:
+        return verdict(NOT_CERTIFIED, str(error), {}, (0.0, 0.0))
+    known = plant.at(plant.known_run())
+    if len(known.omega) < MIN_FREQUENCIES:
+        reason = f"the excitation reaches fewer than {MIN_FREQUENCIES} frequencies in a row"
+        return verdict(NOT_CERTIFIED, reason, {}, (0.0, 0.0))
+    band = (float(known.omega[0]), float(known.omega[-1]))
+    above = loop_bound(gains, known)
+    dense, nominal, draws = _loops(gains, known)
     normal = _Normaliser(inner, outer, dense.omega)
     windings = [normal.windings(loop) for loop in draws]
     figures = _figures(above, dense, nominal, draws, inner)
-    beyond = _beyond_the_band(gains, plant, above)
-    if beyond:
-        return verdict(NOT_CERTIFIED, beyond, figures, band)
     doubtful = sum(any(w) for w in windings)
     if any(normal.windings(nominal)) and doubtful > DRAWS / 2:
         where = "the rate loop alone" if normal.windings(nominal)[0] else "the whole cascade"
         return verdict(UNSTABLE, f"the determinant goes round 0: {where} is unstable", {}, band)
+    beyond = _beyond_the_band(gains, plant, known, body, above)
+    if beyond:
+        return verdict(NOT_CERTIFIED, beyond, figures, band)
     if doubtful:
         reason = f"too close to the limit to tell: {doubtful} of {DRAWS} plants that the log allows are unstable"
         return verdict(NOT_CERTIFIED, reason, figures, band)
@@ -145,13 +150,25 @@ def certify(
         f"assumed: above {band[1]:.0f} rad/s the plant falls at least like an integrator; "
         f"below {band[0]:.1f} rad/s the integral term acts as there"
     )
-    thin = []
-    if figures["Ms"] + figures["Ms_error"] > thresholds.Ms:
-        thin.append(f"Ms {figures['Ms']:.2f} + {figures['Ms_error']:.2f} is above {thresholds.Ms:g}")
-    phase = min(figures["phase_margin_deg"].values())
-    if phase < thresholds.phase_deg:
-        thin.append(f"phase margin {phase:.0f} degrees is below {thresholds.phase_deg:g}")
-    return verdict(THIN if thin else CERTIFIED, "; ".join([*thin, assumed]), figures, band)
+    short = _short_of(figures, thresholds.Ms, thresholds.phase_deg)
+    if not short:
+        return verdict(CERTIFIED, assumed, figures, band)
+    too_short = _short_of(figures, thresholds.thin_Ms, thresholds.thin_phase_deg)
+    if too_short:
+        return verdict(NOT_CERTIFIED, "; ".join(["the margin is too thin", *too_short]), figures, band)
+    return verdict(THIN, "; ".join([*short, assumed]), figures, band)
+
+
+def _short_of(figures: Mapping[str, Any], Ms: float, phase_deg: float) -> list[str]:
+    """What of the margins, errors included, is missed."""
+    missed = []
+    if figures["Ms"] + figures["Ms_error"] > Ms:
+        missed.append(f"Ms {figures['Ms']:.2f} + {figures['Ms_error']:.2f} is above {Ms:g}")
+    for axis, phase in figures["phase_margin_deg"].items():
+        error = figures["phase_margin_error_deg"][axis]
+        if phase - error < phase_deg:
+            missed.append(f"the phase margin of {axis}, {phase:.0f} - {error:.0f} degrees, is below {phase_deg:g}")
+    return missed
 
 
 def sensitivity_peak(gains: Gains, plant: PlantResponse) -> tuple[float, float]:
@@ -161,30 +178,15 @@ def sensitivity_peak(gains: Gains, plant: PlantResponse) -> tuple[float, float]:
     ----------
     gains : Gains
     plant : PlantResponse
-        With at least 8 coherent frequencies in a row.
+        With at least 8 known frequencies in a row.
     """
-    return _sensitivity_peak(*_loops(gains, _certified_band(gains, plant)[0])[1:])
+    _, nominal, draws = _loops(gains, plant.at(plant.known_run()))
+    return _sensitivity_peak(nominal, draws)
 
 
 def _sensitivity_peak(nominal: CascadeLoop, draws: list[CascadeLoop]) -> tuple[float, float]:
-    def peak(loop: CascadeLoop) -> float:
-        return float(np.linalg.norm(np.linalg.inv(np.eye(2) + loop.L_u), ord=2, axis=(1, 2)).max())
-
-    return peak(nominal), 2 * float(np.std([peak(loop) for loop in draws]))
-
-
-def _certified_band(gains: Gains, plant: PlantResponse) -> tuple[PlantResponse, float]:
-    """The longest coherent stretch, up to where the loop is small for good: nothing more has to be known above, and
-    the noisy end of the band is left out. With it what the loop's gain may still reach above.
-    """
-    plant = plant.at(plant.coherent_run())
-    if len(plant.omega) < MIN_FREQUENCIES:
-        return plant, np.inf
-    above = loop_above(gains, plant)
-    small = above <= HIGH_FREQUENCY_LOOP
-    settled = len(small) - int(np.argmin(small[::-1])) if not small.all() else 1
-    last = min(max(settled + 1, MIN_FREQUENCIES), len(small)) - 1
-    return plant.at(np.arange(last + 1)), float(above[last])
+    peaks = [margins.peak(margins.sensitivity(loop)) for loop in (nominal, *draws)]
+    return peaks[0], 2 * float(np.std(peaks[1:]))
 
 
 def _loops(gains: Gains, plant: PlantResponse) -> tuple[PlantResponse, CascadeLoop, list[CascadeLoop]]:
@@ -234,35 +236,46 @@ def _turn(f: Complex) -> float:
     return float(np.sum(np.angle(f[1:] / f[:-1])))
 
 
-def _beyond_the_band(gains: Gains, plant: PlantResponse, loop: float) -> str:
+def _beyond_the_band(
+    gains: Gains, plant: PlantResponse, known: PlantResponse, body: RigidBody, loop: float
+) -> str:
     """Why nothing can be said outside of the band, where the rate loop's gain may still reach `loop`; empty when the
     assumptions hold.
     """
     if loop > HIGH_FREQUENCY_LOOP:
         return (
-            f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
+            f"excitation ends at {known.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
             f"(at most {HIGH_FREQUENCY_LOOP:g}): excite a wider band"
         )
-    if loop + _outer_loop_above(gains, plant) >= 1:
+    again = large_again(gains, plant)
+    if again is not None:
+        omega, gain = again
         return (
-            f"excitation ends at {plant.omega[-1]:.0f} rad/s, where the whole cascade's gain may still reach 1: "
+            f"at {omega:.0f} rad/s ({omega / (2 * np.pi):.0f} Hz) the loop's gain may reach {gain:.2f} again (at most "
+            f"{HIGH_FREQUENCY_LOOP:g}): a mode of the frame; stiffen it, filter the rates (notch, lower cut-off), or ask "
+            "for a lower derivative filter or gain"
+        )
+    if loop + _outer_loop_above(gains, known) >= 1:
+        return (
+            f"excitation ends at {known.omega[-1]:.0f} rad/s, where the whole cascade's gain may still reach 1: "
             "excite a wider band"
         )
-    S = np.linalg.inv(np.eye(2) + cascade_loop(gains, plant.at(np.array([0]))).L_u[0])
-    remaining = float(np.linalg.norm(S, ord=2))
+    S = margins.sensitivity(cascade_loop(gains, known.at(np.array([0]))))
+    remaining = margins.peak(S)
     if remaining > LOW_FREQUENCY_SENSITIVITY:
         return (
-            f"excitation begins at {plant.omega[0]:.1f} rad/s, where the sensitivity is still {remaining:.2f} (at most "
+            f"excitation begins at {known.omega[0]:.1f} rad/s, where the sensitivity is still {remaining:.2f} (at most "
             f"{LOW_FREQUENCY_SENSITIVITY:g}), and nothing is known of the loop below: excite lower frequencies, or ask "
             "for a faster attitude loop"
         )
-    if np.any(gains.Ki_i) and integral_action(gains.Ki_i, plant) <= 0:
+    if np.any(gains.Ki_i) and body.integral_action(gains.Ki_i) <= 0:
         return (
-            f"excitation begins at {plant.omega[0]:.1f} rad/s, where the loop's integral term is not positive: "
-            "excite lower frequencies, or record longer"
+            f"Ki_i through the measured plant is not positive in every direction ({body.integral_action(gains.Ki_i):.3g} "
+            "1/s^2 per rad/s): the integral terms run away below the excitation; raise the diagonal of Ki_i, or leave the "
+            "integral out"
         )
     if np.linalg.eigvalsh(gains.Kp_o + gains.Kp_o.T)[0] <= 0:
-        return f"below {plant.omega[0]:.1f} rad/s the attitude loop's gain is not positive in every direction"
+        return f"below {known.omega[0]:.1f} rad/s the attitude loop's gain is not positive in every direction"
     return ""
 
 
@@ -285,23 +298,51 @@ def loop_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
     return reached
 
 
-def integral_action(Ki_i: Signal, plant: PlantResponse) -> Signal:
-    """The least that integral terms do in any direction where the response begins: Ki_i G_i, its smallest eigenvalue.
+def loop_bound(gains: Gains, plant: PlantResponse) -> float:
+    """What the rate loop's gain may still reach above the plant's band."""
+    return float(loop_above(gains, plant)[-1])
+
+
+def large_again(gains: Gains, plant: PlantResponse) -> tuple[float, float] | None:
+    """Where the rate loop's gain, once small, is large again at a frequency that the log knows: a mode of the frame.
 
     Parameters
     ----------
-    Ki_i : (..., 2, 2) array, 1/rad
+    gains : Gains
     plant : PlantResponse
+        The whole response, known or not.
 
     Returns
     -------
-    (...) array, 1/s
+    tuple of 2 float or None
+        Frequency (rad/s) and the gain with its error, where that is largest; None: nowhere.
     """
-    # The plant there is a real matrix times a scalar between a gain and an integrator: take that phase off.
-    turned = plant.G_i[0] * np.exp(-1j * np.angle(np.trace(plant.G_i[0])))
-    action = Ki_i @ turned.real
-    least: Signal = np.linalg.eigvalsh((action + np.swapaxes(action, -1, -2)) / 2)[..., 0]
-    return least
+    gain, error = _rate_loop_gain(gains, plant)
+    known = np.flatnonzero(plant.known())
+    small = known[gain[known] + error[known] <= HIGH_FREQUENCY_LOOP]
+    small = small[small > known[np.argmax(gain[known])]] if len(small) else small
+    if not len(small):
+        return None
+    beyond = plant.omega > ABOUT * plant.omega[small[0]]
+    explained = np.any(plant.coherence > COHERENT, axis=1)
+    upper = gain + error
+    counts = beyond & (plant.known() | explained) & (upper > HIGH_FREQUENCY_LOOP)
+    # Where the log does not know the response a gain counts that cannot be noise.
+    counts |= beyond & (gain - 2 * error > HIGH_FREQUENCY_LOOP)
+    if not counts.any():
+        return None
+    worst = int(np.argmax(np.where(counts, upper, 0)))
+    return float(plant.omega[worst]), float(upper[worst])
+
+
+def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]:
+    """sigma_max of the rate loop, (K,), and the RMS of its error's largest singular value, two deviations of an element."""
+    C_e, C_d = inner_controllers(gains, plant.omega)
+    controller = C_e + C_d
+    gain = singular_values(controller @ plant.G_i)[0]
+    # Independent errors of the elements: C E has the covariance sum |C_ij|^2 dev_jk^2.
+    spread = np.sqrt(np.abs(controller) ** 2 @ plant.deviation() ** 2)
+    return gain, np.linalg.norm(spread, axis=(1, 2))
 
 
 def _outer_loop_above(gains: Gains, plant: PlantResponse) -> float:
@@ -329,42 +370,30 @@ def _figures(
         # D_M = M - (I - M) G K; G K and K G have the same loop, here cut at u.
         return float(np.linalg.norm(m - (identity - m) @ loop.L_i, ord=2, axis=(1, 2)).max())
 
-    S = np.linalg.inv(identity + nominal.L_u)
-    disk = 1 / float(np.linalg.norm(S - identity / 2, ord=2, axis=(1, 2)).max())
-    ratio = (2 + disk) / (2 - disk) if disk < 2 else np.inf
-    by_axis = {
-        axis: _axis_margins((1 / S[:, i, i] - 1).astype(np.complex128), plant.omega)
-        for i, axis in enumerate(("roll", "pitch"))
-    }
-    # Above the band the loop is at most this large: no gain margin is claimed beyond what that leaves.
-    ceiling = -20 * float(np.log10(above)) if above > 0 else np.inf
-    distance = np.abs(np.linalg.det(identity + nominal.L_u)).min()
+    S = margins.sensitivity(nominal)
+    loops = margins.axis_loops(S)
+    found = [margins.phase_margin(loop, plant.omega) for loop in loops]
+    drawn = np.array(
+        [
+            [margins.phase_margin(loop, plant.omega)[0] for loop in margins.axis_loops(margins.sensitivity(draw))]
+            for draw in draws
+        ]
+    )
+    spread = [2 * float(np.std(phases)) if np.isfinite(phases).all() else 0.0 for phases in drawn.T]
+    disk = margins.disk_margin(S)
+    gain_db, phase_deg = margins.simultaneous(disk)
     Ms, Ms_error = _sensitivity_peak(nominal, draws)
     return {
         "Ms": Ms,
         "Ms_error": Ms_error,
         "delta": delta(nominal),
         "delta_error": 2 * float(np.std([delta(loop) for loop in draws])),
-        "distance": float(distance),
+        "distance": float(np.abs(np.linalg.det(identity + nominal.L_u)).min()),
         "disk_margin": disk,
-        "simultaneous_gain_db": float(20 * np.log10(ratio)),
-        "simultaneous_phase_deg": float(2 * np.degrees(np.arctan(disk / 2))),
-        "gain_margin_db": {axis: min(margins[0], ceiling) for axis, margins in by_axis.items()},
-        "phase_margin_deg": {axis: margins[1] for axis, margins in by_axis.items()},
-        "delay_margin_ms": {axis: margins[2] for axis, margins in by_axis.items()},
+        "simultaneous_gain_db": gain_db,
+        "simultaneous_phase_deg": phase_deg,
+        **margins.gain_margins(loops, above),
+        "phase_margin_deg": {axis: phase for axis, (phase, _) in zip(margins.AXES, found, strict=True)},
+        "phase_margin_error_deg": dict(zip(margins.AXES, spread, strict=True)),
+        "delay_margin_ms": {axis: delay for axis, (_, delay) in zip(margins.AXES, found, strict=True)},
     }
-
-
-def _axis_margins(loop: Complex, omega: Signal) -> tuple[float, float, float]:
-    """Smallest gain (dB, up or down), phase (deg) and delay (ms) margin of one loop, the other axis closed."""
-    from control import stability_margins  # takes longer to import than all of the rest
-
-    data = (np.abs(loop), np.degrees(np.unwrap(np.angle(loop))), omega)
-    gains, phases, _, _, crossings, _ = (np.atleast_1d(part) for part in stability_margins(data, returnall=True))
-    delays = np.radians(phases % 360.0) / crossings * 1e3
-    decibels = np.abs(20 * np.log10(gains[gains > 0]))
-
-    def smallest(values: Signal) -> float:
-        return float(np.min(values, initial=np.inf))
-
-    return smallest(decibels), smallest(np.abs(phases)), smallest(delays)

@@ -8,10 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.experiment import Experiment
 from tuning.gain_stack import GainStack
 from tuning.gains import Gains
-from tuning.identification import identify_rates
+from tuning.measured import Measured
 from tuning.motors import Motors, rotor_lag
 from tuning.spec import Manoeuvre
 from tuning.statespace import StateSpace
@@ -72,38 +71,24 @@ class DoubletModel:
         inverse = np.ascontiguousarray(np.linalg.pinv(self.motors.mixer))
         return self.motors.mixer, inverse, self.motors.hover, float(np.exp(-self.plant.Ts / lag)) if lag else 0.0
 
-    def spectral_radius(self, stack: GainStack) -> float:
-        """Of the first set: the larger of the rate loop's alone and of the cascade's, limits aside."""
-        Kp_o, Kp_i, Ki_i, Kd_i, Kff_i = stack.stacked()[0]
-        n, Ts, a = len(self.plant.A), stack.Ts, stack.derivative_pole
-        start = np.eye(n + 8)
-        state, rate, slope, integral, angle = np.split(start, [n, n + 2, n + 4, n + 6])
-        now = self.plant.C @ state
-        angle = angle + Ts / 2 * (now + rate)
-        slope = a * slope + (1 - a) / Ts * (now - rate)
-        radius = 0.0
-        for wanted in (np.zeros_like(now), -Kp_o @ angle):
-            summed = integral + Ts * Ki_i @ (wanted - now)
-            moment = Kp_i @ (wanted - now) - Kd_i @ slope + Kff_i @ wanted + summed
-            step = np.vstack([self.plant.A @ state + self.plant.B @ moment, now, slope, summed, angle])
-            if not wanted.any():  # nobody looks at the angle
-                step = step[:-2, :-2]
-            radius = max(radius, float(np.abs(np.linalg.eigvals(step)).max()))
-        return radius
 
+def doublet_model(measured: Measured, manoeuvre: Manoeuvre) -> DoubletModel:
+    """The manoeuvre around the plant that was identified from an experiment.
 
-def doublet_model(experiment: Experiment, manoeuvre: Manoeuvre) -> DoubletModel:
-    """The manoeuvre around the plant that PBSID finds in an experiment.
+    Parameters
+    ----------
+    measured : Measured
+    manoeuvre : Manoeuvre
 
     Raises
     ------
     TuningError
-        When the log is too short or not excited.
+        When no model is near the measured response.
     """
+    experiment, plant = measured.experiment, measured.identified.model.plant
     half = round(manoeuvre.period_s / 2 / experiment.Ts)
     height = np.radians(manoeuvre.amplitude_deg) * np.ones(half)
     u = np.concatenate([experiment.u[start:stop] for start, stop in experiment.segments])
-    plant = identify_rates(experiment)[0].plant
     return DoubletModel(plant, np.median(u, axis=0), np.concatenate([height, -height]), experiment.motors)
 
 

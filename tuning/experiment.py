@@ -38,6 +38,8 @@ class Experiment:
         The controller that flew, when the log says so.
     motors : Motors or None
         How the allocator moved the motors, when the log says so.
+    warnings : tuple of str
+        What is wrong with the log although it can be used: damage, parameters that changed.
 
     Raises
     ------
@@ -57,6 +59,7 @@ class Experiment:
     sha256: str = ""
     flown: Gains | None = None
     motors: Motors | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.segments:
@@ -81,3 +84,21 @@ class Experiment:
     def seconds(self) -> float:
         """Usable length of the flight, s."""
         return sum(stop - start for start, stop in self.segments) * self.Ts
+
+
+def external_signal(experiment: Experiment) -> tuple[Signal, str]:
+    """The external signal, (N, 2), and its name: the injected moment, else the attitude set-point (rad).
+
+    Raises
+    ------
+    TuningError
+        When neither is logged and moves.
+    """
+    for name in ("u_bar", "r_o"):
+        signal = getattr(experiment, name)
+        if signal is not None and any(np.ptp(signal[start:stop]) > 0 for start, stop in experiment.segments):
+            return signal, name
+    raise TuningError(
+        f"{experiment.source}: no excitation: neither an injected moment nor a moving attitude set-point is logged; "
+        "fly an experiment with a moment injected on roll, then on pitch"
+    )

@@ -19,7 +19,9 @@ from tuning.errors import TuningError
 
 ORDER = 2  # of the local polynomials
 FREEDOM = 8  # degrees of freedom of the noise, at least
-CENTRES = 400  # frequencies, at most
+CENTRES = 1000  # frequencies, at most
+#: A wide window hides something when its noise is above that of narrow ones by so many deviations of their ratio.
+HIDDEN = 4.0
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
@@ -73,8 +75,8 @@ def local_response(
     upper : float, optional, rad/s
         Largest frequency; the Nyquist frequency by default.
     growth : float
-        Windows are at least this share of their frequency wide on each side: fewer and surer values at high
-        frequencies, where responses change slowly. 0: all as narrow as the data allow.
+        Windows are at least this share of their frequency wide on each side, except where the response changes faster
+        than that: fewer and surer values at high frequencies. 0: all as narrow as the data allow.
 
     Returns
     -------
@@ -85,34 +87,64 @@ def local_response(
     TuningError
         When the data are too short for any estimate.
     """
-    n_w, n_v = w.shape[1], v.shape[1]
+    n_w = w.shape[1]
     spectra = [_Spectrum(w[start:stop], v[start:stop], Ts) for start, stop in segments]
     finest = min(s.step for s in spectra)
     # Enough rows in the longest segment for all parameters of the response and of its transient.
     rows = (ORDER + 1) * (n_w + 1) + FREEDOM
     upper = np.pi / Ts if upper is None else upper
     narrowest = max(rows / 2 * finest, upper / CENTRES)
-    omega, halves = _windows(narrowest, upper, growth)
-    if not len(omega):
+    fits = _fits(spectra, n_w, narrowest, upper, growth)
+    if not fits:
         raise TuningError(f"too short: {sum(b - a for a, b in segments) * Ts:.2f} s hold no frequency response")
-    response = np.empty((len(omega), n_v, n_w), complex)
-    noise = np.empty((len(omega), n_v, n_v), complex)
-    error = np.empty((len(omega), n_w, n_w), complex)
-    explained = np.empty((len(omega), n_v))
-    for k, (centre, half) in enumerate(zip(omega, halves, strict=True)):
-        response[k], noise[k], error[k], explained[k] = _fit(spectra, centre, half, n_w)
-    return LocalResponse(omega, response, noise, explained, error)
+    return LocalResponse(
+        omega=np.array([fit.centre for fit in fits]),
+        response=np.array([fit.response for fit in fits]),
+        noise=np.array([fit.noise for fit in fits]),
+        explained=np.array([fit.explained for fit in fits]),
+        error=np.array([fit.error for fit in fits]),
+    )
 
 
-def _windows(narrowest: float, upper: float, growth: float) -> tuple[Signal, Signal]:
-    """Centres up to `upper` and half widths of windows that touch the next centre, rad/s."""
-    omega, halves, centre = [], [], narrowest
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """What one window says; fields as in `LocalResponse`, and the degrees of freedom of its noise."""
+
+    centre: float
+    response: Complex
+    noise: Complex
+    error: Complex
+    explained: Signal
+    freedom: int
+
+
+def _fits(spectra: Sequence[_Spectrum], n_w: int, narrowest: float, upper: float, growth: float) -> list[_Fit]:
+    """Windows up to `upper`, each up to the centre of the next; wide ones are cut where they would hide something."""
+    found, centre = [], narrowest
     while centre < upper:
         half = max(narrowest, growth * centre)
-        omega.append(centre)
-        halves.append(half)
+        wide = _fit(spectra, centre, half, n_w)
+        if half > 2 * narrowest:
+            parts = [
+                _fit(spectra, middle, narrowest, n_w)
+                for middle in np.arange(centre - half + narrowest, centre + half, 2 * narrowest)
+            ]
+            if _hides(wide, parts):
+                middles = np.arange(centre - half / 2, centre + half / 2, narrowest)
+                found += [_fit(spectra, middle, narrowest, n_w) for middle in middles if middle < upper]
+                centre += half
+                continue
+        found.append(wide)
         centre += half
-    return np.array(omega), np.array(halves)
+    return found
+
+
+def _hides(wide: _Fit, parts: Sequence[_Fit]) -> bool:
+    """Whether a window is too wide for what is in it, such as a mode of the frame: narrow windows leave less noise."""
+    freedom = sum(part.freedom for part in parts)
+    narrow = sum(part.freedom * np.real(np.diag(part.noise)) for part in parts) / freedom
+    ratio = np.real(np.diag(wide.noise)) / np.maximum(narrow, 1e-300)
+    return bool(np.max(ratio) > 1 + HIDDEN * np.sqrt(1 / wide.freedom + 1 / freedom))
 
 
 class _Spectrum:
@@ -132,9 +164,7 @@ class _Spectrum:
         return (bins * self.step - centre) / half, self.W[bins % self.length], self.V[bins % self.length]
 
 
-def _fit(
-    spectra: Sequence[_Spectrum], centre: float, half: float, n_w: int
-) -> tuple[Complex, Complex, Complex, Signal]:
+def _fit(spectra: Sequence[_Spectrum], centre: float, half: float, n_w: int) -> _Fit:
     """Local least squares with the transient of each segment projected out."""
     regressors, outputs = [], []
     lost = 0
@@ -157,4 +187,5 @@ def _fit(
     covariance = inverse @ inverse.conj().T
     total = np.maximum(np.sum(np.abs(V) ** 2, axis=0), 1e-300)
     unexplained = np.real(np.diag(noise)) * (len(K) - lost) / total
-    return theta[:n_w].T, noise, covariance[:n_w, :n_w], 1 - np.minimum(unexplained, 1.0)
+    explained = 1 - np.minimum(unexplained, 1.0)
+    return _Fit(centre, theta[:n_w].T, noise, covariance[:n_w, :n_w], explained, freedom)

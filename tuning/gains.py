@@ -8,6 +8,7 @@ that code with the prefix ``MIMO_`` is the parameter's name.
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 from collections.abc import Mapping
@@ -87,8 +88,8 @@ class Gains:
     moment_scale : tuple of 3 float or None, N m
         Moment that one unit of u stands for on roll, pitch and yaw. None: the log did not say.
     certificate : mapping or None
-        What `tuning.certificate` found: verdict, reason, figures, band and the hashes of log and matrices. It
-        counts only while the matrices are those that it names; see `verdict`. None: never examined.
+        What `tuning.certificate` found: verdict, reason, figures, band, thresholds, the hash of the log, and a seal. It
+        counts only while neither it nor the gains are edited; see `verdict`. None: never examined.
     provenance : mapping
         Where the gains come from: method, log, reference models, standard deviations. Plain TOML values.
 
@@ -148,16 +149,26 @@ class Gains:
         """Pole a = exp(-2 pi f_d Ts) of the derivative filter; 0 when f_d = 0."""
         return derivative_pole(self.derivative_cutoff_hz, self.Ts)
 
-    def matrices_sha256(self) -> str:
-        """Hash of everything that the loop's stability depends on: all elements and their unit, exactly."""
-        return sha256(repr([*self.elements().items(), ("moment_scale", self.moment_scale)]))
+    def with_certificate(self, certificate: Mapping[str, Any] | None) -> Gains:
+        """The set with a certificate, sealed by the hash of both: whoever edits either of them voids it."""
+        if certificate is None:
+            return replace(self, certificate=None)
+        return replace(self, certificate={**certificate, "seal": self._seal(certificate)})
+
+    def _seal(self, certificate: Mapping[str, Any]) -> str:
+        """Hash of a certificate and of everything that the loop's stability depends on, exactly."""
+        said = {name: value for name, value in certificate.items() if name != "seal"}
+        numbers = {**self.elements(), "derivative_cutoff_hz": self.derivative_cutoff_hz}
+        return sha256(json.dumps([said, numbers, self.moment_scale], sort_keys=True, default=str))
 
     def verdict(self) -> tuple[str, str]:
-        """Verdict of the certificate and its reason; ``none`` without one, ``void`` when the gains were edited."""
+        """Verdict of the certificate and its reason; ``none`` without one, ``void`` when gains or certificate were edited."""
         if self.certificate is None:
             return "none", "stability was never examined"
-        if self.certificate.get("matrices_sha256") != self.matrices_sha256():
-            return "void", "the gains were edited after the certificate was made"
+        if "seal" not in self.certificate:
+            return "void", "the certificate is of an earlier version, or was written by hand"
+        if self.certificate["seal"] != self._seal(self.certificate):
+            return "void", "the gains or the certificate were edited after it was made"
         return str(self.certificate.get("verdict")), str(self.certificate.get("reason"))
 
     def elements(self) -> dict[str, float]:
@@ -256,7 +267,7 @@ class Gains:
             return changed
         if abs(ratio[0] / ratio[1] - 1) > 1e-3:
             return replace(changed, certificate=None)
-        return replace(changed, certificate={**self.certificate, "matrices_sha256": changed.matrices_sha256()})
+        return changed.with_certificate(self.certificate)
 
     def save(self, path: Path) -> None:
         """Write the set as a readable TOML file, atomically."""

@@ -11,10 +11,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tuning.closed_loop import PlantResponse
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.instruments import AXES, Stretches
+from tuning.plant_response import PlantResponse
 from tuning.vrft import LoopEstimate
 
 WEAK, DOUBTFUL = 0.3, 0.5

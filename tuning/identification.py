@@ -14,15 +14,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import lstsq, qr, svd
 
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
-from tuning.statespace import Signal, StateSpace
+from tuning.plant_response import PlantResponse
+from tuning.statespace import Response, Signal, StateSpace
 
 #: Orders that are tried when none is asked for.
 MAX_ORDER = 20
+#: Orders that are compared with a measured response, at most: a body, rotors, a filter and delays on two axes.
+RESPONSE_ORDER = 12
 PAST = 20
+#: Order by response: the lowest whose error is within this factor of the least is taken; one that misses more than
+#: this share of the response is of no use.
+NEARLY, POOR = 1.15, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +64,11 @@ class IdentifiedModel:
     def order(self) -> int:
         """Number of states."""
         return len(self.plant.A)
+
+    @property
+    def predictor_stable(self) -> bool:
+        """Whether the one-step predictor forgets: A - K C has its eigenvalues inside the unit circle."""
+        return bool(np.abs(np.linalg.eigvals(self.plant.A - self.K @ self.plant.C)).max() < 1)
 
     def predict(self, u: Signal, y: Signal) -> Signal:
         """One-step-ahead prediction of y from past u and y (and u(k), where D is not zero), from rest.
@@ -140,13 +152,129 @@ def pbsid(
     TuningError
         When the windows or the order do not fit, the data are too short, or the input does not excite.
     """
+    states = _states(u, y, Ts, past, future, external, segments)
+    if order is not None and not 1 <= order <= states.most:
+        raise TuningError(
+            f"identification: got order {order}; expected 1..{states.most} for a future window of {states.future}"
+        )
+    return states.model(order or states.gap())
+
+
+def pbsid_by_response(
+    u: Signal,
+    y: Signal,
+    Ts: float,
+    omega: Signal,
+    response: Response,
+    *,
+    past: int = PAST,
+    future: int | None = None,
+    segments: Sequence[tuple[int, int]] | None = None,
+) -> tuple[IdentifiedModel, float]:
+    """`pbsid` with the order whose frequency response is nearest to the measured one.
+
+    A gap in the singular values says little in closed loop: on logs of a genuine PX4 it asked for order 2, whose predictor
+    diverged, where orders 4 to 8 fit.
+
+    Parameters
+    ----------
+    omega : (K,) array, rad/s
+    response : (K, n_y, n_u) array
+        From u to y, measured there.
+    u, y, Ts, past, future, segments
+        See `pbsid`.
+
+    Returns
+    -------
+    model : IdentifiedModel
+        Of the lowest order that fits nearly best, with a stable predictor.
+    fit : float, percent
+        100 (1 - |G - model| / |G|), each frequency weighed by its own, so that all octaves of an integrator count.
+
+    Raises
+    ------
+    TuningError
+        As `pbsid`, or when no order has a stable predictor, or fits.
+    """
+    states = _states(u, y, Ts, past, future, None, segments)
+    weight = omega[:, None, None]
+    size = float(np.linalg.norm(weight * response))
+    found = []
+    for order in range(1, min(RESPONSE_ORDER, states.most, len(states.singular_values)) + 1):
+        model = states.model(order)
+        if model.predictor_stable:
+            error = float(np.linalg.norm(weight * (model.plant.frequency_response(omega) - response)))
+            found.append((error / size, model))
+    if not found:
+        raise TuningError("identification: no order has a stable predictor; record longer, or excite more strongly")
+    least = min(error for error, _ in found)
+    if least > POOR:
+        raise TuningError(
+            f"identification: no model of order 1 to {RESPONSE_ORDER} is near the measured response (the best is off by "
+            f"{least:.0%}, at most {POOR:.0%}); record longer, or excite more strongly"
+        )
+    error, model = next((error, model) for error, model in found if error <= NEARLY * least)
+    return model, 100 * (1 - error)
+
+
+@dataclass(frozen=True, eq=False)
+class _States:
+    """The state's row space of one experiment: what models of any order are made from."""
+
+    Q: Signal
+    U: Signal
+    singular_values: Signal
+    now_u: Signal
+    now_y: Signal
+    w: Signal
+    full_u: Signal
+    followed: NDArray[np.intp]
+    past: int
+    future: int
+    needed: int
+    Ts: float
+
+    @property
+    def most(self) -> int:
+        """Largest order that the windows allow."""
+        return self.future * self.now_y.shape[1] - 1
+
+    def gap(self) -> int:
+        """The order where the singular values fall most."""
+        s = self.singular_values
+        tried = min(MAX_ORDER, self.most, len(s) - 1)
+        return int(np.argmax(s[:tried] / s[1 : tried + 1])) + 1
+
+    def model(self, order: int) -> IdentifiedModel:
+        """The model of one order."""
+        n_u, n_y = self.full_u.shape[1], self.now_y.shape[1]
+        x = self.Q @ (self.U[:, :order] * np.sqrt(self.singular_values[:order]))
+        CD = _instrumental(np.hstack([x, self.now_u]), np.hstack([x, self.w]), self.now_y).T
+        e = self.now_y - np.hstack([x, self.now_u]) @ CD.T
+        known = np.hstack([x, self.full_u, e])[self.followed]
+        ABK = lstsq(known, x[self.followed + 1], lapack_driver="gelsy")[0].T
+        D = CD[:, order:] if self.w.shape[1] else np.zeros((n_y, n_u))
+        plant = StateSpace(ABK[:, :order], ABK[:, order : order + n_u], CD[:, :order], D, self.Ts)
+        covariance = e.T @ e / (len(x) - self.needed)
+        return IdentifiedModel(
+            plant, ABK[:, order + n_u :], self.singular_values, covariance, self.past, self.future, len(x)
+        )
+
+
+def _states(
+    u: Signal,
+    y: Signal,
+    Ts: float,
+    past: int,
+    future: int | None,
+    external: Signal | None,
+    segments: Sequence[tuple[int, int]] | None,
+) -> _States:
+    """Everything of `pbsid` that does not depend on the order."""
     f = past if future is None else future
     n_u, n_y = u.shape[1], y.shape[1]
     if not 1 <= f <= past:
         raise TuningError(f"identification: got past {past}, future {f}; expected 1 <= future <= past")
-    most = f * n_y - 1
-    if order is not None and not 1 <= order <= most:
-        raise TuningError(f"identification: got order {order}; expected 1..{most} for a future window of {f}")
     stretches = [(a, b) for a, b in segments or [(0, len(u))] if b - a > past + 1]
     direct = external is not None
     needed = past * (n_u + n_y) + n_u * direct
@@ -171,46 +299,75 @@ def pbsid(
         observability[i * n_y : (i + 1) * n_y, : (past - i) * width] = markov[:, i * width :]
     Q, R = qr(Z, mode="economic")
     U, s, _ = svd(R @ observability.T, full_matrices=False)
-    if order is None:
-        tried = min(MAX_ORDER, most, len(s) - 1)
-        order = int(np.argmax(s[:tried] / s[1 : tried + 1])) + 1
-    x = Q @ (U[:, :order] * np.sqrt(s[:order]))
-
-    CD = _instrumental(np.hstack([x, now_u]), np.hstack([x, w]), now_y).T
-    e = now_y - np.hstack([x, now_u]) @ CD.T
     # The next state of a stretch's last sample is in another stretch: leave it out.
     ends = np.cumsum([b - a - past for a, b in stretches]) - 1
     followed = np.setdiff1d(np.arange(count), ends)
     full_u = np.vstack([u[a + past : b] for a, b in stretches])
-    ABK = lstsq(np.hstack([x, full_u, e])[followed], x[followed + 1])[0].T
-    D = CD[:, order:] if direct else np.zeros((n_y, n_u))
-    plant = StateSpace(ABK[:, :order], ABK[:, order : order + n_u], CD[:, :order], D, Ts)
-    return IdentifiedModel(plant, ABK[:, order + n_u :], s, e.T @ e / (count - needed), past, f, count)
+    return _States(Q, U, s, now_u, now_y, w, full_u, followed, past, f, needed, Ts)
+
+
+@dataclass(frozen=True, eq=False)
+class RatesModel:
+    """A plant from torque to body rates, and how well it fits.
+
+    Attributes
+    ----------
+    model : IdentifiedModel
+    one_step_percent : (2,) array
+        Fit of the prediction one sample ahead, roll and pitch rate.
+    response_percent : float
+        Fit of its frequency response to the measured one, see `pbsid_by_response`.
+    """
+
+    model: IdentifiedModel
+    one_step_percent: Signal
+    response_percent: float
 
 
 def identify_rates(
-    experiment: Experiment, *, order: int | None = None, past: int = PAST, future: int | None = None
-) -> tuple[IdentifiedModel, Signal]:
-    """The plant from control moment to body rates, and its one-step fit in percent; see `pbsid`.
+    experiment: Experiment,
+    plant: PlantResponse,
+    *,
+    order: int | None = None,
+    past: int = PAST,
+    future: int | None = None,
+) -> RatesModel:
+    """The plant from torque to body rates; see `pbsid`.
 
     Parameters
     ----------
     experiment : Experiment
+    plant : PlantResponse
+        Measured on it: the order is the one that fits it.
     order, past, future
         See `pbsid`.
 
-    Returns
-    -------
-    model : IdentifiedModel
-    fits : (2,) array
-        Of roll and pitch rate, percent.
+    Raises
+    ------
+    TuningError
+        As `pbsid_by_response`; or when the predictor of the order that was asked for is not stable.
     """
-    u, y = experiment.u, experiment.y_i
-    model = pbsid(u, y, experiment.Ts, order=order, past=past, future=future, segments=experiment.segments)
+    u, y, segments = experiment.u, experiment.y_i, experiment.segments
+    known = plant.at(plant.known_run())
+    if not len(known.omega):
+        raise TuningError(f"{experiment.source}: not excited: the response of the rates is known at no frequency")
+    if order is None:
+        model, response = pbsid_by_response(
+            u, y, experiment.Ts, known.omega, known.G_i, past=past, future=future, segments=segments
+        )
+    else:
+        model = pbsid(u, y, experiment.Ts, order=order, past=past, future=future, segments=segments)
+        if not model.predictor_stable:
+            raise TuningError(
+                f"identification: the predictor of order {order} is not stable, its predictions grow without bound; ask "
+                "for another order, or leave it out"
+            )
+        off = known.omega[:, None, None] * (model.plant.frequency_response(known.omega) - known.G_i)
+        response = 100 * (1 - float(np.linalg.norm(off) / np.linalg.norm(known.omega[:, None, None] * known.G_i)))
     u, y = u - u.mean(axis=0), y - y.mean(axis=0)
-    parts = [(y[a:b][past:], model.predict(u[a:b], y[a:b])[past:]) for a, b in experiment.segments]
+    parts = [(y[a:b][past:], model.predict(u[a:b], y[a:b])[past:]) for a, b in segments]
     measured, predicted = (np.vstack(side) for side in zip(*parts, strict=True))
-    return model, fit(measured, predicted)
+    return RatesModel(model, fit(measured, predicted), response)
 
 
 def model_toml(model: IdentifiedModel, log_sha256: str) -> str:

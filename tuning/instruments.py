@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from scipy.signal import correlate
 
 from tuning.errors import TuningError
-from tuning.experiment import Experiment
-from tuning.identification import pbsid
+from tuning.experiment import Experiment, external_signal
+from tuning.frequency import local_response
+from tuning.identification import pbsid_by_response
+from tuning.plant_response import COHERENT
 
 AXES = ("roll", "pitch")
 #: Two flights count as one experiment flown twice when their excitations agree to this correlation.
@@ -73,7 +75,11 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
         return Instruments(external, external, f"second experiment {repeat.source}", repeat.y_i, repeat.y_o)
     if kind == "model":
         y = np.hstack([experiment.y_i, experiment.y_o])
-        model = pbsid(external, y, experiment.Ts, segments=experiment.segments)
+        found = local_response(external, y, experiment.Ts, experiment.segments)
+        well = np.all(found.explained > COHERENT, axis=1)
+        model, _ = pbsid_by_response(
+            external, y, experiment.Ts, found.omega[well], found.response[well], segments=experiment.segments
+        )
         simulated = np.zeros_like(y)
         for start, stop in experiment.segments:
             simulated[start:stop] = model.simulate(external[start:stop])
@@ -82,24 +88,6 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
     if kind == "u":
         return Instruments(external, experiment.u, "u")
     return Instruments(external, external, name)
-
-
-def external_signal(experiment: Experiment) -> tuple[Signal, str]:
-    """The external signal, (N, 2), and its name: the injected moment, else the attitude set-point (rad).
-
-    Raises
-    ------
-    TuningError
-        When neither is logged and moves.
-    """
-    for name in ("u_bar", "r_o"):
-        signal = getattr(experiment, name)
-        if signal is not None and any(np.ptp(signal[start:stop]) > 0 for start, stop in experiment.segments):
-            return signal, name
-    raise TuningError(
-        f"{experiment.source}: no excitation: neither an injected moment nor a moving attitude set-point is logged; "
-        "fly an experiment with a moment injected on roll, then on pitch"
-    )
 
 
 def excited_stretches(experiment: Experiment, external: Signal, method: str) -> Stretches:

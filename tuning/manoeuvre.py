@@ -14,14 +14,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.certificate import DENSE, HIGH_FREQUENCY_LOOP, Thresholds, integral_action, loop_above, sensitivity_peak
-from tuning.closed_loop import MIN_FREQUENCIES, PlantResponse, singular_values, whole_loop
+from tuning.certificate import DENSE, HIGH_FREQUENCY_LOOP, loop_above, sensitivity_peak
+from tuning.closed_loop import model_spectral_radius, singular_values, whole_loop
 from tuning.descent import descend
 from tuning.doublet import DoubletModel, effort, moment_rms
 from tuning.errors import TuningError
 from tuning.gain_stack import GainStack
 from tuning.gains import Gains
+from tuning.plant_response import MIN_FREQUENCIES, PlantResponse
 from tuning.reference import ReferenceModel
+from tuning.rigid_body import RigidBody, rigid_body
+from tuning.thresholds import DEFAULT_THRESHOLDS
 
 #: Share of the gain that a certificate allows above the band.
 SHARE = 0.99
@@ -77,15 +80,15 @@ def refine_cascade(
     TuningError
         When the measured response is known at too few frequencies, or no gains are found that keep the limits.
     """
-    known = response.at(response.coherent_run())
+    known = response.at(response.known_run())
     if len(known.omega) < MIN_FREQUENCIES:
         raise TuningError(f"the excitation reaches only {len(known.omega)} frequencies, fewer than {MIN_FREQUENCIES}")
     wanted = np.zeros((2, 1, len(model.setpoint), 2))
     for axis, reference in enumerate(outer):
         wanted[axis, 0, :, axis] = reference.response(model.setpoint)
     allowed = np.array(limit if limit is not None else effort(gains, model))
-    task = _Task(gains, model, known, known.interpolated(DENSE), wanted, allowed, terms, full)
-    peak = Thresholds.Ms
+    task = _Task(gains, model, known, known.interpolated(DENSE), rigid_body(response), wanted, allowed, terms, full)
+    peak = DEFAULT_THRESHOLDS.thin_Ms
     point, cost = min((task.descended(begin, peak) for begin in task.beginnings()), key=lambda end: end[1])
     if cost == np.inf:
         raise TuningError("from none of the beginnings gains were found that keep the margins and the effort")
@@ -93,7 +96,7 @@ def refine_cascade(
     kept = None
     for _ in range(REPEATS):
         Ms, error = sensitivity_peak(task.gains_at(point), response)
-        room = (Thresholds.Ms - error) / Ms
+        room = (DEFAULT_THRESHOLDS.thin_Ms - error) / Ms
         if room >= 1 and (kept is None or cost < kept[1]):
             kept = point, cost
         if 1 <= room < 1 + NEAR:
@@ -118,6 +121,7 @@ class _Task:
     model : DoubletModel
     known, dense : PlantResponse
         Measured response where it is known, and with frequencies between its own.
+    body : RigidBody
     wanted : (2, 1, N, 2) array, rad
         Angles that the attitude model asks for in the roll and in the pitch doublet.
     allowed : (2,) array
@@ -130,6 +134,7 @@ class _Task:
     model: DoubletModel
     known: PlantResponse
     dense: PlantResponse
+    body: RigidBody
     wanted: Signal
     allowed: Signal
     terms: Sequence[str]
@@ -181,7 +186,7 @@ class _Task:
 
         end, cost = descend(examine, first[free], STEP)
         point = spread(end[None])[0]
-        stable = self.model.spectral_radius(GainStack.of(self.gains_at(point))) < 1
+        stable = model_spectral_radius(self.gains_at(point), self.model.plant) < 1
         return point, cost if stable else np.inf
 
     def _weight(self) -> Signal:
@@ -198,9 +203,9 @@ class _Task:
         differences = np.concatenate(singular_values(np.eye(2, dtype=complex) + loops), axis=-1)
         peaks = np.sum(differences**-SMOOTH, axis=-1) ** (1 / SMOOTH)
         above = loop_above(candidates, self.known)[:, -1] / HIGH_FREQUENCY_LOOP
-        integral, floor = np.ones(len(above)), INTEGRAL * float(integral_action(self.start.Ki_i, self.known))
+        integral, floor = np.ones(len(above)), INTEGRAL * float(self.body.integral_action(self.start.Ki_i))
         if floor > 0:
-            integral = integral_action(candidates.Ki_i[:, 0], self.known) / floor - 1
+            integral = self.body.integral_action(candidates.Ki_i[:, 0]) / floor - 1
         return np.column_stack([1 - peaks / peak, 1 - above / SHARE, integral])
 
 

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from tuning.errors import TuningError
 from tuning.reference import ReferenceModel, second_order
+from tuning.thresholds import DEFAULT_THRESHOLDS, Thresholds
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -95,6 +96,8 @@ class TuningSpec(_Table):
         What one unit of u stands for; None: as logged.
     yaw, limits
         None: as flown.
+    certificate : Thresholds
+        Margins that verdicts need.
     """
 
     method: Literal["mimo", "siso"] = "mimo"
@@ -113,6 +116,7 @@ class TuningSpec(_Table):
     moment_scale: Triple | None = None
     yaw: YawSpec | None = None
     limits: LimitsSpec | None = None
+    certificate: Thresholds = DEFAULT_THRESHOLDS
 
     @field_validator("inner", "outer", mode="before")
     @classmethod

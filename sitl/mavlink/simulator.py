@@ -166,6 +166,8 @@ class SimulatedVehicle:
         """HIL_SENSOR, HIL_GPS when it is due and, if wanted, HIL_STATE_QUATERNION of now."""
         stamp, state = self.stamp, self.simulator.state
         readings = self.instruments.read(state)
+        for i in range(2):
+            readings[3 + i] += float(self.simulator.sensors.bend[i, 1])
         if self.faults:
             readings[3:6] = self._gyro(readings[3:6])
         fields = INERTIAL | (FIELD_AND_AIR if self.periods % self.field_every == 0 else 0)

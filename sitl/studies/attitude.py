@@ -19,16 +19,19 @@ from sitl.scenario import AXES, Scenario, doublet, excitation_flight
 from sitl.studies.autotune import autotune
 from sitl.studies.benchmarks import TABLES
 from sitl.studies.optimum import Task, best_gains, flown_effort
-from tuning.cascade import measured_plant, tune
-from tuning.certificate import DENSE, Thresholds, certify, integral_action, sensitivity_peak
-from tuning.closed_loop import PlantResponse
+from tuning.cascade import tune
+from tuning.certificate import DENSE, certify, sensitivity_peak
 from tuning.doublet import doublet_model, effort
 from tuning.experiment import Experiment
 from tuning.gains import Gains
 from tuning.manoeuvre import INTEGRAL
+from tuning.measured import Measured
 from tuning.motors import fit_motors
+from tuning.plant_response import measured_plant
 from tuning.reference import ReferenceModel, second_order
+from tuning.rigid_body import rigid_body
 from tuning.spec import Manoeuvre, TuningSpec
+from tuning.thresholds import DEFAULT_THRESHOLDS
 
 DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, perturbed log"
 MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same with any effort"
@@ -236,8 +239,9 @@ def experiment(study: Study, airframe: str, seed: int, noise: bool = True) -> tu
     return flight, Experiment(Ts=default.Ts, source=f"{airframe}, seed {seed}", flown=default, motors=motors, **signals)
 
 
-def tune_all(study: Study, log: Experiment, siso_log: Experiment, plant: PlantResponse) -> dict[str, Gains]:
-    """Every data-driven method, each from one log; `plant` is what `log` says of the response."""
+def tune_all(study: Study, measured: Measured, siso_log: Experiment) -> dict[str, Gains]:
+    """Every data-driven method, each from one log."""
+    log = measured.experiment
     default = _bench(study.airframe)[1]
     inner, outer = study.siso_models
     siso = TuningSpec(method="siso", inner=(inner, inner), outer=(outer, outer))
@@ -246,10 +250,10 @@ def tune_all(study: Study, log: Experiment, siso_log: Experiment, plant: PlantRe
     if siso_log is not log:
         found[SISO_OWN] = tune(log, siso)
     task = Manoeuvre(amplitude_deg=study.amplitude_deg, period_s=study.period_s)
-    roll, pitch = effort(found[SISO], doublet_model(log, task))
+    roll, pitch = effort(found[SISO], doublet_model(measured, task))
     task = task.model_copy(update={"effort": (EFFORT * roll, EFFORT * pitch)})
-    found[MIMO] = tune(log, mimo, plant)
-    found[REFINED] = tune(log, mimo.model_copy(update={"manoeuvre": task}), plant)
+    found[MIMO] = tune(log, mimo, measured)
+    found[REFINED] = tune(log, mimo.model_copy(update={"manoeuvre": task}), measured)
     return found
 
 
@@ -267,10 +271,11 @@ def optimum(study: Study) -> dict[str, Gains]:
     found, errors, bands = [], [], []
     for seed in TYPICAL:
         _, log, siso_log = logs(study, seed)
-        plant = measured_plant(log)
-        found.append(tune_all(study, log, siso_log, plant))
+        measured = Measured(log)
+        plant = measured.response
+        found.append(tune_all(study, measured, siso_log))
         errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
-        bands.append(plant.coherent_run())
+        bands.append(plant.omega[plant.known_run()[[0, -1]]])
     # Without noise a vehicle in balance needs no hover, and what comes after the doublet does not count.
     doublets = study.doublets(log.Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
     spent = [
@@ -280,7 +285,9 @@ def optimum(study: Study) -> dict[str, Gains]:
     # The margins are those of the true plant, as a log without noise shows it, in the band of a log with noise and less
     # what that leaves open.
     plant = measured_plant(experiment(study, study.airframe, TYPICAL[0], noise=False)[1])
-    plant = plant.at(sorted(bands, key=len)[len(bands) // 2]).interpolated(DENSE)
+    body = rigid_body(plant)
+    low, high = np.median(bands, axis=0)
+    plant = plant.at((low <= plant.omega) & (plant.omega <= high)).interpolated(DENSE)
     vehicle, _, library = _bench(study.airframe)
     task = Task(
         vehicle.airframe,
@@ -288,9 +295,10 @@ def optimum(study: Study) -> dict[str, Gains]:
         doublets,
         study.models(BEST, log.Ts)[1],
         plant,
-        Thresholds.Ms - float(np.median(errors)),
+        body,
+        DEFAULT_THRESHOLDS.thin_Ms - float(np.median(errors)),
         [float(rms) for rms in np.median(spent, axis=0)],
-        INTEGRAL * float(integral_action(found[0][MIMO].Ki_i, plant)),
+        INTEGRAL * float(body.integral_action(found[0][MIMO].Ki_i)),
     )
     best = best_gains(task, [found[0][AUTOTUNE], *(gains[REFINED] for gains in found)])
     return {BEST: best, BOUND: best_gains(replace(task, effort=None), [best])}
@@ -299,11 +307,11 @@ def optimum(study: Study) -> dict[str, Gains]:
 def run(study: Study, seed: int, best: dict[str, Gains]) -> Run:
     """Fly the experiment, tune, certify, and fly both doublets with every set."""
     flight, log, siso_log = logs(study, seed)
-    plant = measured_plant(log)
+    measured = Measured(log)
     inner, outer = ([model] * 2 for model in study.models(MIMO, log.Ts))
     gains = {
-        method: replace(found, certificate=certify(found, plant, inner, outer).as_table())
-        for method, found in (tune_all(study, log, siso_log, plant) | best).items()
+        method: certify(found, measured.response, inner, outer).bound_to(found)
+        for method, found in (tune_all(study, measured, siso_log) | best).items()
     }
     doublets = study.doublets(log.Ts)
     flights = {m: [fly_set(study.airframe, found, task, seed) for task in doublets] for m, found in gains.items()}

@@ -18,13 +18,15 @@ from sitl.airframe import Airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import Flight, fly
 from sitl.scenario import Scenario
-from tuning.certificate import HIGH_FREQUENCY_LOOP, integral_action, loop_above
-from tuning.closed_loop import PlantResponse, cascade_loop
+from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
+from tuning.closed_loop import cascade_loop
 from tuning.descent import MISSED, descend
 from tuning.doublet import moment_rms
 from tuning.gains import Gains
 from tuning.manoeuvre import OTHER_AXIS, typical_sizes
+from tuning.plant_response import PlantResponse
 from tuning.reference import ReferenceModel
+from tuning.rigid_body import RigidBody
 
 #: Every gain of the structure that the thesis' tables have.
 FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
@@ -56,7 +58,7 @@ class Task:
     effort : sequence of 2 float or None
         RMS of the moments allowed in each doublet; None: as much as it takes.
     integral : float, 1/s
-        Integral action that is needed, see `tuning.certificate.integral_action`: a vehicle must find its trim.
+        Integral action that is needed, see `tuning.rigid_body.RigidBody.integral_action`: a vehicle must find its trim.
     """
 
     airframe: Airframe
@@ -64,6 +66,7 @@ class Task:
     doublets: Sequence[Scenario]
     outer: ReferenceModel
     plant: PlantResponse
+    body: RigidBody
     peak: float
     effort: Sequence[float] | None
     integral: float
@@ -98,7 +101,7 @@ class Task:
             *(1 - flown_effort(flight) / most for flight, most in zip(flights, allowed, strict=True)),
             1 - float((1 / loop).max()) / self.peak,
             1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
-            float(integral_action(gains.Ki_i, self.plant)) / self.integral - 1,
+            float(self.body.integral_action(gains.Ki_i)) / self.integral - 1,
         ]
 
 

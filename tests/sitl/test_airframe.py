@@ -17,7 +17,7 @@ TS = 0.004
 
 
 def test_the_airframes_come_with_their_gains():
-    assert known_airframes() == ["adam0", "adam0_boom", "adam0_nominal", "adam0_perturbed", "antr", "px4_sih"]
+    assert known_airframes() == ["adam0", "adam0_boom", "adam0_flexible", "adam0_nominal", "adam0_perturbed", "antr", "px4_sih"]
     for name in known_airframes():
         vehicle = load_airframe(name)
         assert vehicle.airframe.name == name
@@ -26,7 +26,7 @@ def test_the_airframes_come_with_their_gains():
 
 def test_an_unknown_airframe_lists_the_known_ones():
     with pytest.raises(
-        SitlError, match=r"unknown airframe 'adam1'.*adam0, adam0_boom, adam0_nominal, adam0_perturbed, antr, px4_sih"
+        SitlError, match=r"unknown airframe 'adam1'.*adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, antr, px4_sih"
     ):
         load_airframe("adam1")
 

@@ -35,7 +35,7 @@ def log():
 @pytest.fixture(scope="module")
 def sets(log):
     siso = tune(log, load_spec(method="siso"))
-    allowed = tuple(1.06 * spent for spent in effort(siso, doublet_model(log, Manoeuvre(**DOUBLET))))
+    allowed = tuple(1.06 * spent for spent in effort(siso, doublet_model(Measured(log), Manoeuvre(**DOUBLET))))
     task = {**DOUBLET, "effort": allowed}
     return {
         "siso": siso,
@@ -78,7 +78,7 @@ def test_refined_siso_gains_stay_diagonal(sets):
 
 def test_the_model_needs_no_more_effort_than_was_allowed(log, sets):
     allowed = sets["refined"].provenance["manoeuvre"]["effort"]
-    needed = effort(sets["refined"], doublet_model(log, Manoeuvre(**DOUBLET)))
+    needed = effort(sets["refined"], doublet_model(Measured(log), Manoeuvre(**DOUBLET)))
     assert np.all(np.array(needed) <= np.array(allowed) * 1.001)
 
 
@@ -122,7 +122,7 @@ def test_the_spectral_radius_is_how_fast_a_flight_grows(gains):
 
 
 def test_refined_gains_are_stable_on_the_model_in_both_loops(log, sets):
-    model = doublet_model(log, Manoeuvre(**DOUBLET))
+    model = doublet_model(Measured(log), Manoeuvre(**DOUBLET))
     for name in ("refined", "refined siso"):
         assert model.spectral_radius(GainStack.of(sets[name])) < 1
 

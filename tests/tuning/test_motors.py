@@ -109,7 +109,7 @@ def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axi
         angles, _ = model.fly(GainStack.of(gains))
         return np.degrees(np.sqrt(np.mean((angles[axis, 0, :, axis] - flown) ** 2)))
 
-    model = doublet_model(log, Manoeuvre(amplitude_deg=40.0, period_s=0.45))
+    model = doublet_model(Measured(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
     without = deviation_deg(dataclasses.replace(model, motors=None))
     assert deviation_deg(model) < 0.25  # of 40
     assert deviation_deg(model) < without / 3
@@ -117,7 +117,7 @@ def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axi
 
 def test_the_drawn_out_switch_of_the_integral_hardly_changes_a_doublet(logs):
     log = logs["adam0_nominal"]
-    model = doublet_model(log, Manoeuvre(amplitude_deg=40.0, period_s=0.45))
+    model = doublet_model(Measured(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
     stack = GainStack.of(tune(log))
     sharp, soft = model.fly(stack)[0], model.fly(stack, 0.05)[0]
     assert 0 < np.degrees(np.abs(soft - sharp).max()) < 0.5

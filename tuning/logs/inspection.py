@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
-from tuning.experiment import Experiment
+from tuning.experiment import Experiment, external_signal
 from tuning.gains import Gains
-from tuning.instruments import excited_stretches, external_signal
+from tuning.instruments import excited_stretches
 from tuning.logs.columns import Columns
 from tuning.logs.flight import flying_parts, intersection
 from tuning.logs.reader import experiment_of, open_log

@@ -1,0 +1,229 @@
+"""The plant's frequency response from one experiment, with its error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tuning.errors import TuningError
+from tuning.experiment import Experiment, external_signal
+from tuning.frequency import local_response
+
+#: Frequencies count where the excitation explains more than this share of a rate's power.
+COHERENT = 0.7
+#: Windows of the response are at least this share of their frequency wide on each side: vehicles answer smoothly there.
+GROWTH = 0.05
+#: Relative errors of G_i (Frobenius norms): below the first it is known whatever its coherence, many bins of little
+#: coherence tell as much as few of a high one; above the second it is not.
+KNOWN, UNKNOWN = 0.3, 0.7
+#: Two known frequencies belong to one stretch up to this ratio: the damped body between them is interpolated.
+HOLE = 1.25
+#: Angles and rates are compared where the angles' relative error is below this.
+SURE = 0.1
+#: Most that rates may lag behind angles, s: filters of a gyro and an estimator.
+LAG = 0.05
+MIN_FREQUENCIES = 8
+#: Plants that are drawn from the error of a response.
+DRAWS = 64
+
+Complex = NDArray[np.complex128]
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PlantResponse:
+    """What one experiment says of the plant, at K frequencies.
+
+    Attributes
+    ----------
+    omega : (K,) array, rad/s
+        Frequencies.
+    G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
+        Responses of rates and angles to the moment.
+    root : (K, 6, 6) array
+        Square root of the noise spectrum of [u, y_i, y_o].
+    reach : (K, 2, 2) array
+        With X (6, 2) of unit complex normals and E = root X reach, G_i + E_i - G_i E_u and G_o + E_o - G_o E_u are
+        as likely as G_i and G_o.
+    coherence : (K, 2) array
+        Multiple coherence of each rate with the excitation.
+    Ts : float, s
+        Sampling period.
+    """
+
+    omega: Signal
+    G_i: Complex
+    G_o: Complex
+    root: Complex
+    reach: Complex
+    coherence: Signal
+    Ts: float
+
+    def deviation(self) -> Signal:
+        """Standard deviation of each element of G_i, (K, 2, 2)."""
+        noise = np.linalg.norm(self.root[:, 2:4] - self.G_i @ self.root[:, :2], axis=2)
+        reach = np.linalg.norm(self.reach, axis=1)
+        deviation: Signal = noise[:, :, None] * reach[:, None, :]
+        return deviation
+
+    def known(self) -> NDArray[np.bool_]:
+        """Where G_i is known: the excitation explains both rates, or its error is small all the same, (K,)."""
+        error = np.linalg.norm(self.deviation(), axis=(1, 2)) / np.linalg.norm(self.G_i, axis=(1, 2))
+        return np.asarray(np.all(self.coherence > COHERENT, axis=1) & (error < UNKNOWN) | (error < KNOWN))
+
+    def known_run(self) -> NDArray[np.intp]:
+        """The longest stretch of known frequencies, as indices; gaps up to `HOLE` do not end it."""
+        indices = np.flatnonzero(self.known())
+        if not len(indices):
+            return indices
+        far = self.omega[indices[1:]] > HOLE * self.omega[indices[:-1]] + 2 * (self.omega[1] - self.omega[0])
+        runs = np.split(indices, np.flatnonzero(far) + 1)
+        return max(runs, key=len)
+
+    def band(self, axis: int) -> tuple[float, float] | None:
+        """Where the excitation explains an axis' rate, rad/s: from the first to the last such frequency; None: nowhere."""
+        where = self.omega[self.coherence[:, axis] > COHERENT]
+        return (float(where[0]), float(where[-1])) if len(where) else None
+
+    def relative_error(self) -> Signal:
+        """Standard deviation of G_o over its size, (K,), Frobenius norms."""
+        spread = (self.root[:, 4:] - self.G_o @ self.root[:, :2], self.reach, self.G_o)
+        noise, reach, size = (np.linalg.norm(matrix, axis=(1, 2)) for matrix in spread)
+        relative: Signal = noise * reach / size
+        return relative
+
+    def at(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> PlantResponse:
+        """The response at some of the frequencies."""
+        arrays = {name: value[which] for name, value in vars(self).items() if name != "Ts"}
+        return PlantResponse(Ts=self.Ts, **arrays)
+
+    def extended(self) -> PlantResponse:
+        """The response with frequencies below its own added, where rates integrate the moment and angles the rates.
+
+        Set-points have most of their power there, and there the closed loop hardly depends on the plant: so the shape
+        of a rigid body, 1/w and 1/w^2 from the mean of the lowest frequencies on, is enough.
+        """
+        step = float(np.diff(self.omega).min())
+        low = np.arange(self.omega[0] - step, step / 2, -step)[::-1]
+        if not len(low):
+            return self
+        first, w = slice(0, 3), self.omega[:, None, None]
+        below = low[:, None, None]
+        down = (self.omega[0] / below) ** np.repeat([0, 1, 2], 2)[:, None]
+        return PlantResponse(
+            omega=np.concatenate([low, self.omega]),
+            G_i=np.concatenate([(w * self.G_i)[first].mean(axis=0) / below, self.G_i]),
+            G_o=np.concatenate([(w**2 * self.G_o)[first].mean(axis=0) / below**2, self.G_o]),
+            root=np.concatenate([down * self.root[0], self.root]),
+            reach=np.concatenate([np.repeat(self.reach[:1], len(low), axis=0), self.reach]),
+            coherence=np.concatenate([np.repeat(self.coherence[:1], len(low), axis=0), self.coherence]),
+            Ts=self.Ts,
+        )
+
+    def interpolated(self, share: float) -> PlantResponse:
+        """The response with frequencies between its own, none further from the next than a share of itself.
+
+        A damped body has G_i^-1 and G_o^-1 / w that are linear in w: they are interpolated. All else is the nearest's.
+        """
+        counts = np.ceil(np.diff(self.omega) / (share * self.omega[:-1])).astype(int)
+        place = np.concatenate([*(k + np.arange(n) / n for k, n in enumerate(counts)), [len(counts)]])
+        omega = np.interp(place, np.arange(len(self.omega)), self.omega)
+        low = np.minimum(place.astype(int), len(counts) - 1)
+        part, new, old = (place - low)[:, None, None], omega[:, None, None], self.omega[:, None, None]
+
+        def between(G: Complex) -> Complex:
+            inverse = np.linalg.inv(G)
+            value: Complex = np.linalg.inv((1 - part) * inverse[low] + part * inverse[low + 1])
+            return value
+
+        dense = self.at(np.rint(place).astype(int))
+        return replace(dense, omega=omega, G_i=between(self.G_i), G_o=between(old * self.G_o) / new)
+
+    def draw(self, generator: np.random.Generator) -> PlantResponse:
+        """Another plant that the experiment allows, from its error distribution."""
+        shape = (len(self.omega), 6, 2)
+        X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
+        E = self.root @ X @ self.reach
+        E_u, E_i, E_o = E[:, :2], E[:, 2:4], E[:, 4:]
+        return replace(self, G_i=self.G_i + E_i - self.G_i @ E_u, G_o=self.G_o + E_o - self.G_o @ E_u)
+
+
+def plant_response(experiment: Experiment, instrument: Signal, upper: float = np.inf) -> PlantResponse:
+    """Joint input-output estimate G = T_yw T_uw^-1, consistent in closed loop.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        One flight.
+    instrument : (N, 2) array
+        Its external signal w.
+    upper : float, rad/s
+        Largest frequency of interest; by default all below the Nyquist frequency.
+
+    Raises
+    ------
+    TuningError
+        When the flight is too short, or w does not reach both axes.
+    """
+    signals = np.hstack([experiment.u, experiment.y_i, experiment.y_o])
+    upper = min(upper, 0.95 * np.pi / experiment.Ts)
+    found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper, GROWTH)
+    T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
+    if np.any(np.linalg.matrix_rank(T_u) < 2):
+        raise TuningError("not excited: the external signal does not move both moments independently")
+    for name, T in (("rates", T_i), ("angles", T_o)):
+        if np.any(np.linalg.matrix_rank(T) < 2):
+            raise TuningError(
+                f"{experiment.source}: roll and pitch {name} are one signal; check what was logged as pitch"
+            )
+    inverse = np.linalg.inv(T_u)
+    plant = PlantResponse(
+        omega=found.omega,
+        G_i=T_i @ inverse,
+        G_o=T_o @ inverse,
+        root=_root(found.noise),
+        reach=_root(found.error).transpose(0, 2, 1) @ inverse,
+        coherence=found.explained[:, 2:4],
+        Ts=experiment.Ts,
+    )
+    return _angles_from_rates(plant)
+
+
+def measured_plant(experiment: Experiment) -> PlantResponse:
+    """The plant's frequency response from the experiment's external signal; see `plant_response`."""
+    return plant_response(experiment, external_signal(experiment)[0])
+
+
+def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
+    """Angles by integrating the rates where these are the surer: noise of an angle does not fall with frequency.
+
+    What lies between the two besides the integral, such as the gyro's filter, is a gain and a delay, found where both
+    are known well.
+    """
+    s = 1j * plant.omega
+    integral = plant.G_i / s[:, None, None]
+    spread = np.linalg.norm(plant.root[:, 4:] - plant.G_o @ plant.root[:, :2], axis=(1, 2))
+    of_rates = np.linalg.norm(plant.root[:, 2:4] - plant.G_i @ plant.root[:, :2], axis=(1, 2)) / plant.omega
+    both = plant.known() & (plant.relative_error() < SURE)
+    if np.count_nonzero(both) < MIN_FREQUENCIES:
+        return plant
+    quotient = np.einsum("kij,kij->k", plant.G_o, integral.conj()) / np.sum(np.abs(integral) ** 2, axis=(1, 2))
+    omega, phase = plant.omega[both], np.unwrap(np.angle(quotient[both]))
+    lead = float(np.clip(omega @ phase / (omega @ omega), -LAG, LAG))
+    gain = float(np.median(np.abs(quotient[both])))
+    better = of_rates < spread
+    better[: np.flatnonzero(both)[-1] // 2] = False
+    change = np.where(better, gain * np.exp(1j * plant.omega * lead) / s, 0)[:, None, None]
+    root = plant.root.copy()
+    root[:, 4:] = np.where(better[:, None, None], change * root[:, 2:4], root[:, 4:])
+    G_o = np.where(better[:, None, None], change * plant.G_i, plant.G_o)
+    return replace(plant, G_o=G_o, root=root)
+
+
+def _root(matrices: Complex) -> Complex:
+    """R with R R^H = each of the positive semidefinite `matrices`."""
+    values, vectors = np.linalg.eigh(matrices)
+    root: Complex = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
+    return root
