@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.certificate import certify
+from tuning.certificate import UNSTABLE, certify
 from tuning.closed_loop import refine_outer
 from tuning.controller import rebuild_rate_setpoint
 from tuning.doublet import doublet_model
@@ -17,15 +17,19 @@ from tuning.experiment import Experiment
 from tuning.gains import Gains, Limits, YawGains
 from tuning.gates import examine_band, examine_estimates, examine_saturation
 from tuning.instruments import Instruments, Stretches, align, excited_stretches, instruments
+from tuning.integral import with_positive_integral
 from tuning.manoeuvre import refine_cascade
 from tuning.measured import Measured
 from tuning.reference import ReferenceModel
+from tuning.rigid_body import RigidBody
 from tuning.siso import siso_vrft
 from tuning.spec import TuningSpec
 from tuning.vrft import LoopEstimate, vrft
 
 #: Periods of a log and of a gain set may differ by this share.
 PERIOD_TOLERANCE = 0.02
+#: Share of the longest stretch that may be spent until a rate controller that is run backwards has forgotten its start.
+FORGOTTEN = 0.25
 NO_MOTORS = (
     "the log does not say how the motors are moved (PX4: actuator_motors, with THR_MDL_FAC set): where the doublet "
     "drives them to their limits the refined gains are not the best"
@@ -74,7 +78,9 @@ class CascadeEstimate:
         return _assemble([loop.deviations[term] for loop in loops], self.stretches)
 
 
-def estimate(experiment: Experiment, spec: TuningSpec, repeat: Experiment | None = None) -> CascadeEstimate:
+def estimate(
+    experiment: Experiment, spec: TuningSpec, repeat: Experiment | None = None, body: RigidBody | None = None
+) -> CascadeEstimate:
     """VRFT with extended instrumental variables of both loops, (3.26)-(3.34), and nothing else.
 
     Parameters
@@ -85,6 +91,8 @@ def estimate(experiment: Experiment, spec: TuningSpec, repeat: Experiment | None
         Method and reference models.
     repeat : Experiment, optional
         A second flight of the same experiment, for the instrument ``repeated``.
+    body : RigidBody, optional
+        Through which the integral gains are kept positive; None: they are left as they come.
 
     Raises
     ------
@@ -114,6 +122,9 @@ def estimate(experiment: Experiment, spec: TuningSpec, repeat: Experiment | None
         )
         for axes, segments in stretches
     ]
+    kept: list[str] = []
+    if body is not None:
+        inner, kept = with_positive_integral(inner, stretches, body)
     found: dict[str, Any] = {
         TERMS[term]: _assemble([loop.gains[term] for loop in inner], stretches) for term in spec.structure
     }
@@ -137,7 +148,7 @@ def estimate(experiment: Experiment, spec: TuningSpec, repeat: Experiment | None
         for axes, segments in stretches
     ]
     gains = replace(gains, Kp_o=_assemble([loop.gains["P"] for loop in outer], stretches))
-    return CascadeEstimate(gains, stretches, inner, outer, chosen, warnings)
+    return CascadeEstimate(gains, stretches, inner, outer, chosen, (*kept, *warnings))
 
 
 def _loop(
@@ -180,10 +191,16 @@ def _rate_setpoint(
     warnings : tuple of str
     """
     r_i, settling = np.zeros_like(experiment.y_i), 0
+    longest = max(stop - start for start, stop in experiment.segments)
     try:
         for start, stop in experiment.segments:
             u, y_i = experiment.u[start:stop], experiment.y_i[start:stop]
             r_i[start:stop], settling = rebuild_rate_setpoint(gains, u, y_i)
+        if settling > FORGOTTEN * longest:
+            raise NotMinimumPhaseError(
+                f"run backwards the rate controller needs {settling * experiment.Ts:.0f} s to forget where it began, "
+                f"and the longest stretch is {longest * experiment.Ts:.0f} s"
+            )
     except NotMinimumPhaseError as error:
         quotients = [m_o.over(m_i) for m_o in outer for m_i in inner]
         warning = (
@@ -226,7 +243,7 @@ def tune(
     """
     spec = spec or TuningSpec()
     measured = measured or Measured(experiment)
-    found = estimate(experiment, spec, repeat)
+    found = estimate(experiment, spec, repeat, measured.body)
     plant = measured.response
     warnings = [
         *experiment.warnings,
@@ -280,7 +297,14 @@ def tune(
         "samples": [found.inner[0].samples, found.outer[0].samples],
         "standard_deviation": {matrix: value.tolist() for matrix, value in deviations.items()},
     }
-    return _certified(replace(gains, provenance=provenance), measured, spec)
+    tuned = _certified(replace(gains, provenance=provenance), measured, spec)
+    verdict, reason = tuned.verdict()
+    if verdict == UNSTABLE:
+        raise TuningError(
+            f"{experiment.source}: the gains that this log gives for these models are unstable, nothing is written: {reason}; "
+            "record a longer or stronger excitation, or ask for a slower rate loop"
+        )
+    return tuned
 
 
 def _certified(gains: Gains, measured: Measured, spec: TuningSpec) -> Gains:

@@ -31,6 +31,8 @@ from tuning.thresholds import DEFAULT_THRESHOLDS, Thresholds
 HIGH_FREQUENCY_LOOP = 0.5
 #: A loop that has become small once may be larger again up to this ratio of frequencies: noise about the limit.
 ABOUT = 1.25
+#: A gain whose error is below this share of it is not noise, whatever the coherence.
+NOT_NOISE = 0.5
 #: Where the band begins the sensitivity may at most be this: the loop must be in charge of what nobody measured below.
 LOW_FREQUENCY_SENSITIVITY = 0.5
 #: Neighbouring frequencies differ by this share at most: a loop at the limit has a peak that is narrower than the
@@ -136,6 +138,7 @@ def certify(
     normal = _Normaliser(inner, outer, dense.omega)
     windings = [normal.windings(loop) for loop in draws]
     figures = _figures(above, dense, nominal, draws, inner)
+    figures["Ms"] = max(figures["Ms"], _peak_beyond(gains, plant, band[1]))
     doubtful = sum(any(w) for w in windings)
     if any(normal.windings(nominal)) and doubtful > DRAWS / 2:
         where = "the rate loop alone" if normal.windings(nominal)[0] else "the whole cascade"
@@ -323,16 +326,30 @@ def large_again(gains: Gains, plant: PlantResponse) -> tuple[float, float] | Non
     small = small[small > known[np.argmax(gain[known])]] if len(small) else small
     if not len(small):
         return None
-    beyond = plant.omega > ABOUT * plant.omega[small[0]]
-    explained = np.any(plant.coherence > COHERENT, axis=1)
     upper = gain + error
-    counts = beyond & (plant.known() | explained) & (upper > HIGH_FREQUENCY_LOOP)
-    # Where the log does not know the response a gain counts that cannot be noise.
-    counts |= beyond & (gain - 2 * error > HIGH_FREQUENCY_LOOP)
+    counts = _told(plant, gain, error) & (plant.omega > ABOUT * plant.omega[small[0]]) & (upper > HIGH_FREQUENCY_LOOP)
     if not counts.any():
         return None
     worst = int(np.argmax(np.where(counts, upper, 0)))
     return float(plant.omega[worst]), float(upper[worst])
+
+
+def _told(plant: PlantResponse, gain: Signal, error: Signal) -> NDArray[np.bool_]:
+    """Where the log says something of a loop's gain: it knows the response, or the excitation is seen on an axis, or the
+    gain is not noise.
+    """
+    seen = np.any(plant.coherence > COHERENT, axis=1)
+    return np.asarray(plant.known() | seen | (error < NOT_NOISE * gain))
+
+
+def _peak_beyond(gains: Gains, plant: PlantResponse, end: float) -> float:
+    """The largest that the sensitivity may be where the log says something above `end` (rad/s), error included."""
+    gain, error = _rate_loop_gain(gains, plant)
+    counts = _told(plant, gain, error) & (plant.omega > end)
+    if not counts.any():
+        return 0.0
+    least = singular_values(np.eye(2) + cascade_loop(gains, plant.at(counts)).L_u)[1] - error[counts]
+    return float(1 / max(least.min(), 1e-6))
 
 
 def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]:

@@ -14,7 +14,7 @@ from tuning.frequency import local_response
 #: Frequencies count where the excitation explains more than this share of a rate's power.
 COHERENT = 0.7
 #: Windows of the response are at least this share of their frequency wide on each side: vehicles answer smoothly there.
-GROWTH = 0.05
+GROWTH = 0.08
 #: Relative errors of G_i (Frobenius norms): below the first it is known whatever its coherence, many bins of little
 #: coherence tell as much as few of a high one; above the second it is not.
 KNOWN, UNKNOWN = 0.3, 0.7

@@ -1,0 +1,117 @@
+"""Integral gains that a plant can bear: positive through it in every direction.
+
+Noise, gusts and short logs tell little of the integral gains, and VRFT then finds negative ones, which run away slowly.
+Where that happens the gains are moved to the nearest ones, in the metric of their own covariance, whose integral action
+through the measured plant is positive; the other gains follow as their correlation with the integral ones asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from tuning.errors import TuningError
+from tuning.instruments import Stretches
+from tuning.rigid_body import RigidBody
+from tuning.vrft import LoopEstimate
+
+#: The least integral action over the least proportional one, 1/s: an offset is gone within some ten seconds.
+LEAST = 0.1
+
+Matrix = NDArray[np.float64]
+
+
+def with_positive_integral(
+    loops: Sequence[LoopEstimate], stretches: Stretches, body: RigidBody
+) -> tuple[list[LoopEstimate], list[str]]:
+    """Rate-loop estimates whose integral gains are positive through the plant.
+
+    Parameters
+    ----------
+    loops : sequence of LoopEstimate
+        One for both axes, or one for each.
+    stretches : list of (axes, segments)
+        The axes of each.
+    body : RigidBody
+        Of the same experiment.
+
+    Returns
+    -------
+    loops : list of LoopEstimate
+    warnings : list of str
+        What was moved; empty when nothing was.
+
+    Raises
+    ------
+    TuningError
+        When the proportional gains are not positive through the plant.
+    """
+    found, warnings = [], []
+    for (axes, _), loop in zip(stretches, loops, strict=True):
+        B = body.B[axes, axes]
+        floor = LEAST * _least(B @ loop.gain("P"))
+        if floor <= 0:
+            raise TuningError(
+                "the proportional gains that VRFT finds are not positive through the measured plant: the log is too short "
+                "or too noisy for this rate loop; record longer, or excite more strongly"
+            )
+        if "I" in loop.gains and _least(B @ loop.gains["I"]) < floor:
+            before = loop.gains["I"]
+            loop = _moved(loop, _nearest(loop, B, floor))
+            old, new = (", ".join(f"{v:.3g}" for v in matrix.ravel()) for matrix in (before, loop.gains["I"]))
+            warnings.append(
+                f"the log asks for integral gains that run away ({old}): they are kept to the nearest that do not ({new}); "
+                "record longer or excite lower frequencies to know them"
+            )
+        found.append(loop)
+    return found, warnings
+
+
+def _least(action: Matrix) -> float:
+    """Smallest eigenvalue of the symmetric part."""
+    return float(np.linalg.eigvalsh((action + action.T) / 2)[0])
+
+
+def _columns(loop: LoopEstimate) -> slice:
+    """Where the integral gains of a row are among its coefficients."""
+    n, place = len(loop.gains["I"][0]), list(loop.gains).index("I")
+    return slice(n * place, n * (place + 1))
+
+
+def _nearest(loop: LoopEstimate, B: Matrix, floor: float) -> Matrix:
+    """The integral gains Ki with B Ki = L L' + floor I + skew that are nearest to those estimated."""
+    Ki, columns = loop.gains["I"], _columns(loop)
+    roots = [np.linalg.cholesky(np.linalg.pinv(C[columns, columns], hermitian=True)) for C in loop.solution.covariance]
+    inverse, n = np.linalg.inv(B), len(Ki)
+    lower, upper = np.tril_indices(n), np.triu_indices(n, 1)
+
+    def matrix(values: NDArray[np.float64]) -> Matrix:
+        L, skew = np.zeros((n, n)), np.zeros((n, n))
+        L[lower] = values[: len(lower[0])]
+        skew[upper] = values[len(lower[0]) :]
+        nearest: Matrix = inverse @ (L @ L.T + floor * np.eye(n) + skew - skew.T)
+        return nearest
+
+    def distance(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.concatenate([root.T @ row for root, row in zip(roots, matrix(values) - Ki, strict=True)])
+
+    action = B @ Ki
+    values, vectors = np.linalg.eigh((action + action.T) / 2)
+    start = np.linalg.cholesky((vectors * np.maximum(values - floor, 0.1 * floor)) @ vectors.T)
+    first = np.concatenate([start[lower], ((action - action.T) / 2)[upper]])
+    return matrix(least_squares(distance, first, x_scale="jac").x)
+
+
+def _moved(loop: LoopEstimate, Ki: Matrix) -> LoopEstimate:
+    """The estimate with these integral gains, and the others as they are most likely then."""
+    columns, coefficients = _columns(loop), loop.solution.B.copy()
+    for row, C, wanted in zip(coefficients, loop.solution.covariance, Ki, strict=True):
+        row += C[:, columns] @ np.linalg.pinv(C[columns, columns], hermitian=True) @ (wanted - row[columns])
+        row[columns] = wanted
+    n = len(Ki[0])
+    gains = {term: coefficients[:, i * n : (i + 1) * n] for i, term in enumerate(loop.gains)}
+    return replace(loop, gains=gains, solution=replace(loop.solution, B=coefficients))
