@@ -38,6 +38,8 @@ class Experiment:
         The controller that flew, when the log says so.
     motors : Motors or None
         How the allocator moved the motors, when the log says so.
+    warnings : tuple of str
+        What is wrong with the log although it can be used: damage, parameters that changed.
 
     Raises
     ------
@@ -57,6 +59,7 @@ class Experiment:
     sha256: str = ""
     flown: Gains | None = None
     motors: Motors | None = None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.segments:
