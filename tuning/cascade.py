@@ -229,6 +229,7 @@ def tune(
     found = estimate(experiment, spec, repeat)
     plant = plant or measured_plant(experiment)
     warnings = [
+        *experiment.warnings,
         *found.warnings,
         *examine_saturation(experiment),
         *examine_estimates(experiment.source, found.stretches, found.inner),

@@ -49,6 +49,7 @@ NOTE = (
     "gains of this controller say; give yaw, limits and derivative_cutoff_hz in a --spec file"
 )
 
+
 def record_dataflash(path: Path) -> Recording:
     """Read an ArduPilot dataflash log.
 
@@ -107,6 +108,7 @@ def record_dataflash(path: Path) -> Recording:
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((damage,) if damage else ()), *vehicle.warnings),
         notes=(NOTE,),
+        span=_span(log),
     )
 
 
@@ -121,8 +123,10 @@ class _Log:
         """
         values = self.file.fields(message, names)
         time = self._clock(message)
-        if values is None or time is not None:
-            return None if values is None else [time, *values]
+        if values is None:
+            return None
+        if time is not None:
+            return [time, *values]
         for other in ("RATE", "ATT"):
             time = self._clock(other)
             if time is not None and len(time):
@@ -247,6 +251,13 @@ def _parameters(log: _Log) -> tuple[dict[str, float], list[tuple[float, str, flo
             changes.append((float(time), name, value))
         now[name] = value
     return first, changes
+
+
+def _span(log: _Log) -> Interval | None:
+    """First and last time (s) of the message that there are most of."""
+    most = max(log.file.offsets, key=lambda name: len(log.file.offsets[name]), default="")
+    columns = log.timed(most, ())
+    return (float(columns[0].min()), float(columns[0].max())) if columns and len(columns[0]) else None
 
 
 def _format(texts: Sequence[str], old: bool) -> str:

@@ -19,6 +19,7 @@ from tuning.motors import Motors, fit_motors
 ULOG = b"ULog\x01\x12\x35"
 DATAFLASH = b"\xa3\x95"
 MATLAB = b"MATLAB 5.0 MAT-file"
+CHANGED = "parameters were changed during the part that is used, the values before are taken as flown: "
 MATLAB_HDF5 = (b"MATLAB 7.3 MAT-file", b"\x89HDF\r\n\x1a\n")
 
 
@@ -91,17 +92,29 @@ def experiment_of(recording: Recording) -> Experiment:
     TuningError
         When the log lacks a signal, never flew, is too slow or too short.
     """
+    try:
+        return _experiment(recording)
+    except TuningError as error:
+        if not recording.warnings:
+            raise
+        raise TuningError(f"{error} (the log: {'; '.join(recording.warnings)})") from error
+
+
+def _experiment(recording: Recording) -> Experiment:
     recording.require_signals()
     parts = flying_parts(recording)
     grid = on_common_grid(recording.signals, parts, str(recording.path), recording.advice)
+    begin = max(parts[0][0], float(recording.signals["u"].time[0]))
+    parameters, changed = recording.parameters_during(begin, parts[-1][1])
     experiment = Experiment(
         Ts=grid.Ts,
         segments=grid.segments,
         source=recording.path.name,
         sha256=sha256(recording.path.read_bytes()),
-        flown=flown_gains(recording.parameters, grid.Ts),
+        flown=flown_gains(parameters, grid.Ts),
         motors=_motors(recording, parts),
-        **grid.signals,
+        warnings=(*recording.warnings, *((CHANGED + "; ".join(changed),) if changed else ())),
+        **grid.signals,  # type: ignore[arg-type]  # of the names in Experiment
     )
     _check_units(experiment, recording)
     return experiment

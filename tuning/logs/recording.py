@@ -55,6 +55,8 @@ class Recording:
         What the reader of an inspection should know besides.
     commands : Series or None
         Motor commands as thrust fractions, a column each. None: the log does not hold them.
+    span : tuple (begin, end) or None, s
+        First and last time in the log, for one without signals. None: not known.
     """
 
     path: Path
@@ -71,6 +73,7 @@ class Recording:
     warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
     commands: Series | None = None
+    span: Interval | None = None
 
     def __post_init__(self) -> None:
         signals, warnings = {}, [*self.warnings]
@@ -99,7 +102,7 @@ class Recording:
                 f"In this log: {listed(self.contents)}"
             )
         if wrong:
-            raise TuningError(f"{self.path}: {'; '.join([*wrong, *self.warnings])}")
+            raise TuningError(f"{self.path}: {'; '.join(wrong)}")
 
     def parameters_during(self, begin: float, end: float) -> tuple[dict[str, float], list[str]]:
         """The parameters in force when a part of the log (s) begins, and what was changed before it ends."""
