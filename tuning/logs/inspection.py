@@ -152,7 +152,10 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
         recording=recording,
         seconds=end - begin,
         airborne=None if recording.airborne is None else since_begin(recording.airborne),
-        signals={name: _signal(name, signal, limit) for name, signal in recording.signals.items()},
+        signals={
+            name: _signal(name, signal, recording.published.get(name, signal.time), limit)
+            for name, signal in recording.signals.items()
+        },
         parts=since_begin(parts),
         experiment=experiment,
         excitation=excitation,
@@ -160,9 +163,10 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
     )
 
 
-def _signal(name: str, signal: Series, limit: float) -> SignalReport:
-    period = sampling_period(signal.time)
-    pauses = np.diff(signal.time)
+def _signal(name: str, signal: Series, stamps: NDArray[np.float64], limit: float) -> SignalReport:
+    pauses = np.diff(stamps)
+    pauses = pauses[pauses > 0]
+    period = sampling_period(np.append(0, np.cumsum(pauses)))
     low, high = signal.values.min(axis=0), signal.values.max(axis=0)
     share = np.mean(np.abs(signal.values) >= 0.999 * limit, axis=0)
     return SignalReport(

@@ -17,7 +17,11 @@ from tuning.logs.resample import REQUIRED, Interval, Series, monotone
 RANGES = {"u": 5.0, "u_bar": 5.0, "y_i": 100.0, "r_i": 100.0, "y_o": 2 * np.pi, "r_o": 2 * np.pi}
 UNITS = dict.fromkeys(("u", "u_bar"), "a moment as a share of the full one") | dict.fromkeys(("y_i", "r_i"), "rad/s")
 UNITS |= dict.fromkeys(("y_o", "r_o"), "rad")
-MAX_LISTED = 60  # names in a message: all topics of a PX4 log at its default profile
+MAX_LISTED = 100  # names in a message: more than the topics of a PX4 log at its default profile
+#: Beginnings of the names of parameters of PX4, ArduPilot and our module that make the loop: gains, filters, motors.
+LOOP = ("MIMO_", "MC_", "IMU_", "THR_", "CA_", "ATC_", "RATE_", "STB_", "INS_", "MOT_", "CC", "FILT")
+#: Those among them that steer an experiment and nothing else: our injector, PX4's autotune.
+EXPERIMENT = ("MIMO_EX", "MC_AT_")
 MAX_WILD = 0.01  # share of a signal that may lie outside its range: damage; more is a wrong unit
 
 
@@ -55,6 +59,8 @@ class Recording:
         What the reader of an inspection should know besides.
     commands : Series or None
         Motor commands as thrust fractions, a column each. None: the log does not hold them.
+    published : mapping
+        Name -> stamps (N,), s, with which a signal was logged, where those of `signals` are of the control cycle.
     span : tuple (begin, end) or None, s
         First and last time in the log, for one without signals. None: not known.
     """
@@ -73,6 +79,7 @@ class Recording:
     warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
     commands: Series | None = None
+    published: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     span: Interval | None = None
 
     def __post_init__(self) -> None:
@@ -105,14 +112,15 @@ class Recording:
             raise TuningError(f"{self.path}: {'; '.join(wrong)}")
 
     def parameters_during(self, begin: float, end: float) -> tuple[dict[str, float], list[str]]:
-        """The parameters in force when a part of the log (s) begins, and what was changed before it ends."""
+        """The parameters in force when a part of the log (s) begins, and what of the loop changed before its end."""
         values = dict(self.parameters)
         for time, name, value in self.changes:
             if time <= begin:
                 values[name] = value
         now, changed = dict(values), []
         for time, name, value in self.changes:
-            if begin < time <= end and now.get(name) != value:
+            ours = name.startswith(LOOP) and not name.startswith(EXPERIMENT)
+            if ours and begin < time <= end and now.get(name) != value:
                 old = now.get(name, math.nan)
                 changed.append(f"{name} from {old:.6g} to {value:.6g} after {time - begin:.1f} s")
                 now[name] = value

@@ -69,8 +69,10 @@ def record_ulog(path: Path) -> Recording:
     excitation = _excitation(log)
     if excitation is not None:
         signals["u_bar"] = excitation
+    published = {}
     for signal in ("r_o", "r_i", "u_bar"):
         if signal in signals and not log.is_sampled(signals[signal].topic) and "u" in signals:
+            published[signal] = signals[signal].time
             signals[signal] = _at_cycle(signals[signal], log.published(signals["u"].topic))
     file = log.file
     airborne, evidence = _airborne(log)
@@ -95,6 +97,7 @@ def record_ulog(path: Path) -> Recording:
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((file.damage,) if file.damage else ()), *vehicle.warnings),
         commands=_commands(log) if 0 not in curves else None,
+        published=published,
         span=_span(file),
     )
 
