@@ -97,15 +97,16 @@ def open_dataflash(path: Path) -> DataflashFile:
     names: dict[int, Format] = {}
     places: dict[int, list[int]] = {FMT: []}
     at, end, lost, gaps = 0, len(content), 0, 0
+    solid = len(content.rstrip(PADDING))
     while at < end:
         following = _following(content, lengths, at)
-        if not following or not _continues(content, following):
-            resumed = _resume(content, lengths, at + 1)
+        if not following or not _continues(content, solid, following):
+            resumed = _resume(content, lengths, solid, at + 1)
             # Whole all the same where just the head of the next message is damaged.
             if not following or following + _length(content, lengths, following) != resumed:
                 if resumed == end and _cut(content, lengths, at):
                     break
-                if resumed < end or content[at:].strip(PADDING):
+                if at < solid:
                     lost, gaps = lost + resumed - at, gaps + 1
                 at = resumed
                 continue
@@ -131,8 +132,9 @@ def open_dataflash(path: Path) -> DataflashFile:
     )
 
 
-def _continues(content: bytes, at: int) -> bool:
-    return at == len(content) or content.startswith(HEAD, at)
+def _continues(content: bytes, solid: int, at: int) -> bool:
+    """Whether a message or nothing but padding follows here."""
+    return at >= solid or content.startswith(HEAD, at)
 
 
 def _length(content: bytes, lengths: list[int], at: int) -> int:
@@ -154,11 +156,11 @@ def _following(content: bytes, lengths: list[int], at: int) -> int:
     return at + length if length and at + length <= len(content) else 0
 
 
-def _resume(content: bytes, lengths: list[int], start: int) -> int:
+def _resume(content: bytes, lengths: list[int], solid: int, start: int) -> int:
     """Where the next message begins that another one or the end of the file follows; the end if there is none."""
     while (start := content.find(HEAD, start)) >= 0:
         following = _following(content, lengths, start)
-        if following and _continues(content, following):
+        if following and _continues(content, solid, following):
             return start
         start += 1
     return len(content)

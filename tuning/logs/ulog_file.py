@@ -27,6 +27,8 @@ APPENDED = 1  # the only incompatible flag that there is: data appended after a 
 
 TYPES = {"int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4"}
 TYPES |= {"int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8", "bool": "i1", "char": "i1"}
+LEVELS = b"01234567"  # of text messages
+_NAME, _KEY = re.compile(rb"[A-Za-z0-9_/]+:"), re.compile(rb"[A-Za-z0-9_\[\]]+ [ -~]+")
 _FIELD = re.compile(r"([A-Za-z0-9_/]+)(?:\[(\d{1,5})\])? ([A-Za-z0-9_]+)")
 
 #: Fields of a format: (type, length of the array or 0, name).
@@ -75,6 +77,7 @@ class UlogFile:
     changes: list[tuple[float, str, float]] = field(default_factory=list)
     damage: str = ""
     _sizes: dict[str, int] = field(default_factory=dict)
+    _impossible: set[str] = field(default_factory=set)
     _started: bool = False
     _stamp: tuple[Topic, int] | None = None
 
@@ -123,6 +126,9 @@ class UlogFile:
         if lost:
             places = f"{gaps} place{'s'[: gaps > 1]}"
             damage.append(f"damaged: {lost} of {end} bytes, in {places}, are no message and left out")
+        if self._impossible:
+            names = ", ".join(sorted(self._impossible)[:3])
+            damage.append(f"damaged: the format of {names} makes no message, none of them is read")
         if at < end:
             damage.append("it ends in the middle of a message: not downloaded completely, or the power was cut")
         self.damage = "; ".join(damage)
@@ -135,14 +141,24 @@ class UlogFile:
         following = at + 3 + size
         if kind not in KINDS or not size or following > len(self.content):
             return 0
-        if kind == ord("D"):
-            topic = self.topics.get(struct.unpack_from("<H", self.content, at + 3)[0]) if size >= 2 else None
-            return following if topic and topic.smallest <= size - 2 <= topic.largest else 0
-        if kind == ord("A"):
-            return following if size > 3 and self._text(at + 6, following) in self.formats else 0
-        if kind == ord("S"):
-            return following if self.content[at + 3 : following] == SYNC else 0
-        return following
+        return following if self._sound(chr(kind), at + 3, following) else 0
+
+    def _sound(self, kind: str, start: int, stop: int) -> bool:
+        """Whether bytes can be the contents of a message of a kind."""
+        content, size = self.content, stop - start
+        if kind == "D":
+            topic = self.topics.get(int.from_bytes(content[start : start + 2], "little"))
+            return topic is not None and topic.smallest <= size - 2 <= topic.largest
+        if kind == "A":
+            return self._text(start + 3, stop) in self.formats
+        if kind == "F":
+            return _NAME.match(content, start, stop) is not None
+        if kind in "IPMQ":  # the key: its length, then type and name; in the latter two behind another byte
+            start += kind in "MQ"
+            return _KEY.fullmatch(content, start + 1, min(start + 1 + content[start], stop)) is not None
+        if kind in "LC":
+            return content[start] in LEVELS
+        return size == 8 and content[start:stop] == SYNC if kind == "S" else size == 2 or kind == "B"
 
     def _cut(self, at: int) -> bool:
         """Whether the file ends here, or before the message that begins here does."""
@@ -181,6 +197,8 @@ class UlogFile:
             largest, smallest = self._sum(fields), self._sum(_unpadded(fields))
             if largest <= MAX_MESSAGE and len({label for _, _, label in fields}) == len(fields):
                 self.topics[number] = Topic(name, instance, fields, smallest, largest)
+            else:
+                self._impossible.add(name)
         elif kind in "IP":
             self._keyed(kind, start, following)
 

@@ -95,7 +95,8 @@ def px4_vehicle(status: Mapping[str, NDArray[Any]], parameters: Mapping[str, flo
         system = int(parameters.get("MAV_TYPE", 0))
         said = f"parameter MAV_TYPE is {system}"
     else:
-        said = f"vehicle_status says system type {system}, vehicle type {kind}"
+        known = {"system_type": system, "vehicle_type": kind, "is_rotary_wing": _last(status.get("is_rotary_wing"))}
+        said = f"vehicle_status: {', '.join(f'{name} {value}' for name, value in known.items() if value is not None)}"
     changing = kinds is not None and bool(np.isin(kinds, ROTARY_WING).any() and np.isin(kinds, 2).any())
     if changing or bool(np.any(status.get("is_vtol", 0))) or system in VTOLS:
         if rotary is None:
@@ -105,7 +106,7 @@ def px4_vehicle(status: Mapping[str, NDArray[Any]], parameters: Mapping[str, flo
         return VehicleType("" if hovering else f"a VTOL in forward flight throughout ({said})", hovering)
     name = OTHERS.get(system or 0) or PX4_OTHERS.get(kind or 0)
     if name is None and not system and kinds is None and rotary is not None and not np.any(rotary):
-        name, said = "no rotary wing", "vehicle_status.is_rotary_wing is 0"
+        name = "no rotary wing"
     return VehicleType(f"{name} ({said})" if name else "")
 
 
