@@ -21,16 +21,15 @@ def flight():
     return make_flight(20.0)
 
 
-def px4(path, flight, changes, excited=(5.0, 15.0)):
-    """A log of 20 s that begins at 10 s, with an injected moment in between."""
-    t = flight.t - flight.t[0]
-    noise = np.random.default_rng(0).choice([-0.1, 0.1], len(t))
-    u_bar = np.where((t >= excited[0]) & (t < excited[1]), noise, 0).astype(np.float32)
+def px4(path, flight, changes):
+    """A log of 20 s that begins at 10 s, with an injected moment from 15 to 25 s."""
+    u_bar = np.random.default_rng(0).choice([-0.1, 0.1], (len(flight.t), 2)).astype(np.float32)
+    u_bar[(flight.t < 15) | (flight.t >= 25)] = 0
     topic = {
         "timestamp": microseconds(flight.t + 0.0004),
-        "x": u_bar,
-        "y": u_bar[::-1].copy() if excited == (5.0, 15.0) else u_bar,
-        "name": np.full(len(t), b"MIMO_EXC", "S10"),
+        "x": u_bar[:, 0],
+        "y": u_bar[:, 1],
+        "name": np.full(len(flight.t), b"MIMO_EXC", "S10"),
     }
     return write_ulog(path / "x.ulg", px4_topics(flight, debug_vect=topic), PX4, changes)
 
