@@ -31,8 +31,9 @@ LAYOUTS = {
 }
 #: RATE of ArduCopter 3.3 and older (Log_Write_Rate): motor inputs of +-4500, rates in hundredths of a degree a second.
 OLD_FACTORS = {"u": 1 / 4500, "y_i": 0.01, "r_i": 0.01}
+MILLISECOND = 1e-3  # s
 #: Field with the time -> its unit, s. ArduCopter 3.3 and older have the latter.
-CLOCKS = {"TimeUS": 1e-6, "TimeMS": 1e-3}
+CLOCKS = {"TimeUS": 1e-6, "TimeMS": MILLISECOND}
 
 #: Axis of the system identification mode (SIDS.Ax) whose waveform is added to the moment -> column of u.
 MIXER_AXES = {10: 0, 11: 1}
@@ -159,12 +160,17 @@ class _Log:
 
 def _unrounded(time: NDArray[np.float64]) -> NDArray[np.float64]:
     """Stamps of a uniform loop from stamps in whole milliseconds: a straight line through each stretch."""
-    Ts = sampling_period(time)
-    bounds = [0, *(np.flatnonzero(np.abs(np.diff(time) - Ts) > Ts + 2e-3) + 1).tolist(), len(time)]
+    steps = np.diff(time)
+    usual = np.median(steps)
+    near = np.abs(steps - usual) <= max(usual / 2, MILLISECOND) + 1e-6
     smooth = time.copy()
+    if usual <= 0 or not near.any():
+        return smooth
+    cycles = np.round(steps / np.mean(steps[near]))  # neighbours, even where the loop takes 2.5 ms
+    bounds = [0, *(np.flatnonzero((cycles < 1) | (cycles > MAX_GAP)) + 1).tolist(), len(time)]
     for a, b in itertools.pairwise(bounds):
-        if b - a > 2 and time[b - 1] > time[a]:
-            index = np.round((time[a:b] - time[a]) / Ts)
+        if b - a > 2:
+            index = np.append(0, np.cumsum(cycles[a : b - 1]))
             smooth[a:b] = np.polyval(np.polyfit(index, time[a:b], 1), index)
     return smooth
 

@@ -89,7 +89,7 @@ def px4_topics(flight, **extra):
     return [(name, 0, fields) for name, fields in topics.items()]
 
 
-KINDS = {"Q": "<u8", "f": "<f4", "B": "u1", "c": "<i2", "N": "S16", "Z": "S64", "b": "i1"}
+KINDS = {"Q": "<u8", "I": "<u4", "f": "<f4", "B": "u1", "c": "<i2", "N": "S16", "Z": "S64", "b": "i1"}
 
 
 def dataflash_bytes(messages):
@@ -132,6 +132,18 @@ def ardupilot_messages(flight, angles="ANG"):
             ("TimeUS", "Roll", "Pitch", "DesRoll", "DesPitch"),
             [stamps, *angle],
         ),
+    ]
+
+
+def old_ardupilot_messages(flight):
+    """RATE, ATT and EV as ArduCopter 3.2 and 3.3 log them: milliseconds, hundredths of degrees, inputs of +-4500."""
+    hundredths = 100 * 180 / np.pi
+    stamps = np.floor(np.asarray(flight.t) * 1e3 + 1e-6).astype(np.uint32)
+    rate = [*(hundredths * flight.y_i.T), *(4500 * flight.u.T)]
+    angle = [np.round(hundredths * a) for a in (*flight.y_o.T, *flight.r_o.T)]
+    return [
+        ("RATE", "Iffff", ("TimeMS", "R", "P", "ROut", "POut"), [stamps, *rate]),
+        ("ATT", "Icccc", ("TimeMS", "Roll", "Pitch", "DesRoll", "DesPitch"), [stamps, *angle]),
     ]
 
 
