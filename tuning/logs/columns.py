@@ -104,6 +104,8 @@ def load_columns(path: Path) -> Columns:
     TuningError
         When it cannot be read, is not TOML, or holds an unknown signal, unit or sign.
     """
+    if not path.is_file():
+        raise TuningError(f"{path}: no such file; give the path of a column file (TOML)")
     try:
         return Columns.model_validate(tomllib.loads(path.read_text()))
     except ValidationError as error:

@@ -41,6 +41,7 @@ MIXER_AXES = {10: 0, 11: 1}
 EV_DISARMED, EV_LANDED, EV_NOT_LANDED = 11, 18, 28
 #: The firmware as it introduces itself, and its major version.
 _RELEASE = re.compile(r"[A-Za-z:]{2,16}[ -]*[Vv](\d+)\.\d+\S*")
+SDLOG2_MESSAGES = {"TIME", "ATT"}  # ArduPilot has no message TIME
 SDLOG2 = (
     "a log of PX4 before ULog (sdlog2, .px4log), not of ArduPilot: fly with PX4 1.8 or newer, which writes ULog; or "
     "make a CSV file of it with PX4's sdlog2_dump.py and name its columns with --columns"
@@ -71,7 +72,7 @@ def record_dataflash(path: Path) -> Recording:
         When the file is damaged.
     """
     log = _Log(open_dataflash(path))
-    if log.file.fields("TIME", ("StartTime",)) is not None:
+    if SDLOG2_MESSAGES.issubset(log.file.names()):
         raise TuningError(f"{path}: {SDLOG2}")
     old = log.in_old_units()
     signals = {}

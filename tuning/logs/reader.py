@@ -20,7 +20,13 @@ ULOG = b"ULog\x01\x12\x35"
 DATAFLASH = b"\xa3\x95"
 MATLAB = b"MATLAB 5.0 MAT-file"
 CHANGED = "parameters were changed during the part that is used, the values before are taken as flown: "
-MATLAB_HDF5 = (b"MATLAB 7.3 MAT-file", b"\x89HDF\r\n\x1a\n")
+#: Beginnings of logs that are known and not read -> what to do.
+REFUSED = {
+    b"MATLAB 7.3 MAT-file": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
+    b"\x89HDF\r\n\x1a\n": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
+    b"FMT,": "an ArduPilot log as text; give the .bin file that it was made from",
+    b"H Product:Blackbox": "a Betaflight log; make a CSV file with blackbox_decode and name its columns with --columns",
+}
 
 
 def read_log(path: Path, columns: Columns | None = None) -> Experiment:
@@ -68,8 +74,9 @@ def open_log(path: Path, columns: Columns | None = None) -> Recording:
         from tuning.logs.dataflash import record_dataflash
 
         return record_dataflash(path)
-    if head.startswith(MATLAB_HDF5):
-        raise TuningError(f"{path}: a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')")
+    for beginning, advice in REFUSED.items():
+        if head.startswith(beginning):
+            raise TuningError(f"{path}: {advice}")
     if head.startswith(MATLAB):
         from tuning.logs.table import record_matlab
 

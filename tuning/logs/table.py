@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import json
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -69,6 +70,10 @@ def record_csv(path: Path, columns: Columns) -> Recording:
             twice = sorted(name for name, count in Counter(header).items() if count > 1 and name in used)
             if twice:
                 raise TuningError(f"{path}: column {', '.join(twice)} appears twice; rename one")
+            if all(_is_number(name) for name in header):
+                raise TuningError(
+                    f"{path}: the first line holds numbers; put a line with the names of the columns above"
+                )
             indexed = [field for field in Columns.model_fields if getattr(columns, field).index is not None]
             if indexed:
                 raise TuningError(f"{path}: {', '.join(indexed)}: index is for the columns of a MATLAB matrix")
@@ -139,15 +144,24 @@ def _vector(path: Path, found: Mapping[str, Any], field: str, columns: Columns) 
     got = f"{path}: {name}: got {values.dtype} of shape {values.shape}"
     if values.dtype.kind not in "fiu" or values.ndim not in (1, 2):
         raise TuningError(f"{got}, expected a vector of real numbers")
-    if values.ndim == 2:
+    if values.ndim == 2 or index is not None:
         mend = f'{field} = {{ column = "{name}", index = 1 }}'
-        rows = values if values.shape[0] >= values.shape[1] else values.T  # there are more samples than signals
+        rows = np.atleast_2d(values)
+        rows = rows if rows.shape[0] >= rows.shape[1] else rows.T  # there are more samples than signals
         if index is None:
             raise TuningError(f"{got}, expected a vector of real numbers; pick its column: {mend} (the first is 1)")
         if index > rows.shape[1]:
             raise TuningError(f"{got}: {field}: index {index}, expected 1 to {rows.shape[1]} (the first is 1)")
         values = rows[:, index - 1]
     return values.astype(np.float64)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _cell(text: str) -> float:
@@ -212,9 +226,12 @@ def _clock_faults(given: NDArray[np.float64], columns: Columns) -> tuple[str, ..
         return ()
     found = f"column {name}: steps of {step:.6g} {unit} are a rate of {rate:.4g} Hz and a flight of {seconds:.4g} s"
     if step == 1 and np.all(steps == 1):
-        return (f"{found}: it counts the samples; put the time of each in its place, in seconds",)
+        return (f"{found}: it counts the samples, whose time must be in its place, or {_unit_line(name, 'ms')}",)
     fitting = next((other for other in TIME_UNITS if RATES[0] <= 1 / (step * TIME_UNITS[other]) <= FAST), unit)
     if fitting != unit:
-        mend = f't = {{ column = "{name}", unit = "{fitting}" }}'
-        return (f"{found}, of no multirotor log; tell its unit with --columns: {mend}",)
+        return (f"{found}, of no multirotor log; {_unit_line(name, fitting)}",)
     return (f"{found}, of no multirotor log; its unit must be s, ms, us or ns: minutes, say, must be converted",)
+
+
+def _unit_line(name: str, unit: str) -> str:
+    return f'tell its unit with --columns: t = {{ column = {json.dumps(name)}, unit = "{unit}" }}'

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
+from tuning.logs.recording import listed
 
 MAGIC = b"ULog\x01\x12\x35"
 FIRST = 16  # bytes of the file header
@@ -23,6 +24,7 @@ SYNC = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"
 IS_KIND = np.isin(np.arange(256), list(KINDS))
 CHUNK = 1 << 16  # bytes that are searched at once
 MAX_MESSAGE = 65535  # bytes: the size of a message is 16 bit, so no topic is larger
+UNKNOWN = 1 << 40  # bytes, of a type that is not defined
 APPENDED = 1  # the only incompatible flag that there is: data appended after a crash
 
 TYPES = {"int8_t": "i1", "uint8_t": "u1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4", "uint32_t": "<u4"}
@@ -53,6 +55,8 @@ class UlogFile:
 
     Attributes
     ----------
+    path : Path
+        The file.
     content : bytes
         All of it.
     formats : dict
@@ -69,6 +73,7 @@ class UlogFile:
         What could not be read; empty when all could.
     """
 
+    path: Path
     content: bytes
     formats: dict[str, Fields] = field(default_factory=dict)
     topics: dict[int, Topic] = field(default_factory=dict)
@@ -77,7 +82,7 @@ class UlogFile:
     changes: list[tuple[float, str, float]] = field(default_factory=list)
     damage: str = ""
     _sizes: dict[str, int] = field(default_factory=dict)
-    _impossible: set[str] = field(default_factory=set)
+    _unread: set[str] = field(default_factory=set)
     _started: bool = False
     _stamp: tuple[Topic, int] | None = None
 
@@ -126,9 +131,8 @@ class UlogFile:
         if lost:
             places = f"{gaps} place{'s'[: gaps > 1]}"
             damage.append(f"damaged: {lost} of {end} bytes, in {places}, are no message and left out")
-        if self._impossible:
-            names = ", ".join(sorted(self._impossible)[:3])
-            damage.append(f"damaged: the format of {names} makes no message, none of them is read")
+        if self._unread:
+            damage.append(f"damaged: the format of {listed(sorted(self._unread))} is not known, none of them is read")
         if at < end:
             damage.append("it ends in the middle of a message: not downloaded completely, or the power was cut")
         self.damage = "; ".join(damage)
@@ -197,8 +201,13 @@ class UlogFile:
             largest, smallest = self._sum(fields), self._sum(_unpadded(fields))
             if largest <= MAX_MESSAGE and len({label for _, _, label in fields}) == len(fields):
                 self.topics[number] = Topic(name, instance, fields, smallest, largest)
+            elif largest < UNKNOWN:
+                raise TuningError(
+                    f"{self.path}: damaged ULog file: messages of {name} would have more than {MAX_MESSAGE} bytes or a "
+                    "field twice, as in no log; download it again"
+                )
             else:
-                self._impossible.add(name)
+                self._unread.add(name)
         elif kind in "IP":
             self._keyed(kind, start, following)
 
@@ -232,12 +241,12 @@ class UlogFile:
         return float(struct.unpack_from("<Q", self.content, place)[0]) * 1e-6
 
     def _sum(self, fields: Fields) -> int:
-        """Bytes of fields; more than a message holds when one is not known or they are nested without end."""
+        """Bytes of fields; more than a message holds when they are nested without end, `UNKNOWN` when a type is."""
         total = 0
         for kind, length, _ in fields:
             total += (length or 1) * self._size(kind)
             if total > MAX_MESSAGE:
-                return MAX_MESSAGE + 1
+                return UNKNOWN if total >= UNKNOWN else MAX_MESSAGE + 1
         return total
 
     def _size(self, kind: str) -> int:
@@ -245,7 +254,7 @@ class UlogFile:
             return np.dtype(TYPES[kind]).itemsize
         if kind not in self._sizes:
             self._sizes[kind] = MAX_MESSAGE + 1  # of one that holds itself
-            self._sizes[kind] = self._sum(self.formats[kind]) if kind in self.formats else MAX_MESSAGE + 1
+            self._sizes[kind] = self._sum(self.formats[kind]) if kind in self.formats else UNKNOWN
         return self._sizes[kind]
 
     def _text(self, start: int, stop: int) -> str:
@@ -258,9 +267,9 @@ def open_ulog(path: Path) -> UlogFile:
     Raises
     ------
     TuningError
-        When its header is damaged or of a later format.
+        When its header is damaged or of a later format, or a topic is larger than a message can be.
     """
-    log = UlogFile(path.read_bytes())
+    log = UlogFile(path, path.read_bytes())
     flags = log.content[FIRST + 11 : FIRST + 19] if log.content[FIRST + 2 : FIRST + 3] == b"B" else b""
     if len(log.content) < FIRST or any(flags[1:]) or (flags and flags[0] & ~APPENDED):
         raise TuningError(f"{path}: damaged ULog file, or of a later format than version 1; download it again")

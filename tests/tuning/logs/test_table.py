@@ -1,5 +1,7 @@
+import re
 import struct
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from tests.tuning.logs.flights import COLUMNS, make_flight, table, write_csv
 from tuning.errors import TuningError
 from tuning.logs.columns import load_columns
 from tuning.logs.reader import read_log
+from tuning.spec import load_spec
 
 
 @pytest.fixture(scope="module")
@@ -126,6 +129,9 @@ def test_columns_of_nan_are_not_logged_and_single_ones_are_missing_samples(tmp_p
         ("t,u_roll\n1,abc\n", "not a table of numbers.*abc"),
         ("t,u_roll,t\n1,2,3\n", "column t appears twice"),
         ("t,u_roll\n0,1\n1,2\n2,3\n", "lacks column u_pitch|lacks column u_roll and u_pitch"),
+        ("0.0,0.1,0.2\n1,2,3\n", "the first line holds numbers"),
+        ("FMT, 128, 89, FMT, BBnNZ\n", "an ArduPilot log as text; give the .bin file"),
+        ("H Product:Blackbox flight data recorder\n", "a Betaflight log; make a CSV file"),
         ("hello\n", "not a flight log"),
         ("", "not a flight log"),
     ],
@@ -308,3 +314,12 @@ def test_other_variables_of_a_matlab_file_do_not_matter(tmp_path, flight):
     others = {"cells": np.array([1.0, "a"], dtype=object), "s": {"x": {"y": [1, 2]}}, "none": {}, "e": np.zeros((0, 3))}
     savemat(tmp_path / "x.mat", table(flight) | others)
     assert_is(read_log(tmp_path / "x.mat"), flight)
+
+
+def test_the_examples_of_the_readme_are_valid_and_all_that_a_csv_log_needs(tmp_path):
+    readme = (Path(__file__).parents[3] / "README.md").read_text()
+    names, spec = re.findall(r"```toml\n(.*?)```", readme.partition("## Tuning from your own log")[2], re.DOTALL)[:2]
+    assert columns(tmp_path, names).t.unit == "us"
+    (tmp_path / "spec.toml").write_text(spec)
+    task = load_spec(tmp_path / "spec.toml")
+    assert None not in (task.yaw, task.derivative_cutoff_hz, task.moment_scale)
