@@ -102,9 +102,9 @@ def estimate(
     """
     if repeat is not None:
         experiment, repeat = align(experiment, repeat)
-    base = _base(experiment, spec)
     chosen = instruments(experiment, spec.instrument, repeat)
     stretches = excited_stretches(experiment, chosen.external, spec.method)
+    base = _base(experiment, spec)
     models = spec.models("inner", experiment.Ts)
     inner = [
         _loop(
@@ -349,14 +349,14 @@ def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | No
 def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
     """Everything that is not tuned: yaw, limits, filter and unit, from the specification or as flown."""
     flown = experiment.flown
-    if spec.yaw is None and flown is None:
+    asked = {
+        "which yaw gains flew ([yaw]: Kp_o, Kp_i, Ki_i, Kd_i)": spec.yaw,
+        "which derivative filter flew (derivative_cutoff_hz, Hz, 0 for none)": spec.derivative_cutoff_hz,
+    }
+    missing = [name for name, value in asked.items() if value is None]
+    if flown is None and missing:
         raise TuningError(
-            f"{experiment.source}: the log does not say which yaw gains flew; give them in a --spec file under [yaw]"
-        )
-    if spec.derivative_cutoff_hz is None and flown is None:
-        raise TuningError(
-            f"{experiment.source}: the log does not say which derivative filter flew; give derivative_cutoff_hz (Hz, "
-            "0 for none) in a --spec file"
+            f"{experiment.source}: the log does not say {' and '.join(missing)}; give it in a --spec file"
         )
     zero = np.zeros((2, 2))
     cutoff = spec.derivative_cutoff_hz

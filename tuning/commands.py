@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,7 +76,6 @@ def tune(
     from tuning.errors import TuningError
     from tuning.gains import MATRICES
     from tuning.logs.columns import load_columns
-    from tuning.logs.reader import read_log
     from tuning.output import print_json
     from tuning.spec import load_spec, parse_doublet, parse_model
 
@@ -89,20 +89,19 @@ def tune(
         instrument=instrument or ("repeated" if repeat else None),
         window=window,
     )
-    named = load_columns(columns) if columns else None
     if campaign:
         if repeat is not None:
             raise TuningError("--repeat: belongs to one log, --campaign tunes many; leave it out")
-        tune_campaign(logs, task, out, named, as_json)
+        tune_campaign(logs, task, out, load_columns(columns) if columns else None, as_json)
         return
     if len(logs) > 1:
         raise TuningError(f"{len(logs)} logs: gains are tuned from one; --campaign tunes each by itself")
     log = logs[0]
-    gains = tune_cascade(read_log(log, named), task, repeat=read_log(repeat, named) if repeat else None)
+    experiment = read_warned(log, columns)
+    gains = tune_cascade(experiment, task, repeat=read_warned(repeat, columns) if repeat else None)
     gains.save(out)
     deviations = gains.provenance["standard_deviation"]
-    for warning in gains.provenance["warnings"]:
-        print(f"mimopilot: warning: {log}: {warning}", file=sys.stderr)
+    print_warnings(log, (warning for warning in gains.provenance["warnings"] if warning not in experiment.warnings))
     if as_json:
         matrices: dict[str, Any] = {name: getattr(gains, name).tolist() for name in MATRICES}
         found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}
@@ -149,11 +148,9 @@ def certify(
     from tuning.cascade import certify_from_log
     from tuning.certificate import CERTIFIED, THIN
     from tuning.gains import load_gains
-    from tuning.logs.columns import load_columns
-    from tuning.logs.reader import read_log
     from tuning.output import print_json
 
-    examined = certify_from_log(read_log(log, load_columns(columns) if columns else None), load_gains(gains))
+    examined = certify_from_log(read_warned(log, columns), load_gains(gains))
     if out is not None:
         examined.save(out)
     if as_json:
@@ -178,14 +175,12 @@ def advise(
     from rich.progress import track
 
     from tuning.advisor import advise as scan
-    from tuning.logs.columns import load_columns
-    from tuning.logs.reader import read_log
     from tuning.output import print_json, print_table, progress_console
     from tuning.spec import load_spec, parse_model
 
     task = load_spec(spec, outer=parse_model(outer) if outer else None)
     found = scan(
-        read_log(log, load_columns(columns) if columns else None),
+        read_warned(log, columns),
         task,
         watch=lambda grid: track(list(grid), "tuning", console=progress_console(), transient=True),
     )
@@ -259,6 +254,7 @@ def inspect(
     from tuning.output import print_json
 
     found = inspect_log(log, load_columns(columns) if columns else None)
+    print_warnings(log, found.warnings)
     if as_json:
         print_json(as_mapping(found))
     else:
@@ -277,11 +273,9 @@ def identify(
     """Identify the plant from control moment to body rates (PBSID, closed loop)."""
     from tuning.files import write_atomically
     from tuning.identification import identify_rates, model_toml
-    from tuning.logs.columns import load_columns
-    from tuning.logs.reader import read_log
     from tuning.output import print_json, print_table
 
-    experiment = read_log(log, load_columns(columns) if columns else None)
+    experiment = read_warned(log, columns)
     model, fits = identify_rates(experiment, order=order, past=past, future=future)
     if out is not None:
         write_atomically(out, model_toml(model, experiment.sha256))
@@ -316,6 +310,22 @@ def identify(
     print(f"one-step fit of the rates: roll {fits[0]:.1f} %, pitch {fits[1]:.1f} %")
     if out is not None:
         print(f"written to {out}")
+
+
+def read_warned(log: Path, columns: Path | None) -> Any:
+    """The experiment in a log; what is wrong with the log is told on standard error."""
+    from tuning.logs.columns import load_columns
+    from tuning.logs.reader import read_log
+
+    experiment = read_log(log, load_columns(columns) if columns else None)
+    print_warnings(log, experiment.warnings)
+    return experiment
+
+
+def print_warnings(log: Path, warnings: Iterable[str]) -> None:
+    """Warnings about a log, a line each, on standard error."""
+    for warning in warnings:
+        print(f"mimopilot: warning: {log}: {warning}", file=sys.stderr)
 
 
 def print_gains(title: str, gains: Any, deviations: dict[str, Any]) -> None:

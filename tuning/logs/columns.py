@@ -11,7 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tuning.errors import TuningError
 
-_FACTORS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_FACTORS = TIME_UNITS | {"rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180}
 
 Name = Annotated[str, Field(min_length=1)]
 Sign = Literal[1, -1]
@@ -21,6 +22,7 @@ class _Column(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     column: Name | None = None
+    index: Annotated[int, Field(ge=1)] | None = None
     sign: Sign = 1
 
     @property
@@ -33,7 +35,7 @@ class Time(_Column):
     """Time stamps."""
 
     sign: Literal[1] = 1
-    unit: Literal["s", "ms", "us"] = "s"
+    unit: Literal["s", "ms", "us", "ns"] = "s"
 
 
 class Moment(_Column):
@@ -54,6 +56,8 @@ class Angle(_Column):
 
 class Columns(BaseModel):
     """Where the signals of a table are; an entry without `column` has the field's own name.
+
+    An entry's `index` picks a column of a MATLAB matrix; the first is 1, as in MATLAB.
 
     Attributes
     ----------
@@ -100,6 +104,8 @@ def load_columns(path: Path) -> Columns:
     TuningError
         When it cannot be read, is not TOML, or holds an unknown signal, unit or sign.
     """
+    if not path.is_file():
+        raise TuningError(f"{path}: no such file; give the path of a column file (TOML)")
     try:
         return Columns.model_validate(tomllib.loads(path.read_text()))
     except ValidationError as error:

@@ -1,11 +1,10 @@
-"""ArduPilot dataflash logs (.bin), with the format definitions and index of pymavlink's DFReader."""
+"""ArduPilot dataflash logs (.bin): signals, flight, vehicle and parameters from their messages."""
 
 from __future__ import annotations
 
-import contextlib
-import os
-import sys
-from collections.abc import Iterator, Sequence
+import itertools
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
+from tuning.logs.dataflash_file import DataflashFile, open_dataflash
 from tuning.logs.flight import intervals
-from tuning.logs.recording import Recording
-from tuning.logs.resample import MAX_GAP, Interval, Series, monotone, sampling_period
+from tuning.logs.recording import MAX_WILD, RANGES, Recording
+from tuning.logs.resample import MAX_GAP, MIN_RATE, Interval, Series, monotone, sampling_period
+from tuning.logs.vehicle_type import ardupilot_vehicle
 
 DEGREE = np.pi / 180
 
@@ -28,21 +29,27 @@ LAYOUTS = {
     "r_o": (("ANG", ("DesRoll", "DesPitch"), DEGREE), ("ATT", ("DesRoll", "DesPitch"), DEGREE)),
     "r_i": (("RATE", ("RDes", "PDes"), DEGREE),),
 }
+#: RATE of ArduCopter 3.3 and older (Log_Write_Rate): motor inputs of +-4500, rates in hundredths of a degree a second.
+OLD_FACTORS = {"u": 1 / 4500, "y_i": 0.01, "r_i": 0.01}
+MILLISECOND = 1e-3  # s
+#: Field with the time -> its unit, s. ArduCopter 3.3 and older have the latter.
+CLOCKS = {"TimeUS": 1e-6, "TimeMS": MILLISECOND}
 
 #: Axis of the system identification mode (SIDS.Ax) whose waveform is added to the moment -> column of u.
 MIXER_AXES = {10: 0, 11: 1}
 
 EV_DISARMED, EV_LANDED, EV_NOT_LANDED = 11, 18, 28
+#: The firmware as it introduces itself, and its major version.
+_RELEASE = re.compile(r"[A-Za-z:]{2,16}[ -]*[Vv](\d+)\.\d+\S*")
+SDLOG2_MESSAGES = {"TIME", "ATT"}  # ArduPilot has no message TIME
+SDLOG2 = (
+    "a log of PX4 before ULog (sdlog2, .px4log), not of ArduPilot: fly with PX4 1.8 or newer, which writes ULog; or "
+    "make a CSV file of it with PX4's sdlog2_dump.py and name its columns with --columns"
+)
 NOTE = (
     "flown gains are not taken over: ArduPilot's D acts on the filtered error and its yaw error is filtered, which no "
     "gains of this controller say; give yaw, limits and derivative_cutoff_hz in a --spec file"
 )
-
-_NUMBERS = dict(
-    zip("bBhHiIqQfdgM", ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f4", "<f8", "<f2", "u1"), strict=True)
-)
-_NUMBERS |= {"c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4"}
-_TEXTS = {"n": "S4", "N": "S16", "Z": "S64", "a": "S64"}
 
 
 def record_dataflash(path: Path) -> Recording:
@@ -64,11 +71,14 @@ def record_dataflash(path: Path) -> Recording:
     TuningError
         When the file is damaged.
     """
-    log = _open(path)
+    log = _Log(open_dataflash(path))
+    if SDLOG2_MESSAGES.issubset(log.file.names()):
+        raise TuningError(f"{path}: {SDLOG2}")
+    old = log.in_old_units()
     signals = {}
     for signal, layouts in LAYOUTS.items():
         for message, fields, factor in layouts:
-            series = log.series(message, fields, factor)
+            series = log.series(message, fields, factor * (OLD_FACTORS.get(signal, 1.0) if old else 1.0))
             if series is not None:
                 signals[signal] = series
                 break
@@ -79,91 +89,115 @@ def record_dataflash(path: Path) -> Recording:
         signal: " or ".join(f"message {message} ({', '.join(fields)})" for message, fields, _ in layouts)
         for signal, layouts in LAYOUTS.items()
     }
-    evidence = "message EV (18 landed, 28 not landed)"
-    parameters = _parameters(log)
-    advice = _advice(log, parameters)
+    parameters, changes = _parameters(log)
+    now = parameters | {name: value for _, name, value in changes}
+    texts = [*log.file.texts("MSG", "Message"), *log.file.texts("VER", "FWS")]
+    modes = log.timed("MODE", ("ModeNum",))
+    vehicle = ardupilot_vehicle(texts, now, (modes[0], modes[1]) if modes else None)
     airborne = _airborne(log)
+    damage = log.file.damage
     return Recording(
-        path, _firmware(log), signals, wanted, log.names(), advice, airborne, evidence, parameters, (NOTE,)
+        path=path,
+        format=_format(texts, old),
+        signals=signals,
+        wanted=wanted,
+        contents=log.file.names(),
+        advice=_advice(log, now, texts),
+        airborne=vehicle.airborne(airborne),
+        evidence="message EV (18 landed, 28 not landed)" if airborne else "message MODE",
+        parameters=parameters,
+        changes=changes,
+        faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
+        warnings=(*((damage,) if damage else ()), *vehicle.warnings),
+        notes=(NOTE,),
+        span=_span(log),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Log:
-    content: NDArray[np.uint8]
-    formats: dict[str, Any]
-    offsets: dict[str, NDArray[np.int64]]
+    file: DataflashFile
 
-    def names(self) -> list[str]:
-        return sorted(name for name, offsets in self.offsets.items() if len(offsets))
+    def timed(self, message: str, names: Sequence[str]) -> list[NDArray[Any]] | None:
+        """Time (s) and fields of a message, one row a message; None when it is not logged with them.
 
-    def fields(self, message: str, names: Sequence[str]) -> list[NDArray[Any]] | None:
-        """Values of the fields of a message, multipliers applied; None when it is not logged with them."""
-        if message not in self.formats or not set(names) <= set(self.formats[message].columns):
+        Events of ArduCopter 3.3 and older have no time: that of the last RATE or ATT before them stands in.
+        """
+        values = self.file.fields(message, names)
+        time = self._clock(message)
+        if values is None:
             return None
-        layout = self.formats[message]
-        kinds = [(_NUMBERS | _TEXTS).get(letter) for letter in layout.format]
-        if None in kinds or len(kinds) != len(layout.columns) or len(set(layout.columns)) != len(kinds):
-            return None
-        record = np.dtype(list(zip(layout.columns, kinds, strict=True)))
-        if record.itemsize + 3 != layout.len:
-            return None
-        offsets = self.offsets[message]
-        offsets = offsets[offsets + layout.len <= len(self.content)]
-        rows = self.content[offsets[:, None] + np.arange(3, layout.len)].view(record)[:, 0]
-        factors = dict(zip(layout.columns, layout.msg_mults, strict=True))
-        return [rows[name] * factors[name] if factors[name] else rows[name] for name in names]
+        if time is not None:
+            return [time, *values]
+        for other in ("RATE", "ATT"):
+            time = self._clock(other)
+            if time is not None and len(time):
+                before = np.searchsorted(self.file.offsets[other], self.file.offsets[message]) - 1
+                return [time[np.maximum(before, 0)], *values]
+        return None
+
+    def _clock(self, message: str) -> NDArray[np.float64] | None:
+        for clock, unit in CLOCKS.items():
+            columns = self.file.fields(message, (clock,))
+            if columns is not None:
+                return columns[0].astype(np.float64) * unit
+        return None
 
     def series(self, message: str, names: Sequence[str], factor: float) -> Series | None:
-        columns = self.fields(message, ("TimeUS", *names))
+        columns = self.timed(message, names)
         if columns is None or any(column.dtype.kind == "S" for column in columns) or len(columns[0]) < 2:
             return None
         with np.errstate(invalid="ignore"):  # a damaged float may be a signalling NaN
             time, *values = (column.astype(np.float64) for column in columns)
-        return Series(time * 1e-6, np.column_stack(values) * factor, message)
+        if self.file.fields(message, ("TimeMS",)) is not None:
+            time = _unrounded(time)
+        return Series(time, np.column_stack(values) * factor, message)
+
+    def in_old_units(self) -> bool:
+        """Whether RATE is that of `OLD_FACTORS`: a share of the full moment is never beyond its range."""
+        outputs = self.series("RATE", ("ROut", "POut"), 1.0)
+        return outputs is not None and bool(np.mean(np.abs(outputs.values) > RANGES["u"]) > MAX_WILD)
 
 
-@contextlib.contextmanager
-def _silence() -> Iterator[None]:
-    """Drop what is printed meanwhile: DFReader tells of every damaged byte, its indexer past Python's own streams."""
-    sys.stderr.flush()
-    saved = os.dup(2)
-    try:
-        with (
-            Path(os.devnull).open("w") as nothing,
-            contextlib.redirect_stdout(nothing),
-            contextlib.redirect_stderr(nothing),
-        ):
-            os.dup2(nothing.fileno(), 2)
-            yield
-    finally:
-        os.dup2(saved, 2)
-        os.close(saved)
+def _unrounded(time: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Stamps of a uniform loop from stamps in whole milliseconds: a straight line through each stretch."""
+    steps = np.diff(time)
+    usual = np.median(steps)
+    near = np.abs(steps - usual) <= max(usual / 2, MILLISECOND) + 1e-6
+    smooth = time.copy()
+    if usual <= 0 or not near.any():
+        return smooth
+    cycles = np.round(steps / np.mean(steps[near]))  # neighbours, even where the loop takes 2.5 ms
+    bounds = [0, *(np.flatnonzero((cycles < 1) | (cycles > MAX_GAP)) + 1).tolist(), len(time)]
+    for a, b in itertools.pairwise(bounds):
+        if b - a > 2:
+            index = np.append(0, np.cumsum(cycles[a : b - 1]))
+            smooth[a:b] = np.polyval(np.polyfit(index, time[a:b], 1), index)
+    return smooth
 
 
-def _open(path: Path) -> _Log:
-    from pymavlink.DFReader import DFReader_binary
-
-    try:
-        with _silence():
-            reader = DFReader_binary(str(path))
-        with contextlib.closing(reader):
-            offsets = {name: np.array(reader.offsets[kind], np.int64) for name, kind in reader.name_to_id.items()}
-            formats = {name: reader.formats[kind] for name, kind in reader.name_to_id.items()}
-    except Exception as error:  # DFReader raises whatever a damaged file makes of its parser
-        raise TuningError(
-            f"{path}: damaged dataflash log: {error or type(error).__name__}; download it again"
-        ) from error
-    return _Log(np.frombuffer(path.read_bytes(), np.uint8), formats, offsets)
-
-
-def _advice(log: _Log, parameters: dict[str, float]) -> str:
-    """What to change so that RATE and the angles are logged in every loop."""
-    bits = parameters.get("LOG_BITMASK")
-    now = f" (it is {int(bits)}, so {int(bits) | 1})" if bits is not None and 0 <= bits < 2**31 else ""
-    advice = f"set bit 0 (fast attitude) of LOG_BITMASK{now} and fly again"
+def _advice(log: _Log, parameters: dict[str, float], texts: Sequence[str]) -> str:
+    """What to change so that RATE and the angles are logged in every loop: nothing that is so already."""
+    bits, limit = parameters.get("LOG_BITMASK"), parameters.get("LOG_FILE_RATEMAX", 0)
+    release = next((found for text in texts if (found := _RELEASE.match(text))), None)
+    if bits is None or not 0 <= bits < 2**31:
+        advice = "set bit 0 (fast attitude) of LOG_BITMASK and fly again"
+    elif not int(bits) & 1:
+        advice = f"set bit 0 (fast attitude) of LOG_BITMASK (it is {int(bits)}, so {int(bits) | 1}) and fly again"
+    elif limit > 0:
+        advice = f"set LOG_FILE_RATEMAX to 0 (no limit; it is {limit:g} Hz) and fly again"
+    elif release and int(release[1]) < 4:
+        advice = (
+            f"messages RATE and ATT are needed at {MIN_RATE:g} Hz or more and bit 0 of LOG_BITMASK is set already: fly "
+            f"with ArduCopter 4.0 or newer, which logs them in every loop (this is {release[0]})"
+        )
+    else:
+        advice = (
+            f"messages RATE and ANG (ATT before 4.6) are needed at {MIN_RATE:g} Hz or more and bit 0 of LOG_BITMASK is "
+            "set already: clear its other bits or take a faster card, so that the logger keeps up, and fly again"
+        )
     slow = log.series("PIDR", ("Act",), 1.0)
-    if "RATE" not in log.names() and slow is not None:
+    if "RATE" not in log.file.names() and slow is not None:
         advice += f"; PIDR, at {1 / np.median(np.diff(slow.time)):.1f} Hz here, does not replace it"
     return advice
 
@@ -171,7 +205,7 @@ def _advice(log: _Log, parameters: dict[str, float]) -> str:
 def _excitation(log: _Log) -> Series | None:
     """The waveform that the system identification mode added to the moment; zero where that mode was off."""
     waveform = log.series("SIDD", ("Targ",), 1.0)
-    runs = log.fields("SIDS", ("TimeUS", "Ax"))
+    runs = log.timed("SIDS", ("Ax",))
     if waveform is None or runs is None or not len(runs[0]):
         return None
     waveform = monotone(waveform)
@@ -179,7 +213,7 @@ def _excitation(log: _Log) -> Series | None:
         return None
     Ts = sampling_period(waveform.time)
     ends = np.flatnonzero(np.append(np.diff(waveform.time) > MAX_GAP * Ts, True))
-    started, axes = runs[0] * 1e-6, runs[1].astype(np.int64)
+    started, axes = runs[0], runs[1].astype(np.int64)
     # The set-up is stamped just after or before the first sample of its run: the nearest start counts.
     begins = np.concatenate([[0], ends[:-1] + 1])
     run = np.searchsorted(begins, np.arange(len(waveform.time)), side="right") - 1
@@ -194,10 +228,10 @@ def _excitation(log: _Log) -> Series | None:
 
 
 def _airborne(log: _Log) -> tuple[Interval, ...] | None:
-    events = log.fields("EV", ("TimeUS", "Id"))
+    events = log.timed("EV", ("Id",))
     if events is None:
         return None
-    time, code = events[0] * 1e-6, events[1]
+    time, code = events
     known = np.isin(code, (EV_DISARMED, EV_LANDED, EV_NOT_LANDED))
     if not np.isin(code, (EV_LANDED, EV_NOT_LANDED)).any():
         return None
@@ -208,16 +242,31 @@ def _airborne(log: _Log) -> tuple[Interval, ...] | None:
     return intervals(np.append(time[0] - 1.0, time), np.append(not flying[0], flying))
 
 
-def _parameters(log: _Log) -> dict[str, float]:
-    columns = log.fields("PARM", ("Name", "Value"))
+def _parameters(log: _Log) -> tuple[dict[str, float], list[tuple[float, str, float]]]:
+    """The first value of each parameter, and (time s, name, value) of what was set later."""
+    columns = log.timed("PARM", ("Name", "Value"))
     if columns is None:
-        return {}
-    names = (name.decode("ascii", "replace") for name in columns[0].tolist())
-    return {name: float(value) for name, value in zip(names, columns[1], strict=True)}
+        return {}, []
+    first: dict[str, float] = {}
+    now: dict[str, float] = {}
+    changes = []
+    for time, label, number in zip(*(column.tolist() for column in columns), strict=True):
+        name, value = label.decode("ascii", "replace"), float(number)
+        if name not in now:
+            first[name] = value
+        elif now[name] != value:
+            changes.append((float(time), name, value))
+        now[name] = value
+    return first, changes
 
 
-def _firmware(log: _Log) -> str:
-    columns = log.fields("MSG", ("Message",))
-    texts = [text.decode("ascii", "replace") for text in columns[0].tolist()] if columns else []
-    vehicle = next((text for text in texts if text.startswith(("ArduCopter", "APM:Copter", "ArduPlane"))), "ArduPilot")
-    return f"dataflash, {vehicle}"
+def _span(log: _Log) -> Interval | None:
+    """First and last time (s) of the message that there are most of."""
+    most = max(log.file.offsets, key=lambda name: len(log.file.offsets[name]), default="")
+    columns = log.timed(most, ())
+    return (float(columns[0].min()), float(columns[0].max())) if columns and len(columns[0]) else None
+
+
+def _format(texts: Sequence[str], old: bool) -> str:
+    vehicle = next((text for text in texts if _RELEASE.match(text)), "ArduPilot")
+    return f"dataflash, {vehicle}{', RATE in the units of 3.3 and older' if old else ''}"

@@ -71,7 +71,7 @@ class Inspection:
     recording : Recording
         The log as it was read.
     seconds : float, s
-        From the first to the last sample of any of its signals.
+        From the first to the last sample of any of its signals, without them of the log.
     airborne : tuple of (begin, end) or None, s
         When the vehicle says it flew, since the first sample. None: the log does not say.
     signals : dict
@@ -94,6 +94,11 @@ class Inspection:
     experiment: Experiment | None
     excitation: dict[str, ExcitationReport]
     reason: str | None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What is wrong with the log although it can be used."""
+        return self.experiment.warnings if self.experiment else tuple(self.recording.warnings)
 
     @property
     def flown(self) -> Gains | None:
@@ -136,18 +141,21 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
         excited_stretches(experiment, instrument, "mimo")
     except TuningError as error:
         reason = str(error).removeprefix(f"{path}: ").removeprefix(f"{path.name}: ")
-    # Without signals the vehicle's own clock has to do.
-    begin = min((float(s.time[0]) for s in recording.signals.values()), default=0.0)
-    end = max((float(s.time[-1]) for s in recording.signals.values()), default=np.inf)
+    first, last = recording.span or (0.0, 0.0)
+    begin = min((float(s.time[0]) for s in recording.signals.values()), default=first)
+    end = max((float(s.time[-1]) for s in recording.signals.values()), default=last)
 
     def since_begin(intervals: tuple[Interval, ...]) -> tuple[Interval, ...]:
         return tuple((a - begin, b - begin) for a, b in intersection(intervals, ((begin, end),)))
 
     return Inspection(
         recording=recording,
-        seconds=end - begin if recording.signals else 0.0,
+        seconds=end - begin,
         airborne=None if recording.airborne is None else since_begin(recording.airborne),
-        signals={name: _signal(name, signal, limit) for name, signal in recording.signals.items()},
+        signals={
+            name: _signal(name, signal, recording.published.get(name, signal.time), limit)
+            for name, signal in recording.signals.items()
+        },
         parts=since_begin(parts),
         experiment=experiment,
         excitation=excitation,
@@ -155,9 +163,10 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
     )
 
 
-def _signal(name: str, signal: Series, limit: float) -> SignalReport:
-    period = sampling_period(signal.time)
-    pauses = np.diff(signal.time)
+def _signal(name: str, signal: Series, stamps: NDArray[np.float64], limit: float) -> SignalReport:
+    pauses = np.diff(stamps)
+    pauses = pauses[pauses > 0]
+    period = sampling_period(np.append(0, np.cumsum(pauses)))
     low, high = signal.values.min(axis=0), signal.values.max(axis=0)
     share = np.mean(np.abs(signal.values) >= 0.999 * limit, axis=0)
     return SignalReport(

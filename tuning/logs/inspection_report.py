@@ -37,6 +37,7 @@ def as_mapping(found: Inspection) -> dict[str, Any]:
         else {"Ts": experiment.Ts, "seconds": experiment.seconds, "segments": [list(s) for s in experiment.segments]},
         "excitation": {name: asdict(report) for name, report in found.excitation.items()},
         "flown": None if found.flown is None else {name: getattr(found.flown, name).tolist() for name in MATRICES},
+        "warnings": list(found.warnings),
         "notes": list(recording.notes),
         "tunable": found.reason is None,
         "reason": found.reason,

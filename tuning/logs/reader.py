@@ -19,7 +19,14 @@ from tuning.motors import Motors, fit_motors
 ULOG = b"ULog\x01\x12\x35"
 DATAFLASH = b"\xa3\x95"
 MATLAB = b"MATLAB 5.0 MAT-file"
-MATLAB_HDF5 = (b"MATLAB 7.3 MAT-file", b"\x89HDF\r\n\x1a\n")
+CHANGED = "parameters were changed during the part that is used, the values before are taken as flown: "
+#: Beginnings of logs that are known and not read -> what to do.
+REFUSED = {
+    b"MATLAB 7.3 MAT-file": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
+    b"\x89HDF\r\n\x1a\n": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
+    b"FMT,": "an ArduPilot log as text; give the .bin file that it was made from",
+    b"H Product:Blackbox": "a Betaflight log; make a CSV file with blackbox_decode and name its columns with --columns",
+}
 
 
 def read_log(path: Path, columns: Columns | None = None) -> Experiment:
@@ -67,8 +74,9 @@ def open_log(path: Path, columns: Columns | None = None) -> Recording:
         from tuning.logs.dataflash import record_dataflash
 
         return record_dataflash(path)
-    if head.startswith(MATLAB_HDF5):
-        raise TuningError(f"{path}: a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')")
+    for beginning, advice in REFUSED.items():
+        if head.startswith(beginning):
+            raise TuningError(f"{path}: {advice}")
     if head.startswith(MATLAB):
         from tuning.logs.table import record_matlab
 
@@ -91,17 +99,29 @@ def experiment_of(recording: Recording) -> Experiment:
     TuningError
         When the log lacks a signal, never flew, is too slow or too short.
     """
+    try:
+        return _experiment(recording)
+    except TuningError as error:
+        if not recording.warnings:
+            raise
+        raise TuningError(f"{error} (the log: {'; '.join(recording.warnings)})") from error
+
+
+def _experiment(recording: Recording) -> Experiment:
     recording.require_signals()
     parts = flying_parts(recording)
     grid = on_common_grid(recording.signals, parts, str(recording.path), recording.advice)
+    begin = max(parts[0][0], float(recording.signals["u"].time[0]))
+    parameters, changed = recording.parameters_during(begin, parts[-1][1])
     experiment = Experiment(
         Ts=grid.Ts,
         segments=grid.segments,
         source=recording.path.name,
         sha256=sha256(recording.path.read_bytes()),
-        flown=flown_gains(recording.parameters, grid.Ts),
+        flown=flown_gains(parameters, grid.Ts),
         motors=_motors(recording, parts),
-        **grid.signals,
+        warnings=(*recording.warnings, *((CHANGED + "; ".join(changed),) if changed else ())),
+        **grid.signals,  # type: ignore[arg-type]  # of the names in Experiment
     )
     _check_units(experiment, recording)
     return experiment

@@ -73,7 +73,11 @@ def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], sour
         When torque, rates or angles are slower than 100 Hz, or less than 5 s are left.
     """
     begin, end = parts[0][0], parts[-1][1]
-    periods = {name: _rate_of(name, series[name], begin, end, source, advice) for name in REQUIRED}
+    rates = {name: _rate_of(name, series[name], begin, end, source) for name in REQUIRED}
+    slow = dict.fromkeys(complaint for _, complaint in rates.values() if complaint)
+    if slow:
+        raise TuningError(f"{source}: too slow: {'; '.join(slow)}; tuning needs {MIN_RATE:g} Hz or more; {advice}")
+    periods = {name: period for name, (period, _) in rates.items()}
     slowest, fastest = max(periods.values()), min(periods.values())
     filtered = slowest > SAME_RATE * fastest
     leader = min(REQUIRED, key=lambda name: periods[name]) if filtered else "u"
@@ -139,8 +143,8 @@ def held_samples(values: NDArray[np.float64]) -> int:
     return hold if np.percentile(runs, 10) > hold / 2 else 1
 
 
-def _rate_of(name: str, signal: Series, begin: float, end: float, source: str, advice: str) -> float:
-    """Period (s) at which a signal brings news, refused when it is too long."""
+def _rate_of(name: str, signal: Series, begin: float, end: float, source: str) -> tuple[float, str]:
+    """Period (s) at which a signal brings news, and what is to be said of it when it is too long."""
     inside = (signal.time >= begin - 1e-9) & (signal.time <= end + 1e-9)
     if np.count_nonzero(inside) < 3:
         raise TuningError(
@@ -149,14 +153,12 @@ def _rate_of(name: str, signal: Series, begin: float, end: float, source: str, a
     period = sampling_period(signal.time[inside])
     # Angles are quantised in many logs, so that only torque and rates show a hold for certain.
     hold = held_samples(signal.values[inside]) if name != "y_o" else 1
-    if 1 / (period * hold) < MIN_RATE * 0.99:
-        logged = f"is logged at {1 / period:.1f} Hz"
-        if hold > 1:
-            logged += f" but each value is held for {hold} samples, so its rate is {1 / (period * hold):.1f} Hz"
-        raise TuningError(
-            f"{source}: too slow: {signal.topic} {logged}, tuning needs {MIN_RATE:g} Hz or more; {advice}"
-        )
-    return period * hold
+    if 1 / (period * hold) >= MIN_RATE * 0.99:
+        return period * hold, ""
+    logged = f"{signal.topic} is logged at {1 / period:.1f} Hz"
+    if hold > 1:
+        logged += f" but each value is held for {hold} samples, so its rate is {1 / (period * hold):.1f} Hz"
+    return period * hold, logged
 
 
 def _inside(time: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:

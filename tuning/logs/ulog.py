@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,10 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tuning.errors import TuningError
 from tuning.logs.flight import bridged, intersection, intervals
 from tuning.logs.recording import Recording
 from tuning.logs.resample import Interval, Series, sampling_period
+from tuning.logs.ulog_file import UlogFile, open_ulog
+from tuning.logs.vehicle_type import px4_vehicle
 
 #: Signal -> the (topic, fields) that hold it, newest PX4 first.
 LAYOUTS = {
@@ -56,7 +56,7 @@ def record_ulog(path: Path) -> Recording:
     TuningError
         When the file is damaged.
     """
-    log = _Log(_open(path))
+    log = _Log(open_ulog(path))
     signals: dict[str, Series] = {}
     for signal, layouts in LAYOUTS.items():
         for topic, fields in layouts:
@@ -69,44 +69,47 @@ def record_ulog(path: Path) -> Recording:
     excitation = _excitation(log)
     if excitation is not None:
         signals["u_bar"] = excitation
+    published = {}
     for signal in ("r_o", "r_i", "u_bar"):
         if signal in signals and not log.is_sampled(signals[signal].topic) and "u" in signals:
+            published[signal] = signals[signal].time
             signals[signal] = _at_cycle(signals[signal], log.published(signals["u"].topic))
+    file = log.file
     airborne, evidence = _airborne(log)
-    parameters = {
-        name: float(value) for name, value in log.ulog.initial_parameters.items() if isinstance(value, int | float)
-    }
-    commands = _commands(log) if parameters.get(THRUST_CURVE) != 0 else None
-    profile = parameters.get("SDLOG_PROFILE")
-    now = f", it is {profile:.0f}" if profile is not None else ""
+    now = file.parameters | {name: value for _, name, value in file.changes}
+    vehicle = px4_vehicle(log.fields("vehicle_status"), now)
+    curves = [file.parameters.get(THRUST_CURVE), *(value for _, name, value in file.changes if name == THRUST_CURVE)]
     wanted = {
         signal: " or ".join(f"{topic} ({', '.join(fields)})" for topic, fields in layouts)
         for signal, layouts in LAYOUTS.items()
     }
     return Recording(
-        path,
-        _firmware(log.ulog.msg_info_dict),
-        signals,
-        wanted,
-        sorted({dataset.name for dataset in log.ulog.data_list}),
-        f"set SDLOG_PROFILE to 49 (default, high rate and debug{now}) and fly again",
-        airborne,
-        evidence,
-        parameters,
-        ("the file is damaged: what could be read of it is used",) if log.ulog.file_corruption else (),
-        commands,
+        path=path,
+        format=_firmware(file.information),
+        signals=signals,
+        wanted=wanted,
+        contents=file.names(),
+        advice=_advice(now.get("SDLOG_PROFILE")),
+        airborne=vehicle.airborne(airborne),
+        evidence=evidence or "vehicle_status",
+        parameters=file.parameters,
+        changes=file.changes,
+        faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
+        warnings=(*((file.damage,) if file.damage else ()), *vehicle.warnings),
+        commands=_commands(log) if 0 not in curves else None,
+        published=published,
+        span=_span(file),
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Log:
-    ulog: Any
+    file: UlogFile
 
     def fields(self, topic: str) -> dict[str, NDArray[Any]]:
         """Field -> values of the first instance of a topic; empty when it is not logged."""
-        named = (d.data for d in self.ulog.data_list if d.name == topic and d.multi_id == 0)
-        found = (data for data in named if len(data.get("timestamp", ())))
-        return next(found, {})
+        found = self.file.fields(topic)
+        return found if "timestamp" in found else {}
 
     def is_sampled(self, topic: str) -> bool:
         """Whether a topic says of which gyro sample it was made."""
@@ -128,14 +131,15 @@ class _Log:
         return Series(self.published(topic)[1], values, topic)
 
 
-def _open(path: Path) -> Any:
-    from pyulog import ULog
-
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # pyulog prints what it skips
-            return ULog(str(path))
-    except Exception as error:  # pyulog raises whatever a damaged file makes of its parser
-        raise TuningError(f"{path}: damaged ULog file: {error or type(error).__name__}; download it again") from error
+def _advice(profile: float | None) -> str:
+    """What to change so that the signals are logged, and fast enough: nothing that is so already."""
+    if profile is None or int(profile) & 49 != 49:
+        now = f" (default, high rate and debug; it is {profile:.0f})" if profile is not None else ""
+        return f"set SDLOG_PROFILE to 49{now} and fly again"
+    return (
+        f"SDLOG_PROFILE is {profile:.0f} and asks for every loop already: it is read when the vehicle starts, so "
+        "restart it, take a faster card if the log has gaps, and fly again"
+    )
 
 
 def _angles(series: Series) -> Series:
@@ -215,7 +219,15 @@ def _airborne(log: _Log) -> tuple[tuple[Interval, ...] | None, str]:
     return airborne, " with ".join(name for name, _, _ in states)
 
 
-def _firmware(information: dict[str, Any]) -> str:
+def _span(file: UlogFile) -> Interval | None:
+    """First and last time (s) of the topic with most messages."""
+    most = max((t for t in file.topics.values() if not t.instance), key=lambda t: len(t.offsets), default=None)
+    stamps = file.fields(most.name).get("timestamp") if most else None
+    return (float(stamps[0]) * 1e-6, float(stamps[-1]) * 1e-6) if stamps is not None and len(stamps) else None
+
+
+def _firmware(information: Mapping[str, str | int]) -> str:
     release = information.get("ver_sw_release")
-    version = f" {release >> 24 & 255}.{release >> 16 & 255}.{release >> 8 & 255}" if isinstance(release, int) else ""
+    numbers = [release >> shift & 255 for shift in (24, 16, 8)] if isinstance(release, int) else []
+    version = f" {'.'.join(str(number) for number in numbers)}" if any(numbers) else ""
     return f"ULog, {information.get('sys_name', 'unknown system')}{version}"

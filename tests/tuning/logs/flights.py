@@ -47,8 +47,11 @@ def attitude(y_o):
     return quaternions(three(y_o))
 
 
-def write_ulog(path, topics, parameters=()):
-    """A ULog file of topics (name, instance, fields), each with its own time stamps, which `fields` hold."""
+def write_ulog(path, topics, parameters=(), changes=()):
+    """A ULog file of topics (name, instance, fields), each with its own time stamps, which `fields` hold.
+
+    `changes` (time s, name, value) are parameters that are set among the messages of the first topic.
+    """
     head = [HEADER, struct.pack("<Q", 0), _message("B", bytes(40)), _keyed("I", "char[3] sys_name", b"PX4")]
     head += [_keyed("I", "uint32_t ver_sw_release", struct.pack("<I", 0x010D02FF))]
     formats = {name: fields for name, _, fields in topics}
@@ -64,7 +67,11 @@ def write_ulog(path, topics, parameters=()):
         rows = np.zeros(len(next(iter(fields.values()))), np.dtype(columns))
         for field, values in fields.items():
             rows[field] = values
-        body += [_message("D", struct.pack("<H", number) + row.tobytes()) for row in rows]
+        messages = [_message("D", struct.pack("<H", number) + row.tobytes()) for row in rows]
+        for time, name, value in () if number else changes:
+            last = int(np.searchsorted(rows["timestamp"], round(time * 1e6), side="right")) - 1
+            messages[last] += _keyed("P", f"float {name}", struct.pack("<f", value))
+        body += messages
     path.write_bytes(b"".join(head + body))
     return path
 
@@ -82,7 +89,7 @@ def px4_topics(flight, **extra):
     return [(name, 0, fields) for name, fields in topics.items()]
 
 
-KINDS = {"Q": "<u8", "f": "<f4", "B": "u1", "c": "<i2", "N": "S16", "Z": "S64", "b": "i1"}
+KINDS = {"Q": "<u8", "I": "<u4", "f": "<f4", "B": "u1", "c": "<i2", "N": "S16", "Z": "S64", "b": "i1"}
 
 
 def dataflash_bytes(messages):
@@ -125,6 +132,18 @@ def ardupilot_messages(flight, angles="ANG"):
             ("TimeUS", "Roll", "Pitch", "DesRoll", "DesPitch"),
             [stamps, *angle],
         ),
+    ]
+
+
+def old_ardupilot_messages(flight):
+    """RATE, ATT and EV as ArduCopter 3.2 and 3.3 log them: milliseconds, hundredths of degrees, inputs of +-4500."""
+    hundredths = 100 * 180 / np.pi
+    stamps = np.floor(np.asarray(flight.t) * 1e3 + 1e-6).astype(np.uint32)
+    rate = [*(hundredths * flight.y_i.T), *(4500 * flight.u.T)]
+    angle = [np.round(hundredths * a) for a in (*flight.y_o.T, *flight.r_o.T)]
+    return [
+        ("RATE", "Iffff", ("TimeMS", "R", "P", "ROut", "POut"), [stamps, *rate]),
+        ("ATT", "Icccc", ("TimeMS", "Roll", "Pitch", "DesRoll", "DesPitch"), [stamps, *angle]),
     ]
 
 

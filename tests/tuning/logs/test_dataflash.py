@@ -3,8 +3,15 @@
 import numpy as np
 import pytest
 
-from tests.tuning.logs.flights import ardupilot_messages, dataflash_bytes, make_flight, microseconds
+from tests.tuning.logs.flights import (
+    ardupilot_messages,
+    dataflash_bytes,
+    make_flight,
+    microseconds,
+    old_ardupilot_messages,
+)
 from tuning.errors import TuningError
+from tuning.logs.dataflash_file import open_dataflash
 from tuning.logs.reader import open_log, read_log
 
 
@@ -129,3 +136,82 @@ def test_flown_gains_are_left_out_with_the_reason(tmp_path, flight):
     assert recording.parameters["ATC_RAT_RLL_P"] == pytest.approx(0.135)
     assert "D acts on the filtered error" in recording.notes[0]
     assert read_log(path).flown is None
+
+
+@pytest.mark.parametrize("Ts", [0.0025, 0.004, 0.01])
+def test_logs_of_arducopter_3_are_read_in_their_own_units_and_milliseconds(tmp_path, Ts):
+    flight = make_flight(10.0, Ts)
+    log = read_log(write(tmp_path / "x.bin", old_ardupilot_messages(flight)))
+    assert log.Ts == pytest.approx(Ts, rel=1e-5)
+    assert len(log.segments) == 1
+    assert len(log.u) == pytest.approx(len(flight.t), abs=1)
+    assert log.u == pytest.approx(flight.u[: len(log.u)], abs=1e-6)
+    # Stamps are cut to whole milliseconds, those of all messages alike.
+    assert log.y_i == pytest.approx(flight.y_i[: len(log.u)], abs=2e-3)
+    assert log.y_o == pytest.approx(flight.y_o[: len(log.u)], abs=5e-4)
+    assert "3.3 and older" in open_log(tmp_path / "x.bin").format
+
+
+def test_milliseconds_with_todays_units_are_read_as_such(tmp_path, flight):
+    rate, angles = ardupilot_messages(flight, "ATT")
+    milli = [("TimeMS", *names[1:]) for _, _, names, _ in (rate, angles)]
+    old = [
+        (name, "I" + letters[1:], names, [np.round(flight.t * 1e3), *values[1:]])
+        for (name, letters, _, values), names in zip((rate, angles), milli, strict=True)
+    ]
+    log = read_log(write(tmp_path / "x.bin", old))
+    assert log.u == pytest.approx(flight.u, abs=1e-6)
+    assert log.y_i == pytest.approx(flight.y_i, abs=1e-5)
+
+
+def test_events_without_a_time_happen_where_they_stand(tmp_path):
+    flight = make_flight(20.0)
+    path = write(tmp_path / "x.bin", [("EV", "B", ("Id",), [[28]]), *old_ardupilot_messages(flight)])
+    whole = path.read_bytes()
+    takeoff, event = open_dataflash(path).offsets["RATE"][1500], 2 * 89
+    path.write_bytes(whole[:event] + whole[event + 4 : takeoff] + whole[event : event + 4] + whole[takeoff:])
+    log = read_log(path)
+    assert log.seconds == pytest.approx(14, abs=0.01)
+    assert log.u == pytest.approx(flight.u[-len(log.u) :], abs=1e-6)
+
+
+def test_a_log_of_px4_before_ulog_is_named(tmp_path):
+    time = ("TIME", "Q", ("StartTime",), [microseconds(np.arange(100) * 0.005)])
+    att = ("ATT", "ffffff", ("qw", "Roll", "Pitch", "Yaw", "RollRate", "PitchRate"), [np.zeros(100)] * 6)
+    with pytest.raises(TuningError, match=r"PX4 before ULog \(sdlog2, .px4log\).*1.8 or newer.*sdlog2_dump.py"):
+        read_log(write(tmp_path / "x.px4log", [time, att]))
+
+
+def firmware(text):
+    return ("MSG", "QZ", ("TimeUS", "Message"), [[0], [text.encode()]])
+
+
+@pytest.mark.parametrize(
+    ("text", "values", "advice", "never"),
+    [
+        ("ArduCopter V4.5.7", {"LOG_BITMASK": 176126}, "it is 176126, so 176127", "already"),
+        ("ArduCopter V4.5.7", {}, "set bit 0 .fast attitude. of LOG_BITMASK and fly", "it is"),
+        (
+            "APM:Copter V3.4-rc2",
+            {"LOG_BITMASK": 32767},
+            "RATE and ATT are needed at 100 Hz.*ArduCopter 4.0 or newer",
+            "so 32767",
+        ),
+        (
+            "ArduCopter V4.5.7",
+            {"LOG_BITMASK": 1, "LOG_FILE_RATEMAX": 25},
+            "LOG_FILE_RATEMAX to 0 .*it is 25 Hz",
+            "so 1",
+        ),
+        ("ArduCopter V4.5.7", {"LOG_BITMASK": 65535}, "RATE and ANG.*100 Hz.*clear its other bits", "so 65535"),
+    ],
+)
+def test_the_advice_on_a_slow_log_is_not_in_force_already(tmp_path, flight, text, values, advice, never):
+    slow = [
+        (name, letters, names, [v[::10] for v in rows]) for name, letters, names, rows in ardupilot_messages(flight)
+    ]
+    with pytest.raises(
+        TuningError, match=r"RATE is logged at 25\.0 Hz; ANG is logged at 25\.0 Hz; .*" + advice
+    ) as caught:
+        read_log(write(tmp_path / "x.bin", [firmware(text), parameters(**values), *slow]))
+    assert never not in str(caught.value)

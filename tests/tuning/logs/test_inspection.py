@@ -42,6 +42,30 @@ def test_rates_gaps_ranges_and_saturation_are_those_of_the_log(tmp_path, flight)
     assert found.reason is None
 
 
+def test_rates_of_set_points_are_those_of_the_log_though_few_of_them_are_used(tmp_path, flight):
+    topics = px4_topics(flight)
+    slow = {name: values[::10] for name, values in topics[0][2].items()}
+    topics[0] = (*topics[0][:2], slow)
+    found = inspect_log(write_ulog(tmp_path / "x.ulg", topics))
+    assert found.signals["u"].rate_hz == pytest.approx(25)
+    assert found.signals["r_o"].rate_hz == pytest.approx(250)
+    assert found.signals["r_o"].longest_gap_s == pytest.approx(0.004)
+
+
+def test_a_log_without_signals_is_as_long_as_its_messages(tmp_path, flight):
+    stamps = microseconds(flight.t[::25])
+    barometer = ("BARO", "Qf", ("TimeUS", "Alt"), [stamps, np.zeros(len(stamps))])
+    events = ("EV", "QB", ("TimeUS", "Id"), [microseconds([12.0, 18.0]), [28, 18]])
+    (tmp_path / "x.bin").write_bytes(dataflash_bytes([barometer, events]))
+    found = inspect_log(tmp_path / "x.bin")
+    assert found.seconds == pytest.approx(19.9)
+    assert found.airborne == ((2.0, 8.0),)
+    stamps = {"timestamp": microseconds(flight.t[:500]), "landed": np.zeros(500, np.uint8)}
+    found = inspect_log(write_ulog(tmp_path / "x.ulg", [("vehicle_land_detected", 0, stamps)]))
+    assert found.seconds == pytest.approx(1.996)
+    assert found.airborne == ((0.0, pytest.approx(1.996)),)
+
+
 def test_the_band_and_the_strength_of_the_excitation_are_given_for_each_axis(tmp_path, flight):
     u_bar = np.zeros((len(flight.t), 2), np.float32)
     u_bar[:, 0] = 0.1 * np.sin(2 * np.pi * 4 * flight.t)
@@ -112,7 +136,7 @@ def test_the_column_file_is_used_by_inspect_and_by_tune(mimopilot, tmp_path, fli
     assert found["signals"]["y_i"]["maximum"] == pytest.approx(flight.y_i.max(axis=0).tolist(), rel=1e-6)
     # With the columns known, the next thing that the log does not say is asked for.
     result = mimopilot("tune", "x.csv", "--columns", "c.toml", "--out", "x.toml")
-    assert_one_clear_line(result, "which yaw gains flew", "--spec")
+    assert_one_clear_line(result, "which yaw gains flew", "derivative_cutoff_hz", "--spec")
 
 
 def test_a_file_that_cannot_be_read_is_one_clear_line(mimopilot, tmp_path):

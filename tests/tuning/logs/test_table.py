@@ -1,3 +1,8 @@
+import re
+import struct
+import zlib
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.io import savemat
@@ -6,6 +11,7 @@ from tests.tuning.logs.flights import COLUMNS, make_flight, table, write_csv
 from tuning.errors import TuningError
 from tuning.logs.columns import load_columns
 from tuning.logs.reader import read_log
+from tuning.spec import load_spec
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +86,7 @@ def test_foreign_names_units_and_signs_are_mapped(tmp_path, flight):
         ('p = { column = "gx", units = "deg/s" }', "p.units: Extra inputs"),
         ('p = { unit = "deg" }', "p.unit: Input should be 'rad/s' or 'deg/s'"),
         ('t = { unit = "min" }', "t.unit"),
+        ('p = { column = "gyro", index = 0 }', "p.index: Input should be greater than or equal to 1"),
         ("u_roll = { sign = 0 }", "u_roll.sign: Input should be 1 or -1"),
         ("u_roll = { sign = [", "cannot read the column file"),
         ('p = { column = "" }', "p.column"),
@@ -122,6 +129,9 @@ def test_columns_of_nan_are_not_logged_and_single_ones_are_missing_samples(tmp_p
         ("t,u_roll\n1,abc\n", "not a table of numbers.*abc"),
         ("t,u_roll,t\n1,2,3\n", "column t appears twice"),
         ("t,u_roll\n0,1\n1,2\n2,3\n", "lacks column u_pitch|lacks column u_roll and u_pitch"),
+        ("0.0,0.1,0.2\n1,2,3\n", "the first line holds numbers"),
+        ("FMT, 128, 89, FMT, BBnNZ\n", "an ArduPilot log as text; give the .bin file"),
+        ("H Product:Blackbox flight data recorder\n", "a Betaflight log; make a CSV file"),
         ("hello\n", "not a flight log"),
         ("", "not a flight log"),
     ],
@@ -165,3 +175,151 @@ def test_a_wrong_unit_or_sign_is_found(tmp_path, flight, names, factor, words):
     own = table(flight)
     with pytest.raises(TuningError, match=words):
         read_log(write_csv(tmp_path / "x.csv", own | {name: factor * own[name] for name in names}))
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+def test_a_time_in_another_unit_is_refused_with_the_line_that_mends_it(tmp_path, flight, unit, factor):
+    path = write_csv(tmp_path / "x.csv", table(flight) | {"t": np.round(factor * (flight.t - 10))})
+    line = f't = {{ column = "t", unit = "{unit}" }}'
+    with pytest.raises(TuningError, match=r"column t: steps of .* s are a rate of") as caught:
+        read_log(path)
+    assert str(caught.value).endswith(f"tell its unit with --columns: {line}")
+    assert_is(read_log(path, columns(tmp_path, line)), flight)
+
+
+@pytest.mark.parametrize(
+    ("time", "words"),
+    [
+        (lambda t: np.arange(len(t)), "steps of 1 s are a rate of 1 Hz and a flight of 2000 s: it counts the samples"),
+        (lambda t: (t - 10) / 60, r"a rate of 1\.5e\+04 Hz and a flight of 0\.1333 s.*minutes, say, must be converted"),
+        (lambda t: 0 * t, "column t: the time does not rise"),
+        (lambda t: -t, "column t: the time does not rise"),
+        (lambda t: 500 * (t - 10), r'a rate of 0\.5 Hz .*unit = "ms"'),
+    ],
+)
+def test_a_time_that_cannot_be_is_refused_with_what_was_found(tmp_path, flight, time, words):
+    with pytest.raises(TuningError, match=words):
+        read_log(write_csv(tmp_path / "x.csv", table(flight) | {"t": time(flight.t)}))
+
+
+def test_a_short_log_in_minutes_is_not_taken_for_a_fast_one(tmp_path):
+    flight = make_flight(20.0, 0.01)
+    with pytest.raises(TuningError, match=r"a rate of 6000 Hz and a flight of 0\.3333 s"):
+        read_log(write_csv(tmp_path / "x.csv", table(flight) | {"t": np.round((flight.t - 10) / 60, 9)}))
+    assert read_log(write_csv(tmp_path / "x.csv", table(make_flight(8.0, 0.0005)))).Ts == 0.0005
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_decimal_commas_are_read_where_other_marks_separate(tmp_path, flight, delimiter):
+    path = write_csv(tmp_path / "x.csv", table(flight), delimiter)
+    path.write_text(path.read_text().replace(".", ","))
+    assert_is(read_log(path), flight)
+
+
+def test_decimal_commas_between_commas_are_refused_with_the_cause(tmp_path, flight):
+    path = write_csv(tmp_path / "x.csv", table(flight))
+    path.write_text(path.read_text().replace(".", ","))
+    with pytest.raises(TuningError, match=r"cells in the first row, 9 names.*decimal commas\?.*semicolons"):
+        read_log(path)
+
+
+def test_all_that_is_missing_is_told_at_once(tmp_path, flight):
+    own = table(flight)
+    path = write_csv(tmp_path / "x.csv", {"time": own["t"], "p": own["p"], "roll": own["roll"]})
+    with pytest.raises(
+        TuningError, match=r"no column 't' with the time.*no column u_roll, u_pitch, q, pitch; .* time, p"
+    ):
+        read_log(path)
+    text = 't = { column = "stamp" }\nq = { column = "gyro" }'
+    with pytest.raises(
+        TuningError, match=r"t: no column 'stamp'; q: no column 'gyro'; no column u_roll, u_pitch, pitch"
+    ):
+        read_log(path, columns(tmp_path, text))
+
+
+def test_columns_of_matlab_matrices_are_picked_by_an_index_from_one(tmp_path, flight):
+    names = ("p", "q", "roll", "pitch", "u_roll", "u_pitch", "roll_sp", "pitch_sp")
+    matrices = {
+        "gyro": np.column_stack([flight.y_i, np.zeros(len(flight.t))]),
+        "angle": np.column_stack([flight.y_o, np.zeros(len(flight.t))]).T,
+        "s": {"u": flight.u, "sp": flight.r_o},
+    }
+    savemat(tmp_path / "x.mat", {"t": flight.t, **matrices})
+    places = ("gyro", "gyro", "angle", "angle", "s.u", "s.u", "s.sp", "s.sp")
+    lines = [
+        f'{n} = {{ column = "{m}", index = {1 + i % 2} }}' for i, (n, m) in enumerate(zip(names, places, strict=True))
+    ]
+    assert_is(read_log(tmp_path / "x.mat", columns(tmp_path, "\n".join(lines))), flight)
+    lines[1] = 'q = { column = "gyro", index = 4 }'
+    with pytest.raises(TuningError, match="q: index 4, expected 1 to 3"):
+        read_log(tmp_path / "x.mat", columns(tmp_path, "\n".join(lines)))
+    lines[1] = 'q = { column = "gyro" }'
+    with pytest.raises(TuningError, match=r'pick its column: q = \{ column = "gyro", index = 1 \} \(the first is 1\)'):
+        read_log(tmp_path / "x.mat", columns(tmp_path, "\n".join(lines)))
+    with pytest.raises(TuningError, match="p: index is for the columns of a MATLAB matrix"):
+        read_log(write_csv(tmp_path / "x.csv", table(flight)), columns(tmp_path, "p = { index = 1 }"))
+
+
+def test_very_many_columns_give_a_short_message(tmp_path):
+    names = [f"c{i}" for i in range(50_000)]
+    (tmp_path / "x.csv").write_text(",".join(names) + "\n" + ",".join(["1"] * len(names)) + "\n")
+    with pytest.raises(TuningError, match="c98, c99 and 49900 more") as caught:
+        read_log(tmp_path / "x.csv")
+    assert len(str(caught.value)) < 1500
+
+
+def matlab(kind, shape, contents=b"", packed=False):
+    """A MATLAB file with one array of a class that claims a shape."""
+    flags = struct.pack("<IIII", 6, 8, kind, 0)
+    sizes = struct.pack("<IIii", 5, 8, *shape)
+    body = flags + sizes + struct.pack("<HHI", 1, 1, ord("u")) + contents
+    element = struct.pack("<II", 14, len(body)) + body
+    if packed:
+        squeezed = zlib.compress(element)
+        element = struct.pack("<II", 15, len(squeezed)) + squeezed
+    return b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x100) + b"IM" + element
+
+
+HUGE = (1 << 15, 1 << 15)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "contents"),
+    [
+        (1, b""),
+        (2, struct.pack("<HHI", 5, 4, 8) + struct.pack("<II", 1, 8) + b"field\0\0\0"),
+        (4, b""),
+        (6, struct.pack("<II", 9, 1 << 31)),
+    ],
+    ids=["cell", "structure", "text", "numbers"],
+)
+def test_a_matlab_array_that_claims_more_than_the_file_holds_is_refused(tmp_path, kind, contents, packed):
+    (tmp_path / "x.mat").write_bytes(matlab(kind, HUGE, contents, packed))
+    with pytest.raises(TuningError, match="an array claims more values than it has"):
+        read_log(tmp_path / "x.mat")
+    (tmp_path / "x.mat").write_bytes(matlab(1, (1, 1), matlab(kind, HUGE, contents)[128:], packed))
+    with pytest.raises(TuningError, match="an array claims more values than it has"):
+        read_log(tmp_path / "x.mat")
+
+
+def test_a_matlab_file_that_unpacks_without_end_is_refused(tmp_path, flight, monkeypatch):
+    savemat(tmp_path / "x.mat", table(flight), do_compression=True)
+    monkeypatch.setattr("tuning.logs.matlab_sizes.MAX_BYTES", 100_000)
+    with pytest.raises(TuningError, match="unpacks to more than"):
+        read_log(tmp_path / "x.mat")
+
+
+def test_other_variables_of_a_matlab_file_do_not_matter(tmp_path, flight):
+    others = {"cells": np.array([1.0, "a"], dtype=object), "s": {"x": {"y": [1, 2]}}, "none": {}, "e": np.zeros((0, 3))}
+    savemat(tmp_path / "x.mat", table(flight) | others)
+    assert_is(read_log(tmp_path / "x.mat"), flight)
+
+
+def test_the_examples_of_the_readme_are_valid_and_all_that_a_csv_log_needs(tmp_path):
+    readme = (Path(__file__).parents[3] / "README.md").read_text()
+    names, spec = re.findall(r"```toml\n(.*?)```", readme.partition("## Tuning from your own log")[2], re.DOTALL)[:2]
+    assert columns(tmp_path, names).t.unit == "us"
+    (tmp_path / "spec.toml").write_text(spec)
+    task = load_spec(tmp_path / "spec.toml")
+    assert None not in (task.yaw, task.derivative_cutoff_hz, task.moment_scale)

@@ -1,5 +1,7 @@
 """PX4 logs of every layout, written here; genuine ones are other people's data."""
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -164,5 +166,15 @@ def test_default_logging_is_refused_as_too_slow(tmp_path, flight):
         read_log(write_ulog(tmp_path / "x.ulg", topics))
 
 
-def test_the_release_is_read(tmp_path, flight):
-    assert open_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight))).format == "ULog, PX4 1.13.2"
+def test_the_release_is_read_and_none_is_made_up(tmp_path, flight):
+    path = write_ulog(tmp_path / "x.ulg", px4_topics(flight))
+    assert open_log(path).format == "ULog, PX4 1.13.2"
+    path.write_bytes(path.read_bytes().replace(struct.pack("<I", 0x010D02FF), struct.pack("<I", 0x000000FF), 1))
+    assert open_log(path).format == "ULog, PX4"
+
+
+@pytest.mark.parametrize(("profile", "advice"), [(17, "to 49 .*it is 17"), (49, "49 and asks for every loop already")])
+def test_the_advice_on_the_logging_profile_is_not_in_force_already(tmp_path, flight, profile, advice):
+    path = write_ulog(tmp_path / "x.ulg", px4_topics(flight)[1:], {"SDLOG_PROFILE": profile})
+    with pytest.raises(TuningError, match=f"SDLOG_PROFILE (is )?{advice}"):
+        read_log(path)

@@ -1,0 +1,88 @@
+"""Which parameters are the flown ones: those in force when the part that is used begins."""
+
+import numpy as np
+import pytest
+
+from tests.conftest import assert_one_clear_line
+from tests.tuning.logs.flights import (
+    ardupilot_messages,
+    dataflash_bytes,
+    make_flight,
+    microseconds,
+    px4_topics,
+    write_ulog,
+)
+from tests.tuning.test_flown import PX4
+from tuning.logs.reader import open_log, read_log
+
+
+@pytest.fixture(scope="module")
+def flight():
+    return make_flight(20.0)
+
+
+def px4(path, flight, changes):
+    """A log of 20 s that begins at 10 s, with an injected moment from 15 to 25 s."""
+    u_bar = np.random.default_rng(0).choice([-0.1, 0.1], (len(flight.t), 2)).astype(np.float32)
+    u_bar[(flight.t < 15) | (flight.t >= 25)] = 0
+    topic = {
+        "timestamp": microseconds(flight.t + 0.0004),
+        "x": u_bar[:, 0],
+        "y": u_bar[:, 1],
+        "name": np.full(len(flight.t), b"MIMO_EXC", "S10"),
+    }
+    return write_ulog(path / "x.ulg", px4_topics(flight, debug_vect=topic), PX4, changes)
+
+
+def test_a_gain_set_before_the_excitation_is_the_flown_one(tmp_path, flight):
+    log = read_log(px4(tmp_path, flight, [(11.0, "MC_YAWRATE_P", 0.7), (14.0, "MC_YAWRATE_P", 0.4)]))
+    assert log.flown.yaw.Kp_i == pytest.approx(0.4)
+    assert log.warnings == ()
+
+
+def test_a_gain_set_during_the_excitation_is_told_and_did_not_fly(tmp_path, flight):
+    log = read_log(px4(tmp_path, flight, [(17.0, "MC_YAWRATE_P", 0.4), (18.0, "MC_ROLL_P", 5.0)]))
+    assert log.flown.yaw.Kp_i == pytest.approx(0.2)
+    (warning,) = log.warnings
+    assert "MC_YAWRATE_P from 0.2 to 0.4 after 2.0 s; MC_ROLL_P from 6.5 to 5 after 3.0 s" in warning
+
+
+@pytest.mark.parametrize(
+    "change", [(26.0, "MC_YAWRATE_P", 0.4), (17.0, "MC_YAWRATE_P", 0.2), (17.0, "MC_AT_START", 1.0), (17.0, "X", 1.0)]
+)
+def test_what_is_set_afterwards_to_the_same_or_outside_the_loop_is_not_told(tmp_path, flight, change):
+    log = read_log(px4(tmp_path, flight, [change]))
+    assert log.flown.yaw.Kp_i == pytest.approx(0.2)
+    assert log.warnings == ()
+
+
+def test_the_thrust_curve_that_was_set_later_decides_what_motor_commands_are(tmp_path, flight):
+    motors = {"timestamp": microseconds(flight.t), "timestamp_sample": microseconds(flight.t)}
+    motors["control"] = np.full((len(flight.t), 4), 0.5, np.float32)
+    topics = px4_topics(flight, actuator_motors=motors)
+    path = write_ulog(tmp_path / "x.ulg", topics, {"THR_MDL_FAC": 0.3})
+    assert open_log(path).commands is not None
+    path = write_ulog(tmp_path / "x.ulg", topics, {"THR_MDL_FAC": 0.3}, [(11.0, "THR_MDL_FAC", 0.0)])
+    assert open_log(path).commands is None
+
+
+def test_repeated_parm_messages_are_changes(tmp_path, flight):
+    names = [b"ATC_RAT_YAW_P", b"LOG_BITMASK", b"ATC_RAT_YAW_P", b"STAT_RUNTIME", b"STAT_RUNTIME"]
+    times, values = microseconds([9, 9, 15, 9, 16]), [0.2, 1, 0.4, 5, 35]
+    parm = ("PARM", "QNf", ("TimeUS", "Name", "Value"), [times, names, values])
+    (tmp_path / "x.bin").write_bytes(dataflash_bytes([parm, *ardupilot_messages(flight)]))
+    recording = open_log(tmp_path / "x.bin")
+    assert recording.parameters["ATC_RAT_YAW_P"] == pytest.approx(0.2)
+    assert [change[:2] for change in recording.changes] == [(15, "ATC_RAT_YAW_P"), (16, "STAT_RUNTIME")]
+    (warning,) = read_log(tmp_path / "x.bin").warnings
+    assert warning.endswith("ATC_RAT_YAW_P from 0.2 to 0.4 after 5.0 s")
+
+
+def test_commands_tell_what_is_wrong_with_a_log(mimopilot, tmp_path, flight):
+    px4(tmp_path, flight, [(17.0, "MC_ROLL_P", 5.0)])
+    for command in (("inspect", "x.ulg"), ("identify", "x.ulg"), ("tune", "x.ulg", "--out", "g.gains.toml")):
+        result = mimopilot(*command)
+        told = [line for line in result.stderr.splitlines() if "MC_ROLL_P from 6.5 to 5" in line]
+        assert len(told) == 1, result.stderr
+        assert told[0].startswith("mimopilot: warning: x.ulg: parameters were changed")
+    assert_one_clear_line(mimopilot("tune", "y.ulg", "--out", "g.gains.toml"), "no such file")
