@@ -142,6 +142,9 @@ EXCITATION: tuple[Setting, ...] = (
 ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
 
 
+#: Verdicts that gains may be emitted and uploaded with, the best first.
+ACCEPTED = ("certified", "stable, thin margin")
+
 #: Longest name that MAVLink and PX4 carry.
 NAME_LENGTH = 16
 
@@ -190,8 +193,8 @@ def check_ranges(gains: Gains) -> None:
             )
 
 
-def check_verdict(gains: Gains, allow: bool, required: bool = False) -> str:
-    """Refuse gains whose loop is unstable or cannot be shown to be stable.
+def check_verdict(gains: Gains, allow: bool) -> str:
+    """Refuse gains whose loop is unstable, too near to it, or was never examined.
 
     Parameters
     ----------
@@ -199,8 +202,6 @@ def check_verdict(gains: Gains, allow: bool, required: bool = False) -> str:
         The set, with its certificate.
     allow : bool
         Go on all the same.
-    required : bool
-        Refuse gains that were never examined, too.
 
     Returns
     -------
@@ -210,17 +211,29 @@ def check_verdict(gains: Gains, allow: bool, required: bool = False) -> str:
     Raises
     ------
     CodegenError
-        When the verdict is any other than ``certified``, ``stable, thin margin`` and, unless required, none at all, and
-        `allow` is False.
+        When the verdict is any other than ``certified`` and ``stable, thin margin``, and `allow` is False.
     """
     verdict, reason = gains.verdict()
-    if verdict == "certified":
-        return ""
-    accepted = ("stable, thin margin", *([] if required else ["none"]))
-    if verdict not in accepted and not allow:
+    loose = _loose_thresholds(gains) if verdict in ACCEPTED else ""
+    if verdict == ACCEPTED[0]:
+        return loose
+    if verdict not in ACCEPTED and not allow:
         verdict = "no certificate" if verdict == "none" else verdict
         raise CodegenError(f"{verdict}: {reason}; tune or certify again, or give --uncertified to go on all the same")
-    return f"certificate: {verdict}: {reason}"
+    return f"certificate: {verdict}: {reason}{'; ' if loose else ''}{loose}"
+
+
+def _loose_thresholds(gains: Gains) -> str:
+    """What is to be said where a certificate asked for less margin than usual."""
+    asked = {**DEFAULT_THRESHOLDS.model_dump(), **dict((gains.certificate or {}).get("thresholds", {}))}
+    usual = DEFAULT_THRESHOLDS
+    if asked["thin_Ms"] <= usual.thin_Ms and asked["thin_phase_deg"] >= usual.thin_phase_deg:
+        if asked["Ms"] <= usual.Ms and asked["phase_deg"] >= usual.phase_deg:
+            return ""
+    return (
+        f"the certificate asked for less margin than usual: Ms {asked['Ms']:g} and {asked['phase_deg']:g} degrees "
+        f"(thin: {asked['thin_Ms']:g} and {asked['thin_phase_deg']:g})"
+    )
 
 
 def to_array(gains: Gains) -> NDArray[np.float32]:

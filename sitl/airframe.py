@@ -61,8 +61,10 @@ class Noise(_Table):
 
 
 class Frame(_Table):
-    """A frame that bends on roll and pitch, see `sitl.sensors.frame_mode`: Hz, share of critical damping, and modal gain
-    over that of the rigid body (negative where the sensors move against the rotors).
+    """A frame that bends on roll and pitch, see `sitl.sensors.frame_mode`.
+
+    Frequency (Hz), share of critical damping, and modal gain over that of the rigid body, negative where the sensors
+    move against the rotors.
     """
 
     frequency_hz: Annotated[float, Field(gt=0, le=500)]

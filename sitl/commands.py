@@ -10,7 +10,9 @@ import typer
 
 AirframeArgument = Annotated[
     str,
-    typer.Argument(help="Airframe: adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file."),
+    typer.Argument(
+        help="Airframe: adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file."
+    ),
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
 FaultOption = Annotated[
@@ -102,7 +104,10 @@ def experiment(
         str | None, typer.Option(help="With --connect: roll, pitch, or both, one after the other (the default).")
     ] = None,
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
-    amplitude: Annotated[float, typer.Option(help="Of the injected moment, dimensionless.")] = 0.15,
+    amplitude: Annotated[
+        float | None,
+        typer.Option(help="Of the injected torque (normalised); 0.15, or less where the motors have little room."),
+    ] = None,
     bandwidth: Annotated[float, typer.Option(help="Of the injected moment, rad/s.")] = 50.0,
     seed: SeedOption = 0,
     runs: Annotated[
@@ -141,21 +146,22 @@ def experiment(
             raise SitlError("--out: name the log to write, FILE.ulg")
         if (axis, mode, tilt_deg) != (None,) * 3:
             raise SitlError("--axis, --mode, --tilt-deg: belong to --connect; a simulated flight excites both axes")
-        plan = (seconds_per_axis, amplitude, bandwidth, excitation_seed)
-        _simulated_experiment(airframe, out, gains, plan, seed, runs)
+        _simulated_experiment(airframe, out, gains, (seconds_per_axis, amplitude, bandwidth, excitation_seed), seed, runs)
         return
     if (out, gains, runs, excitation_seed) != (None,) * 4:
         raise SitlError(
             "--out, --gains, --runs, --excitation-seed: are of a simulated flight; a vehicle has its gains and writes "
             "its own log"
         )
+    from sitl.experiments import AMPLITUDE
     from sitl.mavlink.experiment_console import Choice
     from sitl.mavlink.experiment_console import experiment as fly_experiment
     from sitl.mavlink.session import Options
 
     options = Options(connect or "", system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json)
     tilt = 28.0 if tilt_deg is None else tilt_deg
-    choice = Choice(axis or "both", seconds_per_axis, amplitude, bandwidth, seed, mode or "hold", tilt)
+    strength = AMPLITUDE if amplitude is None else amplitude
+    choice = Choice(axis or "both", seconds_per_axis, strength, bandwidth, seed, mode or "hold", tilt)
     fly_experiment(options, choice)
 
 
@@ -163,17 +169,19 @@ def _simulated_experiment(
     airframe: str,
     out: Path,
     gains: Path | None,
-    excitation: tuple[float, float, float, int | None],
+    excitation: tuple[float, float | None, float, int | None],
     seed: int,
     runs: int | None,
 ) -> None:
     import numpy as np
 
     from sitl.errors import SitlError
-    from sitl.experiments import ExperimentPlan, repeat_experiment
+    from sitl.experiments import ExperimentPlan, default_amplitude, repeat_experiment
 
     body, controller = _load(airframe, gains)
-    plan = ExperimentPlan(body, controller, *excitation)
+    seconds, amplitude, bandwidth, excitation_seed = excitation
+    strength = default_amplitude(body) if amplitude is None else amplitude
+    plan = ExperimentPlan(body, controller, seconds, strength, bandwidth, excitation_seed)
     if runs is not None:
         from rich.progress import Progress
 

@@ -13,10 +13,15 @@ import numpy as np
 from sitl.airframe import Airframe
 from sitl.autopilot import Autopilot
 from sitl.loop import Flight, fly
+from sitl.plant import GRAVITY
 from sitl.recorder import save_flight
 from sitl.scenario import excitation_flight
 from tuning.gains import Gains
 from tuning.parallel import processes, run_all
+
+
+#: Largest amplitude of the injected torque that is proposed, and the share of the motors' room that it may take.
+AMPLITUDE, ROOM = 0.15, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +57,17 @@ class ExperimentPlan:
         flight = self.fly(seed)
         save_flight(path, flight, self.airframe, self.gains)
         return flight
+
+
+def default_amplitude(airframe: Airframe) -> float:
+    """Amplitude of the injected torque that leaves the motors room: 0.15, or less for a vehicle that hovers near an end.
+
+    The loop's own answer and the other axes' add to what is injected, so only a share of the room is taken.
+    """
+    plant, allocation = airframe.plant(), airframe.allocation()
+    hover = plant.mass * GRAVITY / (len(plant.rotors) * plant.thrust_max)
+    room = min(hover, 1 - hover) / float(np.abs(allocation.mixer[:, :2]).max())
+    return min(AMPLITUDE, float(f"{ROOM * room:.2g}"))
 
 
 def repeat_experiment(

@@ -301,8 +301,8 @@ def tune(
     verdict, reason = tuned.verdict()
     if verdict == UNSTABLE:
         raise TuningError(
-            f"{experiment.source}: the gains that this log gives for these models are unstable, nothing is written: {reason}; "
-            "record a longer or stronger excitation, or ask for a slower rate loop"
+            f"{experiment.source}: the gains that this log gives for these models are unstable, nothing is written: "
+            f"{reason}; record a longer or stronger excitation, or ask for a slower rate loop"
         )
     return tuned
 

@@ -141,6 +141,9 @@ def certify(
     log: LOG,
     gains: Annotated[Path, typer.Option(help="Gains file to examine.")],
     out: Annotated[Path | None, typer.Option(help="Write the gains with their certificate to this file.")] = None,
+    spec: Annotated[
+        Path | None, typer.Option(help="Specification (TOML) whose [certificate] says what margins are needed.")
+    ] = None,
     columns: COLUMNS = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
@@ -149,8 +152,9 @@ def certify(
     from tuning.certificate import CERTIFIED, THIN
     from tuning.gains import load_gains
     from tuning.output import print_json
+    from tuning.spec import load_spec
 
-    examined = certify_from_log(read_warned(log, columns), load_gains(gains))
+    examined = certify_from_log(read_warned(log, columns), load_gains(gains), load_spec(spec))
     if out is not None:
         examined.save(out)
     if as_json:
@@ -222,6 +226,7 @@ def advise(
 
 def print_certificate(gains: Any) -> None:
     """Verdict, reason and margins of a certified set."""
+    from tuning.margins import AXES
     from tuning.output import print_table
 
     certificate = gains.certificate
@@ -235,9 +240,17 @@ def print_certificate(gains: Any) -> None:
         ["disk margin", f"{figures['disk_margin']:.2f}"],
         ["all axes at once", f"{figures['simultaneous_gain_db']:.1f} dB, {figures['simultaneous_phase_deg']:.0f} deg"],
     ]
-    for axis in ("roll", "pitch"):
-        margins = (figures[name][axis] for name in ("gain_margin_db", "phase_margin_deg", "delay_margin_ms"))
-        rows.append([axis, "{:.1f} dB, {:.0f} deg, {:.1f} ms".format(*margins)])
+    for axis in AXES:
+        kind = figures["gain_margin"][axis]
+        gain = "gain not known" if kind == "not known" else f"{figures['gain_margin_db'][axis]:.1f} dB"
+        phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
+        rows.append(
+            [
+                axis,
+                f"{'at least ' if kind == 'at least' else ''}{gain}, {phase:.0f} +- {error:.0f} deg, "
+                f"{figures['delay_margin_ms'][axis]:.1f} ms",
+            ]
+        )
     low, high = certificate["band"]
     print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)
 
@@ -263,7 +276,7 @@ def inspect(
 
 def identify(
     log: LOG,
-    order: Annotated[int | None, typer.Option(help="States; by default from the singular values.")] = None,
+    order: Annotated[int | None, typer.Option(help="States; by default those that fit the measured response.")] = None,
     past: Annotated[int, typer.Option(help="Past window, samples.")] = 20,
     future: Annotated[int | None, typer.Option(help="Future window, samples; the past window by default.")] = None,
     out: Annotated[Path | None, typer.Option(help="Where the state space is written: FILE.toml.")] = None,
@@ -273,10 +286,12 @@ def identify(
     """Identify the plant from control moment to body rates (PBSID, closed loop)."""
     from tuning.files import write_atomically
     from tuning.identification import identify_rates, model_toml
+    from tuning.plant_response import measured_plant
     from tuning.output import print_json, print_table
 
     experiment = read_warned(log, columns)
-    model, fits = identify_rates(experiment, order=order, past=past, future=future)
+    found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)
+    model, fits = found.model, found.one_step_percent
     if out is not None:
         write_atomically(out, model_toml(model, experiment.sha256))
     shown = model.singular_values[: max(10, model.order + 3)].tolist()
@@ -292,6 +307,7 @@ def identify(
                 "singular_values": shown,
                 "poles": [list(pole) for pole in poles],
                 "fit_percent": fits.tolist(),
+                "response_fit_percent": found.response_percent,
                 "Ts": model.plant.Ts,
                 **matrices,
                 "K": model.K.tolist(),
@@ -308,6 +324,7 @@ def identify(
         ],
     )
     print(f"one-step fit of the rates: roll {fits[0]:.1f} %, pitch {fits[1]:.1f} %")
+    print(f"fit to the measured frequency response: {found.response_percent:.1f} %")
     if out is not None:
         print(f"written to {out}")
 

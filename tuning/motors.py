@@ -14,6 +14,10 @@ EXPLAINED = 0.95
 #: Break frequencies that rotors have, rad/s.
 ROTORS = (5.0, 100.0)
 MIN_SAMPLES = 50
+#: A command this near to 0 or 1 is at its end: half of the step of a 10 bit output.
+END = 5e-4
+#: Share of the samples with a motor at an end that is told; and of those that the amplitude that is advised keeps within.
+SATURATED, NEARLY_ALL = 0.01, 0.999
 
 Signal = NDArray[np.float64]
 
@@ -62,6 +66,33 @@ def fit_motors(u: Signal, commands: Signal) -> Motors | None:
     given = (commands - hover) @ np.linalg.pinv(mixer).T
     missing = np.mean((given - (u - middle)) ** 2, axis=0)
     return Motors(mixer, hover) if np.all(missing < (1 - EXPLAINED) * np.var(u, axis=0)) else None
+
+
+def saturation_warnings(u: Signal, commands: Signal, motors: Motors | None, amplitude: float) -> list[str]:
+    """What is to be said of motors at an end of their range: in which share of the samples, and which amplitude avoids it.
+
+    Parameters
+    ----------
+    u : (N, 2) array
+        Torques in flight.
+    commands : (N, n) array
+        Motor commands made from them, 0 to 1.
+    motors : Motors or None
+        The allocator.
+    amplitude : float
+        Of the injected torque; 0: none was injected.
+    """
+    share = float(np.mean(((commands <= END) | (commands >= 1 - END)).any(axis=1))) if len(commands) else 0.0
+    if share <= SATURATED:
+        return []
+    text = f"a motor is at an end of its range in {share:.0%} of the samples"
+    if motors is None or amplitude == 0:
+        return [f"{text}; fly gentler"]
+    moved = (u - np.median(u, axis=0)) @ motors.mixer.T
+    up, down = np.quantile(moved, [NEARLY_ALL, 1 - NEARLY_ALL], axis=0)
+    room = np.concatenate([(1 - motors.hover) / np.maximum(up, 1e-9), motors.hover / np.maximum(-down, 1e-9)])
+    fitting = amplitude * float(np.clip(room.min(), 0.0, 1.0))
+    return [f"{text}; inject a torque of {fitting:.2g} in place of {amplitude:.2g}"]
 
 
 def rotor_lag(plant: StateSpace) -> float:

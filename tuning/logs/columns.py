@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -13,6 +14,16 @@ from tuning.errors import TuningError
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _FACTORS = TIME_UNITS | {"rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180}
+
+#: Signal -> the two columns that hold it, by their names in `Columns`.
+SIGNALS = {
+    "u": ("u_roll", "u_pitch"),
+    "y_i": ("p", "q"),
+    "y_o": ("roll", "pitch"),
+    "r_o": ("roll_sp", "pitch_sp"),
+    "r_i": ("p_sp", "q_sp"),
+    "u_bar": ("u_bar_roll", "u_bar_pitch"),
+}
 
 Name = Annotated[str, Field(min_length=1)]
 Sign = Literal[1, -1]
@@ -94,6 +105,18 @@ class Columns(BaseModel):
     def name(self, field: str) -> str:
         """Name of a signal's column in the file."""
         return getattr(self, field).column or field
+
+
+    def line(self, field: str, other: str, what: str) -> str:
+        """The line of a column file that gives a field another ``sign`` or ``unit``, or the column of another field."""
+        entry = getattr(self, other)
+        values: dict[str, Any] = {"column": self.name(other)}
+        values |= {key: value for key, value in entry.model_dump(exclude_defaults=True).items() if key != "column"}
+        if what == "sign":
+            values["sign"] = -entry.sign
+        if what == "unit":
+            values["unit"] = {"rad": "deg", "deg": "rad", "rad/s": "deg/s", "deg/s": "rad/s"}[entry.unit]
+        return f"{field} = {{ {', '.join(f'{key} = {json.dumps(value)}' for key, value in values.items())} }}"
 
 
 def load_columns(path: Path) -> Columns:

@@ -11,13 +11,18 @@ from tuning.logs.resample import Interval, Series
 
 STILL_RATE = 0.01  # rad/s, standard deviation over a second: no multirotor hovers that quietly
 STILL_WINDOW = 1.0  # s
+TUMBLE = np.radians(75.0)  # of tilt: no multirotor holds its altitude there
+BEFORE = 1.0  # s before a tumble that are not used: a vehicle is lost within 0.7 s of losing a motor
+AGAIN = 3  # tumbles that are none: degrees for radians, or aerobatics
+SHORT = 0.1  # s on the ground that are not worth telling
 
 
-def flying_parts(recording: Recording) -> tuple[Interval, ...]:
+def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str, ...]]:
     """The parts of a log that may be used for tuning.
 
-    An injected excitation marks the experiment: from its first to its last sample that is not zero. Else it
-    is the time in the air, as the vehicle says, or from the first to the last movement.
+    An injected excitation marks the experiment: from its first to its last sample that is not zero. Of it, or of the
+    whole log, counts what was in the air, as the vehicle says, or from the first to the last movement; and nothing
+    from the second before a tumble on.
 
     Parameters
     ----------
@@ -26,12 +31,14 @@ def flying_parts(recording: Recording) -> tuple[Interval, ...]:
 
     Returns
     -------
-    tuple of (begin, end), s
+    parts : tuple of (begin, end), s
+    said : tuple of str
+        What was cut off and why.
 
     Raises
     ------
     TuningError
-        When the vehicle never flew.
+        When the vehicle never flew, or tumbles again and again.
     """
     airborne, source = recording.airborne, str(recording.path)
     rates, torque = recording.signals["y_i"], recording.signals["u"]
@@ -40,20 +47,75 @@ def flying_parts(recording: Recording) -> tuple[Interval, ...]:
     if airborne is not None and not airborne:
         raise TuningError(f"{source}: no flight: {recording.evidence} says that it never left the ground; fly it")
     marked = _marked(recording.signals.get("u_bar"))
-    if marked and airborne and not any(a < marked[1] and b > marked[0] for a, b in airborne):
-        raise TuningError(
-            f"{source}: no flight: {recording.evidence} says that it was on the ground while a moment was injected; "
-            "take off first"
-        )
-    parts = (marked,) if marked else airborne or ((-np.inf, np.inf),)
+    said: list[str] = []
+    parts = (marked,) if marked else ((-np.inf, np.inf),)
+    if airborne:
+        parts = intersection(parts, airborne)
+        if marked and not parts:
+            raise TuningError(
+                f"{source}: no flight: {recording.evidence} says that it was on the ground while a torque was injected; "
+                "take off first"
+            )
+        grounded = marked[1] - marked[0] - sum(b - a for a, b in parts) if marked else 0.0
+        if grounded > SHORT:
+            said.append(
+                f"{recording.evidence} says on the ground for {grounded:.1f} s of the excitation: that part is not used"
+            )
+    parts, tumble = _before_tumble(recording, parts)
+    if tumble:
+        said.append(tumble)
     moving = _moving(rates, parts)
     if moving is None or not np.ptp(torque.values, axis=0).any():
-        still = "the body rates do not move" if moving is None else f"{torque.topic} does not move"
-        said = (
-            f"{recording.evidence} says airborne for {sum(b - a for a, b in airborne):.1f} s, but " if airborne else ""
+        largest = float(np.abs(rates.values).max())
+        still = (
+            f"the body rates in {rates.topic} do not move (at most {largest:.2g} rad/s, expected {STILL_RATE:g} or more)"
+            if moving is None
+            else f"{torque.topic} does not move"
         )
-        raise TuningError(f"{source}: no flight: {said}{still}; a log from the bench cannot be tuned from, fly it")
-    return parts if marked or airborne else (moving,)
+        flew = f"{recording.evidence} says airborne for {sum(b - a for a, b in airborne):.1f} s, but " if airborne else ""
+        unit = "; if it flew, the unit of the rates is wrong" if moving is None and airborne != () else ""
+        raise TuningError(
+            f"{source}: no flight: {flew}{still}; a log from the bench cannot be tuned from, fly it{unit}"
+        )
+    return parts if marked or airborne else intersection(parts, (moving,)), tuple(said)
+
+
+def _before_tumble(recording: Recording, parts: tuple[Interval, ...]) -> tuple[tuple[Interval, ...], str]:
+    """The parts without what comes from the second before a tumble on, and what is to be said of it.
+
+    Raises
+    ------
+    TuningError
+        When the tilt is large again and again: that is no multirotor that was lost.
+    """
+    angles, source = recording.signals["y_o"], str(recording.path)
+    tilt = np.arccos(np.clip(np.cos(angles.values[:, 0]) * np.cos(angles.values[:, 1]), -1.0, 1.0))
+    inside = np.zeros(len(tilt), bool)
+    for a, b in parts:
+        inside |= (angles.time >= a) & (angles.time <= b)
+    beyond = np.flatnonzero(inside & (tilt > TUMBLE))
+    if not len(beyond):
+        return parts, ""
+    level = np.flatnonzero(inside & (tilt < TUMBLE / 2))
+    times = len(np.unique(np.searchsorted(level, beyond)))
+    if times >= AGAIN:
+        raise TuningError(
+            f"{source}: {angles.topic}: a tilt beyond {np.degrees(TUMBLE):.0f} degrees {times} times where the experiment is; "
+            "no multirotor flies like that: are the angles in degrees (then tell their unit), or was it aerobatics? Excite "
+            "in hover"
+        )
+    at = float(angles.time[beyond[0]])
+    kept = intersection(parts, ((-np.inf, at - BEFORE),))
+    begin = min(float(series.time[0]) for series in recording.signals.values())
+    if not kept:
+        raise TuningError(
+            f"{source}: no flight: a tilt beyond {np.degrees(TUMBLE):.0f} degrees at {at - begin:.1f} s, at the beginning of the "
+            "experiment; fly it again"
+        )
+    return kept, (
+        f"the vehicle tumbled at {at - begin:.1f} s (tilt beyond {np.degrees(TUMBLE):.0f} degrees): only what is "
+        f"{BEFORE:g} s or more before it is used"
+    )
 
 
 def intervals(time: NDArray[np.float64], flag: NDArray[np.bool_]) -> tuple[Interval, ...]:

@@ -132,7 +132,7 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
     excitation: dict[str, ExcitationReport] = {}
     try:
         recording.require_signals()
-        parts = flying_parts(recording)
+        parts = flying_parts(recording)[0]
         experiment = experiment_of(recording)
         if experiment.flown is not None:
             limit = min(experiment.flown.limits.moment_max[:2])

@@ -12,9 +12,10 @@ from tuning.files import sha256
 from tuning.flown import flown_gains
 from tuning.logs.columns import Columns
 from tuning.logs.flight import flying_parts
+from tuning.logs.log_checks import check_angles, check_log
 from tuning.logs.recording import Recording
 from tuning.logs.resample import Interval, on_common_grid
-from tuning.motors import Motors, fit_motors
+from tuning.motors import Motors, fit_motors, saturation_warnings
 
 ULOG = b"ULog\x01\x12\x35"
 DATAFLASH = b"\xa3\x95"
@@ -99,57 +100,50 @@ def experiment_of(recording: Recording) -> Experiment:
     TuningError
         When the log lacks a signal, never flew, is too slow or too short.
     """
+    said = [*recording.warnings]
     try:
-        return _experiment(recording)
+        return _experiment(recording, said)
     except TuningError as error:
-        if not recording.warnings:
+        if not said:
             raise
-        raise TuningError(f"{error} (the log: {'; '.join(recording.warnings)})") from error
+        raise TuningError(f"{error} (the log: {'; '.join(said)})") from error
 
 
-def _experiment(recording: Recording) -> Experiment:
+def _experiment(recording: Recording, said: list[str]) -> Experiment:
+    """The experiment; what is wrong with the log although it can be used is added to what is said of it."""
     recording.require_signals()
-    parts = flying_parts(recording)
+    check_angles(recording)
+    parts, cut = flying_parts(recording)
+    said += cut
     grid = on_common_grid(recording.signals, parts, str(recording.path), recording.advice)
     begin = max(parts[0][0], float(recording.signals["u"].time[0]))
     parameters, changed = recording.parameters_during(begin, parts[-1][1])
+    said += [CHANGED + "; ".join(changed)] if changed else []
+    motors = _motors(recording, parts, said)
     experiment = Experiment(
         Ts=grid.Ts,
         segments=grid.segments,
         source=recording.path.name,
         sha256=sha256(recording.path.read_bytes()),
         flown=flown_gains(parameters, grid.Ts),
-        motors=_motors(recording, parts),
-        warnings=(*recording.warnings, *((CHANGED + "; ".join(changed),) if changed else ())),
+        motors=motors,
+        warnings=tuple(said),
         **grid.signals,  # type: ignore[arg-type]  # of the names in Experiment
     )
-    _check_units(experiment, recording)
+    check_log(experiment, recording)
     return experiment
 
 
-def _motors(recording: Recording, parts: tuple[Interval, ...]) -> Motors | None:
-    """How the allocator moved the motors in the usable parts of a log, where it holds their commands."""
+def _motors(recording: Recording, parts: tuple[Interval, ...], said: list[str]) -> Motors | None:
+    """How the allocator moved the motors in the usable parts of a log, where it holds their commands; saturation is said.
+    """
     commands, torque = recording.commands, recording.signals["u"]
     if commands is None:
         return None
     made = np.searchsorted(torque.time, commands.time + 1e-6, side="right") - 1
     used = (made >= 0) & np.any([(a <= commands.time) & (commands.time <= b) for a, b in parts], axis=0)
-    return fit_motors(torque.values[made[used]], commands.values[used])
-
-
-def _check_units(experiment: Experiment, recording: Recording) -> None:
-    """Refuse rates that are not the derivative of the angles: a wrong unit or sign."""
-    slopes = [np.gradient(experiment.y_o[a:b], experiment.Ts, axis=0) for a, b in experiment.segments if b - a > 2]
-    rates = [experiment.y_i[a:b] for a, b in experiment.segments if b - a > 2]
-    for axis, name in enumerate(("roll", "pitch")):
-        slope, rate = (np.concatenate(pieces)[:, axis] for pieces in (slopes, rates))
-        scale = np.std(slope) * np.std(rate)
-        if scale == 0:
-            continue
-        correlation = float(np.cov(slope, rate)[0, 1] / scale)
-        factor = float(np.std(rate) / np.std(slope) * np.sign(correlation))
-        if abs(correlation) > 0.8 and not 0.4 < factor < 2.5:
-            raise TuningError(
-                f"{recording.path}: {name}: {recording.signals['y_i'].topic} is {factor:.3g} times the derivative "
-                f"of {recording.signals['y_o'].topic}, expected 1; correct the unit (rad/s, rad) or sign of one"
-            )
+    u, given = torque.values[made[used]], commands.values[used]
+    motors = fit_motors(u, given)
+    injected = recording.signals.get("u_bar")
+    said += saturation_warnings(u, given, motors, float(np.abs(injected.values).max()) if injected else 0.0)
+    return motors if recording.linear_thrust else None

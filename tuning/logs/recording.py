@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
+from tuning.logs.columns import Columns
 from tuning.logs.resample import REQUIRED, Interval, Series, monotone
 
 #: Largest believable value of a signal: normalised moment, rad/s, rad.
-RANGES = {"u": 5.0, "u_bar": 5.0, "y_i": 100.0, "r_i": 100.0, "y_o": 2 * np.pi, "r_o": 2 * np.pi}
+RANGES = {"u": 5.0, "u_bar": 5.0, "y_i": 100.0, "r_i": 100.0, "y_o": 400.0, "r_o": 2 * np.pi}
 UNITS = dict.fromkeys(("u", "u_bar"), "a moment as a share of the full one") | dict.fromkeys(("y_i", "r_i"), "rad/s")
 UNITS |= dict.fromkeys(("y_o", "r_o"), "rad")
 MAX_LISTED = 100  # names in a message: more than the topics of a PX4 log at its default profile
@@ -58,11 +59,15 @@ class Recording:
     notes : sequence of str
         What the reader of an inspection should know besides.
     commands : Series or None
-        Motor commands as thrust fractions, a column each. None: the log does not hold them.
+        Motor commands, 0 to 1, a column each. None: the log does not hold them.
+    linear_thrust : bool
+        Whether they are thrust fractions.
     published : mapping
         Name -> stamps (N,), s, with which a signal was logged, where those of `signals` are of the control cycle.
     span : tuple (begin, end) or None, s
         First and last time in the log, for one without signals. None: not known.
+    columns : Columns or None
+        Where the signals of a table are. None: the log names its signals itself.
     """
 
     path: Path
@@ -79,8 +84,10 @@ class Recording:
     warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
     commands: Series | None = None
+    linear_thrust: bool = True
     published: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     span: Interval | None = None
+    columns: Columns | None = None
 
     def __post_init__(self) -> None:
         signals, warnings = {}, [*self.warnings]

@@ -14,20 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
-from tuning.logs.columns import TIME_UNITS, Columns
+from tuning.logs.columns import SIGNALS, TIME_UNITS, Columns
 from tuning.logs.matlab_sizes import check_sizes
 from tuning.logs.recording import Recording, listed
 from tuning.logs.resample import MIN_SECONDS, REQUIRED, Series
 
-#: Signal -> the two columns that hold it, by their names in `Columns`.
-SIGNALS = {
-    "u": ("u_roll", "u_pitch"),
-    "y_i": ("p", "q"),
-    "y_o": ("roll", "pitch"),
-    "r_o": ("roll_sp", "pitch_sp"),
-    "r_i": ("p_sp", "q_sp"),
-    "u_bar": ("u_bar_roll", "u_bar_pitch"),
-}
 ADVICE = (
     "log it at 100 Hz or more on the vehicle (PX4: SDLOG_PROFILE 49, ArduPilot: LOG_BITMASK bit 0) and export every "
     "sample; other names of columns are told with --columns"
@@ -210,7 +201,7 @@ def _record(
         rows = np.column_stack([values * getattr(columns, field).factor for field, values in pair])
         signals[signal] = Series(time, rows, ", ".join(columns.name(field) for field in fields))
     faults = _clock_faults(given, columns)
-    return Recording(path, kind, signals, wanted, contents, ADVICE, faults=faults, notes=(NOTE,))
+    return Recording(path, kind, signals, wanted, contents, ADVICE, faults=faults, notes=(NOTE,), columns=columns)
 
 
 def _clock_faults(given: NDArray[np.float64], columns: Columns) -> tuple[str, ...]:

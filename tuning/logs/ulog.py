@@ -96,7 +96,8 @@ def record_ulog(path: Path) -> Recording:
         changes=file.changes,
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((file.damage,) if file.damage else ()), *vehicle.warnings),
-        commands=_commands(log) if 0 not in curves else None,
+        commands=_commands(log),
+        linear_thrust=0 not in curves,
         published=published,
         span=_span(file),
     )
