@@ -87,6 +87,17 @@ def test_the_message_before_a_damaged_one_is_kept(tmp_path, flight, write):
     assert set(first) - set(left) == {first[300]}
 
 
+def test_a_size_that_spans_two_messages_of_a_ulog_is_found_out(tmp_path, flight):
+    path = tmp_path / "x"
+    read, count = ulog(path, flight)
+    log, data = read(path), bytearray(path.read_bytes())
+    first, second = log.topics[0].offsets[300:302]
+    data[first] += second - first
+    path.write_bytes(data)
+    assert count(log) - count(read(path)) == 1
+    assert f"damaged: {second - first} of" in read(path).damage
+
+
 @pytest.mark.parametrize("write", [dataflash, ulog])
 def test_a_file_that_ends_in_a_message_says_so_and_padding_is_no_damage(tmp_path, flight, write):
     path = tmp_path / "x"
