@@ -309,7 +309,6 @@ def test_damage_of_a_log_is_told_once_by_every_command_that_reads_it(mimopilot, 
         ("identify", "x.ulg"),
         ("tune", "x.ulg", "--out", "g.gains.toml"),
         ("certify", "x.ulg", "--gains", "g.gains.toml"),
-        ("advise", "x.ulg"),
     ):
         told = [line for line in mimopilot(*command).stderr.splitlines() if "damaged: " in line]
         assert len(told) == 1, command
