@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from pyulog import ULog
 
 from sitl.airframe import FOLDER
 from tests.conftest import assert_one_clear_line
+from tuning.logs.ulog_file import open_ulog
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
@@ -296,3 +298,19 @@ def test_the_demo_does_the_whole_way(mimopilot, tmp_path):
     for name in ("flight.ulg", "mimo.gains.toml", "siso.gains.toml", "report.html", "firmware/mimo/manifest.json"):
         assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes()
     assert again.returncode == 0
+
+
+def test_damage_of_a_log_is_told_once_by_every_command_that_reads_it(mimopilot, log, tmp_path):
+    data = bytearray(log.read_bytes())
+    data[open_ulog(log).topics[0].offsets[1000] + 2] ^= 0xFF  # the kind of a message
+    (tmp_path / "x.ulg").write_bytes(data)
+    for command in (
+        ("inspect", "x.ulg"),
+        ("identify", "x.ulg"),
+        ("tune", "x.ulg", "--out", "g.gains.toml"),
+        ("certify", "x.ulg", "--gains", "g.gains.toml"),
+    ):
+        told = [line for line in mimopilot(*command).stderr.splitlines() if "damaged: " in line]
+        assert len(told) == 1, command
+        assert re.match(r"mimopilot: warning: x\.ulg: damaged: \d+ of \d+ bytes, in 1 place, are no message", told[0])
+    assert "damaged: " in (tmp_path / "g.gains.toml").read_text()

@@ -86,7 +86,7 @@ def record_dataflash(path: Path) -> Recording:
     if excitation is not None:
         signals["u_bar"] = excitation
     wanted = {
-        signal: " or ".join(f"message {message} ({', '.join(fields)})" for message, fields, _ in layouts)
+        signal: " or ".join(_wanted(log, message, fields) for message, fields, _ in layouts)
         for signal, layouts in LAYOUTS.items()
     }
     parameters, changes = _parameters(log)
@@ -174,6 +174,14 @@ def _unrounded(time: NDArray[np.float64]) -> NDArray[np.float64]:
             index = np.append(0, np.cumsum(cycles[a : b - 1]))
             smooth[a:b] = np.polyval(np.polyfit(index, time[a:b], 1), index)
     return smooth
+
+
+def _wanted(log: _Log, message: str, fields: Sequence[str]) -> str:
+    """Where a signal should be, and what is there where the message has other fields."""
+    wanted = f"message {message} ({', '.join(fields)})"
+    return (
+        f"{wanted}, which has {', '.join(log.file.formats[message].letters)}" if message in log.file.names() else wanted
+    )
 
 
 def _advice(log: _Log, parameters: dict[str, float], texts: Sequence[str]) -> str:

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.logs.recording import listed
+
 HEAD = b"\xa3\x95"
 FMT, FMT_LENGTH = 0x80, 89  # the message that defines the others, itself as AP_Logger's LogStructure.h defines it
 PADDING = b"\x00\xff"  # what block devices leave behind the last message
@@ -82,7 +84,7 @@ class DataflashFile:
         columns = self.fields(message, (field,))
         if columns is None or columns[0].dtype.kind != "S":
             return []
-        return [text.decode("ascii", "replace") for text in columns[0].tolist()]
+        return [_text(text) for text in columns[0].tolist()]
 
 
 def open_dataflash(path: Path) -> DataflashFile:
@@ -122,6 +124,9 @@ def open_dataflash(path: Path) -> DataflashFile:
     damage = []
     if lost:
         damage.append(f"damaged: {lost} of {end} bytes, in {gaps} place{'s'[: gaps > 1]}, are no message and left out")
+    unread = sorted(names[n].name for n in used if places[n] and names[n].length > 3 and names[n].record is None)
+    if unread:
+        damage.append(f"the format of {listed(unread)} is not known or damaged, none of them is read")
     if at < end:
         damage.append("it ends in the middle of a message: not downloaded completely, or the power was cut")
     return DataflashFile(
@@ -169,7 +174,13 @@ def _resume(content: bytes, lengths: list[int], solid: int, start: int) -> int:
 def _format(payload: bytes) -> tuple[int, Format]:
     """Type and layout that an FMT message defines."""
     number, length, name, letters, columns = struct.unpack("<BB4s16s64s", payload)
-    name, letters, columns = (text.partition(b"\0")[0].decode("ascii", "replace") for text in (name, letters, columns))
+    name, letters, columns = (_text(text) for text in (name, letters, columns))
     fields = columns.split(",") if columns else []
     whole = len(fields) == len(letters) == len(set(fields))
     return number, Format(name, length, dict(zip(fields, letters, strict=True)) if whole else {})
+
+
+def _text(field: bytes) -> str:
+    """A text field; damage does not bring control characters into messages."""
+    text = field.partition(b"\0")[0].decode("ascii", "replace")
+    return "".join(letter if letter.isprintable() else "?" for letter in text)

@@ -20,7 +20,7 @@ UNITS = dict.fromkeys(("u", "u_bar"), "a moment as a share of the full one") | d
 UNITS |= dict.fromkeys(("y_o", "r_o"), "rad")
 MAX_LISTED = 100  # names in a message: more than the topics of a PX4 log at its default profile
 #: Beginnings of the names of parameters of PX4, ArduPilot and our module that make the loop: gains, filters, motors.
-LOOP = ("MIMO_", "MC_", "IMU_", "THR_", "CA_", "ATC_", "RATE_", "STB_", "INS_", "MOT_", "CC", "FILT")
+LOOP = ("MIMO_", "MC_", "IMU_", "THR_", "CA_", "ATC_", "RATE_", "STB_", "INS_", "MOT_", "CC", "FILT", "Q_A_", "Q_M_")
 #: Those among them that steer an experiment and nothing else: our injector, PX4's autotune.
 EXPERIMENT = ("MIMO_EX", "MC_AT_")
 MAX_WILD = 0.01  # share of a signal that may lie outside its range: damage; more is a wrong unit

@@ -17,7 +17,7 @@ from tuning.errors import TuningError
 from tuning.logs.columns import SIGNALS, TIME_UNITS, Columns
 from tuning.logs.matlab_sizes import check_sizes
 from tuning.logs.recording import Recording, listed
-from tuning.logs.resample import MIN_SECONDS, REQUIRED, Series
+from tuning.logs.resample import MIN_RATE, MIN_SECONDS, REQUIRED, Series
 
 ADVICE = (
     "log it at 100 Hz or more on the vehicle (PX4: SDLOG_PROFILE 49, ArduPilot: LOG_BITMASK bit 0) and export every "
@@ -200,18 +200,18 @@ def _record(
                 )
         rows = np.column_stack([values * getattr(columns, field).factor for field, values in pair])
         signals[signal] = Series(time, rows, ", ".join(columns.name(field) for field in fields))
-    faults = _clock_faults(given, columns)
+    faults = _clock_faults(path, given, columns)
     return Recording(path, kind, signals, wanted, contents, ADVICE, faults=faults, notes=(NOTE,), columns=columns)
 
 
-def _clock_faults(given: NDArray[np.float64], columns: Columns) -> tuple[str, ...]:
+def _clock_faults(path: Path, given: NDArray[np.float64], columns: Columns) -> tuple[str, ...]:
     """Why a time column as it is in the file cannot be that of a multirotor's log, and the line that mends it."""
     name, unit = columns.name("t"), columns.t.unit
     steps = np.diff(given[np.isfinite(given)])
     steps = steps[steps != 0]
     step = float(np.median(steps)) if len(steps) else 0.0
     if step <= 0:
-        return (f"column {name}: the time does not rise; it must be the time of each sample",)
+        raise TuningError(f"{path}: column {name}: the time does not rise; it must be the time of each sample")
     rate, seconds = 1 / (step * columns.t.factor), step * len(given) * columns.t.factor
     if RATES[0] <= rate <= RATES[1] and (rate <= FAST or seconds >= MIN_SECONDS):
         return ()
@@ -220,7 +220,9 @@ def _clock_faults(given: NDArray[np.float64], columns: Columns) -> tuple[str, ..
         return (f"{found}: it counts the samples, whose time must be in its place, or {_unit_line(name, 'ms')}",)
     fitting = next((other for other in TIME_UNITS if RATES[0] <= 1 / (step * TIME_UNITS[other]) <= FAST), unit)
     if fitting != unit:
-        return (f"{found}, of no multirotor log; {_unit_line(name, fitting)}",)
+        right = 1 / (step * TIME_UNITS[fitting])
+        slow = f"; its rate is then {right:.4g} Hz, tuning needs {MIN_RATE:g} Hz or more" if right < MIN_RATE else ""
+        return (f"{found}, of no multirotor log; {_unit_line(name, fitting)}{slow}",)
     return (f"{found}, of no multirotor log; its unit must be s, ms, us or ns: minutes, say, must be converted",)
 
 

@@ -46,8 +46,8 @@ ARDUPILOT_OTHERS = {
 }
 #: FRAME_CLASS of ArduCopter: helicopter, dual and quad helicopter; and of a rover: boat.
 HELICOPTERS, BOAT = (6, 11, 13), 2
-#: Modes of ArduPlane in which a QuadPlane flies as a multirotor: QSTABILIZE to QACRO, and LOITER to QLAND.
-HOVER_MODES = (17, 18, 19, 20, 21, 22, 23, 25)
+#: Modes of ArduPlane (mode.h) in which a QuadPlane flies as a multirotor: QSTABILIZE to QACRO.
+HOVER_MODES = range(17, 24)
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def ardupilot_vehicle(
     firmware, said = found or ("", "")
     frame = int(parameters.get("FRAME_CLASS", 0))
     if firmware == "Plane" and parameters.get("Q_ENABLE", 0) > 0:
-        hovering = intervals(modes[0], np.isin(modes[1], HOVER_MODES)) if modes is not None else ()
+        hovering = intervals(modes[0], np.isin(modes[1], list(HOVER_MODES))) if modes is not None else ()
         return VehicleType("" if hovering else f"a VTOL that never hovered ({said}, no Q mode)", hovering)
     if firmware == "Rover" and frame == BOAT:
         return VehicleType(f"a boat ({said}, FRAME_CLASS {frame})")

@@ -87,6 +87,17 @@ def test_the_message_before_a_damaged_one_is_kept(tmp_path, flight, write):
     assert set(first) - set(left) == {first[300]}
 
 
+def test_a_size_that_spans_two_messages_of_a_ulog_is_found_out(tmp_path, flight):
+    path = tmp_path / "x"
+    read, count = ulog(path, flight)
+    log, data = read(path), bytearray(path.read_bytes())
+    first, second = log.topics[0].offsets[300:302]
+    data[first] += second - first
+    path.write_bytes(data)
+    assert count(log) - count(read(path)) == 1
+    assert f"damaged: {second - first} of" in read(path).damage
+
+
 @pytest.mark.parametrize("write", [dataflash, ulog])
 def test_a_file_that_ends_in_a_message_says_so_and_padding_is_no_damage(tmp_path, flight, write):
     path = tmp_path / "x"
@@ -173,3 +184,18 @@ def test_a_topic_with_a_damaged_format_is_named_and_the_others_are_read(tmp_path
     assert log.r_o is None
     assert log.u == pytest.approx(flight.u, abs=1e-6)
     assert "the format of vehicle_attitude_setpoint is not known, none of them is read" in log.warnings[0]
+
+
+def test_a_message_with_a_damaged_format_is_named_beside_what_lacks(tmp_path, flight):
+    data = bytearray(dataflash_bytes(ardupilot_messages(flight)))
+    data[data.index(b"Qffff\0")] = ord("X")
+    (tmp_path / "x.bin").write_bytes(data)
+    with pytest.raises(TuningError, match=r"lacks message RATE .*the format of RATE is not known or damaged"):
+        read_log(tmp_path / "x.bin")
+
+
+def test_fields_that_are_there_instead_are_named(tmp_path, flight):
+    data = dataflash_bytes(ardupilot_messages(flight)).replace(b"ROut,POut", b"ROvt,POut")
+    (tmp_path / "x.bin").write_bytes(data)
+    with pytest.raises(TuningError, match=r"message RATE \(ROut, POut\), which has TimeUS, R, P, ROvt, POut;"):
+        read_log(tmp_path / "x.bin")

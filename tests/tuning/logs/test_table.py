@@ -202,6 +202,12 @@ def test_a_time_that_cannot_be_is_refused_with_what_was_found(tmp_path, flight, 
         read_log(write_csv(tmp_path / "x.csv", table(flight) | {"t": time(flight.t)}))
 
 
+def test_a_slow_log_in_milliseconds_is_told_both(tmp_path):
+    flight = make_flight(20.0, 0.02)
+    with pytest.raises(TuningError, match=r'unit = "ms" \}; its rate is then 50 Hz, tuning needs 100 Hz'):
+        read_log(write_csv(tmp_path / "x.csv", table(flight) | {"t": 1000 * flight.t}))
+
+
 def test_a_short_log_in_minutes_is_not_taken_for_a_fast_one(tmp_path):
     flight = make_flight(20.0, 0.01)
     with pytest.raises(TuningError, match=r"a rate of 6000 Hz and a flight of 0\.3333 s"):
