@@ -104,7 +104,7 @@ def restore(
     from sitl.mavlink.session import Options
     from sitl.mavlink.upload_console import transact
 
-    plan = restoration(read_parameters(parameters))
+    plan = restoration(read_parameters(parameters), str(parameters))
     stem = parameters.with_name(
         re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
     )  # a snapshot's next one is its sister

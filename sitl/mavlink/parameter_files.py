@@ -1,4 +1,8 @@
-"""Parameter files of the three ground stations: every float32 is written so that it is read back with the same bits."""
+"""Parameter files of the three ground stations: every float32 is written so that it is read back with the same bits.
+
+The first line, a comment to all three, says how many parameters follow and their SHA-256: half of a gain matrix is
+never taken for the whole.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,9 @@ from pathlib import Path
 
 from sitl.errors import SitlError
 from sitl.mavlink.words import REAL32, shortest, single
+from tuning.files import sha256
 
+SEAL = re.compile(r"# mimopilot: (\d+) parameters, sha256 ([0-9a-f]{64})")
 NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 
@@ -42,7 +48,12 @@ def parameter_text(form: str, values: Mapping[str, float], system: int = 1, comp
     system, component : int
         The vehicle's, which only QGroundControl's files hold.
     """
-    return FORMATS[form](values, system, component)
+    seal = f"# mimopilot: {len(values)} parameters, sha256 {_digest(values)}\n"
+    return seal + FORMATS[form](values, system, component)
+
+
+def _digest(values: Mapping[str, float]) -> str:
+    return sha256("".join(f"{name} {shortest(value)}\n" for name, value in values.items()))
 
 
 def read_parameters(path: Path) -> dict[str, float]:
@@ -51,7 +62,8 @@ def read_parameters(path: Path) -> dict[str, float]:
     Raises
     ------
     SitlError
-        With the line, when it is none of them, a name is impossible or repeated, or a value is not a finite float.
+        With the line, when it is none of them, a name is impossible or repeated, or a value is not a finite float. When
+        it is not what its first line says was written.
     """
     try:
         text = path.read_text()
@@ -67,9 +79,26 @@ def read_parameters(path: Path) -> dict[str, float]:
         if name in values:
             raise SitlError(f"{where}: {name} stands in the file twice")
         values[name] = value
+    _check_seal(text, values, path)
     if not values:
         raise SitlError(f"{path}: holds no parameters")
     return values
+
+
+def _check_seal(text: str, values: Mapping[str, float], path: Path) -> None:
+    seal = SEAL.match(text)
+    if seal is None:
+        return
+    if len(values) != int(seal[1]):
+        raise SitlError(
+            f"{path}: holds {len(values)} parameters, but its first line says {seal[1]}: it is not whole; use another "
+            "copy"
+        )
+    if _digest(values) != seal[2]:
+        raise SitlError(
+            f"{path}: its values are not those that its first line vouches for: it is damaged or was edited; use "
+            "another copy, or delete the first line to take the values as they are"
+        )
 
 
 def _entry(content: str, where: str) -> tuple[str, float]:

@@ -18,7 +18,19 @@ import tty
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.mavlink.words import Ack, Heartbeat, Read, Refusal, Store, Value, Write
+from sitl.mavlink.words import (
+    HEARTBEAT,
+    THE_PEER,
+    Ack,
+    Heard,
+    Heartbeat,
+    Read,
+    Refusal,
+    RequestOnce,
+    Store,
+    Value,
+    Write,
+)
 
 SYSTEM, COMPONENT = 1, 1
 TELL_S = 0.1
@@ -40,11 +52,12 @@ class ScriptedVehicle:
         self.values = {name: float32(value) for name, value in values.items()}
         self.fault, self.victim, self.after, self.storage = fault, victim, after, storage
         self.armed = self.dead = False
+        self.autopilot, self.type = 12, 2  # a quadrotor with PX4
         self.first = self.values.get(victim, 0.0)
         self.writes = self.reads = self.stored = 0
 
     def heartbeat(self):
-        return [] if self.dead else [Heartbeat(SYSTEM, COMPONENT, 12, self.armed)]
+        return [] if self.dead else [Heartbeat(SYSTEM, COMPONENT, self.autopilot, self.armed, 0, self.type)]
 
     def value(self, name):
         kind = 6 if self.fault == "integer" and name == self.victim else 9
@@ -56,6 +69,8 @@ class ScriptedVehicle:
         if isinstance(order, Store):
             self.stored += 1
             return [] if self.storage is None else [Ack(SYSTEM, COMPONENT, 245, self.storage)]
+        if order == RequestOnce(SYSTEM, COMPONENT, HEARTBEAT):
+            return self.heartbeat()
         if not isinstance(order, Read | Write) or (order.system, order.component) != (SYSTEM, COMPONENT):
             return []
         if order.name not in self.values:
@@ -134,7 +149,7 @@ class SimulatedLink:
                 late = 4 * self.latency * chance() if chance() < self.reorder else 0.0
                 self.schedule(self.time + self.latency + late, kind, message)
 
-    def send(self, messages):
+    def send(self, messages, to=None):
         for message in messages:
             self.log.append((self.time, message))
             self.carry("to vehicle", message)
@@ -158,7 +173,7 @@ class SimulatedLink:
             elif self.up and kind == "to vehicle":
                 self.say(self.vehicle.answer(message))
             elif self.up:
-                return [message]
+                return [Heard(THE_PEER, message)]
         self.time = max(self.time, until)
         return []
 
@@ -167,7 +182,7 @@ def encode(message):
     """pymavlink's message for a word of the vehicle."""
     if isinstance(message, Heartbeat):
         mode = 128 if message.armed else 0
-        return mavlink.MAVLink_heartbeat_message(2, message.autopilot, mode, 0, 4, 3)
+        return mavlink.MAVLink_heartbeat_message(message.type, message.autopilot, mode, 0, 4, 3)
     if isinstance(message, Value):
         # Index 65535: unknown.
         return mavlink.MAVLink_param_value_message(message.name.encode(), message.value, message.kind, 100, 65535)
@@ -186,6 +201,8 @@ def decode(message):
         assert message.param_type == 9
         return Write(message.target_system, message.target_component, message.param_id, message.param_value)
     if kind == "COMMAND_LONG":
+        if message.command == 512:
+            return RequestOnce(message.target_system, message.target_component, message.param1)
         assert (message.command, message.param1) == (245, 1.0)
         return Store(message.target_system, message.target_component)
     return None

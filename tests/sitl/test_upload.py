@@ -1,6 +1,7 @@
 """upload, restore and params as a user runs them, on real sockets, against a scripted vehicle and against ours."""
 
 import dataclasses
+import io
 import json
 import os
 import random
@@ -13,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import mimopilot as front_door
 from codegen.parameters import IDENTITY, PARAMETERS
 from codegen.render import render
 from sitl.airframe import load_airframe
@@ -24,11 +26,30 @@ from sitl.mavlink.profiles import make_plan
 from sitl.mavlink.signing import Signer, read_key
 from sitl.mavlink.words import Beat, Heartbeat, Read, Refusal, Store, Value, Write
 from tests.conftest import assert_one_clear_line
-from tests.sitl.running import Pilot, running_sitl
+from tests.sitl.running import QUICK, WAITS, Pilot, running_sitl
 from tests.sitl.scripted_vehicle import FAILING, ScriptedVehicle, SerialVehicle, TcpVehicle, UdpVehicle, encode, float32
 from tuning.gains import load_gains
 
 KEY = bytes(range(32))
+
+
+@pytest.fixture
+def mimopilot(monkeypatch, capsys, tmp_path):
+    """The command line in this process, with `WAITS`: a real upload waits for seconds."""
+    for (module, name), value in WAITS.items():
+        monkeypatch.setattr(f"{module}.{name}", value)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["mimopilot", *map(str, arguments)])
+        monkeypatch.setattr(sys, "stdin", io.StringIO())
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            front_door.main()
+        code = end.value.code or 0
+        return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture
@@ -143,7 +164,7 @@ def test_a_connection_that_breaks_is_noticed_at_once(mimopilot, certified, old):
 def test_ctrl_c_and_a_closed_terminal_put_the_old_values_back(certified, old, new, number):
     vehicle = ScriptedVehicle(old, "deaf to one", victim="MIMO_RF_PP")
     with UdpVehicle(vehicle) as link:
-        command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url, "--yes"]
+        command = [*QUICK, "upload", str(certified), "--connect", link.url, "--yes"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             deadline = time.monotonic() + 20
             while vehicle.writes < 20 and time.monotonic() < deadline:
@@ -162,7 +183,7 @@ def test_ctrl_c_and_a_closed_terminal_put_the_old_values_back(certified, old, ne
 def test_a_person_at_a_terminal_is_asked(certified, old, new, answer, written):
     near, far = os.openpty()
     with UdpVehicle(ScriptedVehicle(old)) as link:
-        command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url]
+        command = [*QUICK, "upload", str(certified), "--connect", link.url]
         with subprocess.Popen(command, stdin=far, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             shown = ""
             while "Write 35 parameters to vehicle 1?" not in shown:
@@ -180,7 +201,7 @@ def test_a_person_at_a_terminal_is_asked(certified, old, new, answer, written):
 def test_values_that_change_while_the_question_stands_are_not_overwritten(certified, old, new):
     near, far = os.openpty()
     with UdpVehicle(ScriptedVehicle(old)) as link:
-        command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url]
+        command = [*QUICK, "upload", str(certified), "--connect", link.url]
         with subprocess.Popen(command, stdin=far, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
             deadline = time.monotonic() + 20
             while link.vehicle.reads < len(old) and time.monotonic() < deadline:
@@ -242,12 +263,14 @@ def test_a_vehicle_without_its_unit_of_moment_takes_gains_whose_unit_is_told(mim
         assert named(link.vehicle.values, new) == new
 
 
-@pytest.mark.parametrize(("profile", "count"), [("px4-stock", 25), ("ardupilot-stock", 24)])
-def test_a_stock_autopilot_gets_the_diagonal(mimopilot, certified, gains, profile, count):
+@pytest.mark.parametrize(("profile", "autopilot", "count"), [("px4-stock", 12, 25), ("ardupilot-stock", 3, 24)])
+def test_a_stock_autopilot_gets_the_diagonal(mimopilot, certified, gains, profile, autopilot, count):
     wanted = make_plan(gains, profile, drop=True).values
     assert len(wanted) == count
     arguments = ("upload", certified, "--yes", "--profile", profile)
-    with UdpVehicle(ScriptedVehicle(dict.fromkeys(wanted, 0.25))) as link:
+    vehicle = ScriptedVehicle(dict.fromkeys(wanted, 0.25))
+    vehicle.autopilot = autopilot
+    with UdpVehicle(vehicle) as link:
         at = ("--connect", link.url)
         assert_one_clear_line(mimopilot(*arguments, *at), "13% of its diagonal", "--drop-off-diagonals")
         told = (*arguments, *at, "--drop-off-diagonals")
