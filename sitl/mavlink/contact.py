@@ -5,7 +5,7 @@ No socket and no clock: see `sitl.mavlink.words` for how a conversation is drive
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 from sitl.errors import SitlError
 from sitl.mavlink.words import (
@@ -83,7 +83,7 @@ class Contact:
         self.contradiction = ""
         self.progress: Callable[[str, int, int], None] = lambda phase, done, of: None
         self.witness: Callable[[Sight], None] = lambda sight: None
-        self._agreed: Mapping[str, float] = {}
+        self._agreed: dict[str, float] | None = None
         self._doubled = ""
         self._heartbeat_at = self._heard_at = now
         self._beat_due = self._request_due = now
@@ -110,9 +110,17 @@ class Contact:
             return "the vehicle was armed before the last reading"
         return self._doubled or self.contradiction
 
-    def agree(self, values: Mapping[str, float]) -> None:
-        """The vehicle has stated these: from now on each other value of these names is a contradiction."""
-        self._agreed, self.contradiction = values, ""
+    def watch(self, on: bool) -> None:
+        """From now on what contradicts a value that was read counts, or (False) no longer."""
+        self._agreed = {} if on else None
+        self.contradiction = ""
+
+    def agree(self, name: str, value: float | None) -> None:
+        """A value was read, or (None) the vehicle is told another."""
+        if self._agreed is not None and value is not None:
+            self._agreed[name] = value
+        elif self._agreed is not None:
+            self._agreed.pop(name, None)
 
     def resume(self, now: float) -> None:
         """Go on after a pause in which nobody listened: writing waits for another HEARTBEAT."""
@@ -161,14 +169,12 @@ class Contact:
 
     def _compare(self, message: Value | Refusal | Ack) -> None:
         """See whether a value contradicts what was agreed on."""
-        if not isinstance(message, Value) or message.name not in self._agreed:
+        if not isinstance(message, Value) or self._agreed is None:
             return
-        if message.value != self._agreed[message.name]:
+        agreed = self._agreed.get(message.name, message.value)
+        if message.value != agreed:
             self.possible[message.name].add(message.value)
-            self.contradiction = (
-                f"{message.name}: the vehicle states {shortest(message.value)} after "
-                f"{shortest(self._agreed[message.name])} was read back"
-            )
+            self.contradiction = f"{message.name}: {shortest(message.value)}, after the vehicle said {shortest(agreed)}"
 
     def meet(self) -> Steps[Heartbeat]:
         """Wait for the vehicle's HEARTBEAT, and hear who else is there.

@@ -169,6 +169,7 @@ class Conversation(Contact):
         if value is None:
             return Read(*address, name)
         self.written.add(name)
+        self.agree(name, None)
         self._changed_at = self.now
         self.possible.setdefault(name, set()).add(value)
         return Write(*address, name, value, self._kinds.get(name, REAL32))
@@ -195,6 +196,8 @@ class Conversation(Contact):
             self._round_trip = max(self._round_trip, took)
         if wanted is not None:
             self.possible[message.name] = {wanted}
+        else:
+            self.agree(message.name, message.value)
         return Answer(message.value)
 
     def settle(self) -> Steps[None]:

@@ -48,12 +48,8 @@ def parameter_text(form: str, values: Mapping[str, float], system: int = 1, comp
     system, component : int
         The vehicle's, which only QGroundControl's files hold.
     """
-    seal = f"# mimopilot: {len(values)} parameters, sha256 {_digest(values)}\n"
-    return seal + FORMATS[form](values, system, component)
-
-
-def _digest(values: Mapping[str, float]) -> str:
-    return sha256("".join(f"{name} {shortest(value)}\n" for name, value in values.items()))
+    body = FORMATS[form](values, system, component)
+    return f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n{body}"
 
 
 def read_parameters(path: Path) -> dict[str, float]:
@@ -69,6 +65,7 @@ def read_parameters(path: Path) -> dict[str, float]:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise SitlError(f"{path}: cannot read the parameter file: {error}") from error
+    _check_seal(text, path)
     values: dict[str, float] = {}
     for number, line in enumerate(text.splitlines(), 1):
         content = line.split("#")[0].strip()
@@ -79,25 +76,26 @@ def read_parameters(path: Path) -> dict[str, float]:
         if name in values:
             raise SitlError(f"{where}: {name} stands in the file twice")
         values[name] = value
-    _check_seal(text, values, path)
     if not values:
         raise SitlError(f"{path}: holds no parameters")
     return values
 
 
-def _check_seal(text: str, values: Mapping[str, float], path: Path) -> None:
+def _check_seal(text: str, path: Path) -> None:
+    """Refuse a file that is not what its first line says was written."""
     seal = SEAL.match(text)
     if seal is None:
         return
-    if len(values) != int(seal[1]):
+    body = text[seal.end() :].strip()
+    count = sum(bool(line) and not line.startswith("#") for line in body.splitlines())
+    if count != int(seal[1]):
         raise SitlError(
-            f"{path}: holds {len(values)} parameters, but its first line says {seal[1]}: it is not whole; use another "
-            "copy"
+            f"{path}: holds {count} parameters, but its first line says {seal[1]}: it is not whole; use another copy"
         )
-    if _digest(values) != seal[2]:
+    if sha256(body) != seal[2]:
         raise SitlError(
-            f"{path}: its values are not those that its first line vouches for: it is damaged or was edited; use "
-            "another copy, or delete the first line to take the values as they are"
+            f"{path}: is not what its first line vouches for: it was cut short, damaged or edited; use another copy, "
+            "or delete the first line to take the values as they are"
         )
 
 

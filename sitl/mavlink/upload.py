@@ -84,20 +84,18 @@ def apply(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float]
     """
     expected = {**old, **new}
     talk.possible = {name: {value} for name, value in old.items()}
+    talk.watch(True)
     storage = ""
     reason = yield from _write(talk, new, old)
     if not reason:
         reason = yield from _verify(talk, expected)
     if not reason and store:
-        talk.agree(expected)
         storage = yield from talk.store()
         reason = (yield from talk.outlast()) or (yield from _verify(talk, expected))
     state = "verified"
     if reason:
         state, storage = yield from _put_back(talk, new, old, store)
-        if state == "mixed" and talk.contradiction:
-            reason = f"{reason}; while the old values were put back, {talk.contradiction}"
-    talk.agree({})
+    talk.watch(False)
     held = {name: tuple(sorted(values)) for name, values in talk.possible.items()}
     return Outcome(state, reason, held, storage, talk.was_armed)
 
@@ -108,20 +106,19 @@ def _put_back(
     """Put the old values back; the state of the vehicle and of its storage."""
     if not talk.written:
         return "untouched", ""
-    talk.agree({})
+    talk.watch(True)
     yield from talk.settle()
     back = {name: old[name] for name in new if name in talk.written or talk.possible[name] != {old[name]}}
     yield from talk.tell(back, "putting back", keep_going=True)
     if talk.gone:
         return "mixed", ""
     yield from talk.settle()
-    talk.agree(old)
     storage = ""
     if store:
         storage = yield from talk.store()
         yield from talk.outlast(keep_going=True)
     answers = yield from talk.ask(list(old), "verifying", keep_going=True)
-    restored = all(answers[name].value == old[name] for name in old) and not talk.contradiction
+    restored = all(answers[name].value == old[name] and talk.possible[name] == {old[name]} for name in old)
     return "rolled back" if restored else "mixed", storage
 
 

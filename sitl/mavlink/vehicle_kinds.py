@@ -80,6 +80,6 @@ def check_kind(vehicle: Heartbeat, profile: str) -> None:
 def without_module(vehicle: Heartbeat) -> str:
     """What to say of a stock autopilot that could fly our module and does not."""
     return (
-        f"the vehicle is {describe(vehicle)} and its stock controllers, and has none of our parameters; the profile that "
-        f"fits is {AUTOPILOTS[vehicle.autopilot][1][0]}, or flash what `mimopilot generate` emits for mimo"
+        f"the vehicle is {describe(vehicle)} and its stock controllers, and has none of our parameters; the profile "
+        f"that fits is {AUTOPILOTS[vehicle.autopilot][1][0]}, or flash what `mimopilot generate` emits for mimo"
     )

@@ -123,7 +123,7 @@ class SimulatedLink:
     """A link with loss, duplicates, reordering and latency each way, in simulated time; see words.Link."""
 
     def __init__(self, vehicle, seed=0, loss=0.0, duplicate=0.0, reorder=0.0, latency=0.05, noise=()):
-        self.vehicle, self.closed, self.time = vehicle, False, 0.0
+        self.vehicles, self.closed, self.time = {THE_PEER: vehicle}, False, 0.0
         self.random = random.Random(seed)
         self.loss, self.duplicate, self.reorder, self.latency = loss, duplicate, reorder, latency
         self.order = itertools.count()
@@ -131,9 +131,14 @@ class SimulatedLink:
         self.up = True
         self.noise = noise
         self.log = []
-        self.schedule(self.random.random(), "beat", None)
+        self.schedule(self.random.random(), "beat", THE_PEER)
         if hasattr(vehicle, "tell"):
             self.schedule(0.0, "tell", None)
+
+    def join(self, at, origin, vehicle):
+        """Another vehicle at another address, from a time (s) on."""
+        self.vehicles[origin] = vehicle
+        self.schedule(at, "beat", origin)
 
     def now(self):
         return self.time
@@ -152,28 +157,30 @@ class SimulatedLink:
     def send(self, messages, to=None):
         for message in messages:
             self.log.append((self.time, message))
-            self.carry("to vehicle", message)
+            for target in self.vehicles if to is None else [to]:
+                self.carry("to vehicle", (target, message))
 
-    def say(self, messages):
+    def say(self, messages, origin=THE_PEER):
         for message in messages:
-            self.carry("to ground", message)
+            self.carry("to ground", Heard(origin, message))
             for other in self.noise:
-                self.carry("to ground", other(message))
+                self.carry("to ground", Heard(origin, other(message)))
 
     def receive(self, until):
         while self.queue and self.queue[0][0] <= until:
             at, _, kind, message = heapq.heappop(self.queue)
             self.time = max(self.time, at)
             if kind == "beat":
-                self.say(self.vehicle.heartbeat())
-                self.schedule(at + 1.0, "beat", None)
+                self.say(self.vehicles[message].heartbeat(), message)
+                self.schedule(at + 1.0, "beat", message)
             elif kind == "tell":
-                self.say(self.vehicle.tell(at))
+                self.say(self.vehicles[THE_PEER].tell(at))
                 self.schedule(at + TELL_S, "tell", None)
             elif self.up and kind == "to vehicle":
-                self.say(self.vehicle.answer(message))
+                target, order = message
+                self.say(self.vehicles[target].answer(order), target)
             elif self.up:
-                return [Heard(THE_PEER, message)]
+                return [message]
         self.time = max(self.time, until)
         return []
 
@@ -211,14 +218,14 @@ def decode(message):
 class ByteVehicle:
     """A scripted vehicle that speaks MAVLink in a thread; the transport gives it `receive` and `transmit`."""
 
-    def __init__(self, vehicle, beat=0.1, delay=0.0, key=None):
+    def __init__(self, vehicle, beat=0.1, delay=0.0, key=None, late=0.0):
         self.vehicle, self.beat, self.delay = vehicle, beat, delay
         self.first_beat_at = None
         self.mav = mavlink.MAVLink(None, SYSTEM, COMPONENT)
         self.mav.robust_parsing = True
         if key is not None:
             self.mav.signing.secret_key, self.mav.signing.sign_outgoing = key, True
-            self.mav.signing.timestamp = int((time.time() - 1420070400) * 1e5)
+            self.mav.signing.timestamp = int((time.time() - 1420070400 - late) * 1e5)
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self.run)
 
@@ -260,6 +267,7 @@ class UdpVehicle(ByteVehicle):
         super().__init__(vehicle, **keywords)
         self.port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.port.bind(("127.0.0.1", 0))
+        self.port_number = self.port.getsockname()[1]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
             self.ground = probe.getsockname()

@@ -11,7 +11,7 @@ from sitl.errors import SitlError
 from sitl.mavlink.contact import LISTEN_S
 from sitl.mavlink.exchange import AUTOSAVE_S, Conversation
 from sitl.mavlink.upload import apply, read
-from sitl.mavlink.words import Ack, Heartbeat, Refusal, Store, Value, Write, drive, single
+from sitl.mavlink.words import THE_PEER, Ack, Heard, Heartbeat, Refusal, Store, Value, Write, drive, single
 from tests.sitl.scripted_vehicle import FAILING, ScriptedVehicle, SimulatedLink
 
 NAMES = [f"MIMO_X_{i:02d}" for i in range(20)]
@@ -168,7 +168,7 @@ def test_a_link_that_comes_back_in_time_ends_with_the_old_values():
     def revive(until):
         if not link.up and any(kind == "back" and at <= until for at, _, kind, _ in link.queue):
             link.up = True
-        return [heard for heard in receive(until) if heard.message is not None]
+        return [heard for heard in receive(until) if heard is not None]
 
     link.receive = revive
     outcome = upload(link)
@@ -228,7 +228,7 @@ def test_writing_waits_for_a_heartbeat_when_the_last_one_is_old():
     link.time += 60.0  # somebody reads the table; meanwhile it arms
     link.queue.clear()
     vehicle.armed = True
-    link.schedule(link.time + 0.7, "beat", None)
+    link.schedule(link.time + 0.7, "beat", THE_PEER)
     talk.resume(link.now())
     outcome = drive(apply(talk, NEW, held), link)
     assert (outcome.state, vehicle.writes) == ("untouched", 0)
@@ -383,7 +383,7 @@ def test_whatever_else_is_said_on_the_link_a_success_is_true(noise, seed, fault)
     for i, word in enumerate(noise):
         # Left out: a stray value with the very bits that are hoped for, which cannot be told from an answer.
         if not (isinstance(word, Value) and word.value == NEW.get(word.name)):
-            link.schedule(0.05 * i, "to ground", word)
+            link.schedule(0.05 * i, "to ground", Heard(THE_PEER, word))
     try:
         outcome = upload(link, tries=6, system=1)
     except SitlError:

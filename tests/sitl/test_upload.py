@@ -1,21 +1,18 @@
 """upload, restore and params as a user runs them, on real sockets, against a scripted vehicle and against ours."""
 
 import dataclasses
-import io
 import json
 import os
 import random
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import mimopilot as front_door
-from codegen.parameters import IDENTITY, PARAMETERS
+from codegen.parameters import PARAMETERS
 from codegen.render import render
 from sitl.airframe import load_airframe
 from sitl.errors import SitlError
@@ -26,7 +23,7 @@ from sitl.mavlink.profiles import make_plan
 from sitl.mavlink.signing import Signer, read_key
 from sitl.mavlink.words import Beat, Heartbeat, Read, Refusal, Store, Value, Write
 from tests.conftest import assert_one_clear_line
-from tests.sitl.running import QUICK, WAITS, Pilot, running_sitl
+from tests.sitl.running import QUICK, Pilot, running_sitl
 from tests.sitl.scripted_vehicle import FAILING, ScriptedVehicle, SerialVehicle, TcpVehicle, UdpVehicle, encode, float32
 from tuning.gains import load_gains
 
@@ -34,44 +31,8 @@ KEY = bytes(range(32))
 
 
 @pytest.fixture
-def mimopilot(monkeypatch, capsys, tmp_path):
-    """The command line in this process, with `WAITS`: a real upload waits for seconds."""
-    for (module, name), value in WAITS.items():
-        monkeypatch.setattr(f"{module}.{name}", value)
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["mimopilot", *map(str, arguments)])
-        monkeypatch.setattr(sys, "stdin", io.StringIO())
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            front_door.main()
-        code = end.value.code or 0
-        return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
-
-    return run
-
-
-@pytest.fixture
-def certified(gains, tmp_path):
-    """A gains file with a certificate for its very matrices."""
-    path = tmp_path / "my.gains.toml"
-    certificate = {"verdict": "certified", "reason": "by this test", "matrices_sha256": gains.matrices_sha256()}
-    dataclasses.replace(gains, certificate=certificate).save(path)
-    return path
-
-
-@pytest.fixture
-def new(gains):
-    return make_plan(gains).values
-
-
-@pytest.fixture
-def old(gains, new):
-    """Every gain on the vehicle differs from the new one; the period and the unit of moment do not."""
-    identity = dict(zip((p.name for p in IDENTITY), gains.moment_scale, strict=True))
-    values = {name: value * 0.875 for name, value in new.items()} | {"MIMO_TS": gains.Ts} | identity
-    return {name: float32(value) for name, value in values.items()}
+def mimopilot(quick_mimopilot):
+    return quick_mimopilot
 
 
 def named(values, names):
