@@ -223,11 +223,16 @@ class ByteVehicle:
         self.first_beat_at = None
         self.mav = mavlink.MAVLink(None, SYSTEM, COMPONENT)
         self.mav.robust_parsing = True
+        self.late = late
         if key is not None:
             self.mav.signing.secret_key, self.mav.signing.sign_outgoing = key, True
-            self.mav.signing.timestamp = int((time.time() - 1420070400 - late) * 1e5)
+            self.set_clock()
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self.run)
+
+    def set_clock(self):
+        """Its own time of signing, `late` s behind."""
+        self.mav.signing.timestamp = int((time.time() - 1420070400 - self.late) * 1e5)
 
     def __enter__(self):
         self.thread.start()
@@ -249,6 +254,8 @@ class ByteVehicle:
             while outbox and outbox[0][0] <= now:
                 message = outbox.pop(0)[1]
                 self.mav.srcSystem, self.mav.srcComponent = message.system, message.component
+                if self.late:
+                    self.set_clock()  # pymavlink would take over the time of whom it hears
                 self.transmit(encode(message).pack(self.mav))
                 self.mav.seq = (self.mav.seq + 1) % 256
             wake = min([due, *(at for at, _ in outbox[:1])])
