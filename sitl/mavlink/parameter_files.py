@@ -1,7 +1,7 @@
 """Parameter files of the three ground stations: every float32 is written so that it is read back with the same bits.
 
-The first line, a comment to all three, says how many parameters follow and their SHA-256: half of a gain matrix is
-never taken for the whole.
+The first line, a comment to all three, says how many parameters follow and the SHA-256 of the rest: half of a gain
+matrix is never taken for the whole.
 """
 
 from __future__ import annotations
@@ -36,7 +36,9 @@ def _mission_planner(values: Mapping[str, float], system: int, component: int) -
 FORMATS = {"qgc": _qgc, "mavproxy": _mavproxy, "missionplanner": _mission_planner}
 
 
-def parameter_text(form: str, values: Mapping[str, float], system: int = 1, component: int = 1) -> str:
+def parameter_text(
+    form: str, values: Mapping[str, float], system: int = 1, component: int = 1, seal: bool = True
+) -> str:
     """Text of a parameter file.
 
     Parameters
@@ -47,9 +49,12 @@ def parameter_text(form: str, values: Mapping[str, float], system: int = 1, comp
         Name -> value; rounded to single precision.
     system, component : int
         The vehicle's, which only QGroundControl's files hold.
+    seal : bool
+        Begin with the line that vouches for the rest; False for a file that is meant to be edited.
     """
     body = FORMATS[form](values, system, component)
-    return f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n{body}"
+    first = f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n" if seal else ""
+    return first + body
 
 
 def read_parameters(path: Path) -> dict[str, float]:
