@@ -204,16 +204,23 @@ def test_mavproxy_connects_without_an_error_sets_parameters_and_flies(tmp_path, 
 
             def shown():
                 proxy.say("param fetch MIMO_RP_RR")
+                time.sleep(0.5)
                 proxy.say("param show MIMO_RP_RR")
-                time.sleep(0.2)
+                proxy.until("MIMO_RP_RR       0.1")
                 return "MIMO_RP_RR       0.11999999731779099" in proxy.output
 
             wait_for(shown, lambda: proxy.output)
-            proxy.say("arm throttle")
-            proxy.until("armed")
+
+            def armed():
+                proxy.say("arm throttle")
+                time.sleep(0.5)
+                return "COMPONENT_ARM_DISARM: ACCEPTED" in proxy.output
+
+            wait_for(armed, lambda: proxy.output)  # it may not be ready yet
             proxy.say("takeoff 2")
             proxy.until("mode hold")
             proxy.say(f"mode {custom_mode(Mode.LAND)}")
             proxy.until("disarmed: landed")
         finally:
+            proxy.process.kill()  # it does not always end when asked
             proxy.end()
