@@ -13,7 +13,9 @@ ConnectOption = Annotated[
 ]
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only read and compare.")]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
-ForceArmedOption = Annotated[bool, typer.Option("--force-armed", help="Write even to an armed vehicle.")]
+ForceArmedOption = Annotated[
+    bool, typer.Option("--force-armed", help="Write even to a vehicle that is or becomes armed.")
+]
 TimeoutOption = Annotated[
     float, typer.Option(min=0.5, max=600, help="Silence after which the vehicle counts as gone, s.")
 ]
@@ -62,8 +64,11 @@ def upload(
 ) -> None:
     """Put gains on a vehicle: all of them, each read back, or the old ones again.
 
-    An armed vehicle is refused, and asked again before every write. Whatever goes wrong on the way (Ctrl-C, an armed
-    vehicle, a refused value) puts the old values back; where the link is lost, what may be left is told name by name.
+    Nothing is written to an armed vehicle, nor under a HEARTBEAT older than 1.5 s: a late one is asked for. After the
+    vehicle has stored its values, 2.5 s after the last write, and after another HEARTBEAT, all of them are read once
+    more. Whatever goes wrong until then (Ctrl-C, a vehicle that arms, a value that it refuses, changes or contradicts,
+    a second vehicle with its system number) puts the old values back, the one thing that is also written to an armed
+    vehicle, and ends in exit code 1; where the link is lost, what may be left is told name by name.
     """
     import sys
 
@@ -98,13 +103,16 @@ def restore(
     system: SystemOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a snapshot's values back to a vehicle, with the same care as an upload."""
+    """Write a snapshot's values back to a vehicle, with the same care as an upload.
+
+    A snapshot that is not whole, holds a part of our gains only, or a value out of its range, is refused.
+    """
     from sitl.mavlink.parameter_files import read_parameters
     from sitl.mavlink.profiles import restoration
     from sitl.mavlink.session import Options
     from sitl.mavlink.upload_console import transact
 
-    plan = restoration(read_parameters(parameters))
+    plan = restoration(read_parameters(parameters), str(parameters))
     stem = parameters.with_name(
         re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
     )  # a snapshot's next one is its sister

@@ -16,10 +16,13 @@ from sitl.mavlink.link import Codec, udp_socket
 from sitl.mavlink.signing import Signer
 from sitl.mavlink.words import (
     INT32,
+    THE_PEER,
     Ack,
+    Address,
     Attitude,
     Beat,
     Excited,
+    Heard,
     Heartbeat,
     Incoming,
     Landed,
@@ -27,6 +30,7 @@ from sitl.mavlink.words import (
     Read,
     Refusal,
     Request,
+    RequestOnce,
     Text,
     Value,
     Write,
@@ -39,6 +43,8 @@ BAUD = 57600
 EXCITATION = "MIMO_EXC"
 FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
 CONNECT_S = 5.0
+#: Addresses of a UDP link that are remembered: more than any network of vehicles and routers has.
+MAX_PEERS = 64
 
 
 def understand(message: Any) -> Incoming | None:
@@ -49,7 +55,7 @@ def understand(message: Any) -> Incoming | None:
         if message.type == mavlink.MAV_TYPE_GCS or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
             return None
         armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        return Heartbeat(*speaker, message.autopilot, armed, message.custom_mode)
+        return Heartbeat(*speaker, message.autopilot, armed, message.custom_mode, message.type)
     if kind == "PARAM_VALUE":
         value = message.param_value
         whole = struct.unpack("<i", struct.pack("<f", value))[0] if message.param_type == INT32 else value
@@ -85,6 +91,8 @@ def express(order: Outgoing) -> Any:
         return mavlink.MAVLink_param_set_message(order.system, order.component, name, coded, order.kind)
     if isinstance(order, Request):
         command, parameters = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (order.message, order.interval)
+    elif isinstance(order, RequestOnce):
+        command, parameters = mavlink.MAV_CMD_REQUEST_MESSAGE, (order.message, 0)
     else:
         command, parameters = mavlink.MAV_CMD_PREFLIGHT_STORAGE, (1, 0)
     return mavlink.MAVLink_command_long_message(order.system, order.component, command, 0, *parameters, 0, 0, 0, 0, 0)
@@ -108,13 +116,22 @@ class Connection:
 
     def __init__(self, url: str, key: bytes | None = None) -> None:
         self.closed = False
-        self.codec = Codec(GROUND_SYSTEM, GROUND_COMPONENT, None if key is None else Signer(key))
+        self.signer = None if key is None else Signer(key)
         self.kind, _, rest = url.partition(":")
-        self.peers: dict[Any, None] = {}
+        #: Who is there, each with what packs and parses its messages: two half frames of two speakers make none.
+        self.peers: dict[Address, Codec] = {}
         if self.kind in ("udp", "udpin", "udpout", "tcp"):
             self.port: Any = self._open_socket(url, rest)
         else:
             self.port = self._open_serial(url)
+        if self.kind not in ("udp", "udpin", "udpout"):
+            self._peer(THE_PEER)
+
+    def _peer(self, address: Address) -> Codec:
+        """What speaks with an address. Beyond so many the oldest is forgotten: anybody can send a datagram."""
+        if address not in self.peers and len(self.peers) >= MAX_PEERS:
+            del self.peers[next(iter(self.peers))]
+        return self.peers.setdefault(address, Codec(GROUND_SYSTEM, GROUND_COMPONENT, self.signer))
 
     def _open_socket(self, url: str, rest: str) -> socket.socket:
         host, _, number = rest.rpartition(":")
@@ -128,7 +145,7 @@ class Connection:
                 port.settimeout(CONNECT_S)
                 return port
             if self.kind == "udpout":
-                self.peers[socket.gethostbyname(host), address[1]] = None
+                self._peer((socket.gethostbyname(host), address[1]))
                 return udp_socket("", 0)
             return udp_socket(*address, "is another ground station listening there?")
         except OSError as error:
@@ -149,10 +166,16 @@ class Connection:
     @property
     def hint(self) -> str:
         """What signatures tell about a silence; empty when nothing."""
-        if self.codec.unasked:
+        if any(codec.unasked for codec in self.peers.values()):
             return "; messages on this link are signed: give --signing-key"
-        trusted = self.codec.signer is not None and self.codec.signer.heard
-        return "; messages came that are not signed with this key" if self.codec.refused and not trusted else ""
+        if self.signer is None or self.signer.heard:
+            return ""
+        if self.signer.behind:
+            return (
+                f"; messages came that are signed with this key, {self.signer.behind:.0f} s behind this computer's "
+                "clock: set the clock of whichever is wrong"
+            )
+        return "; messages came that are not signed with this key" * any(c.refused for c in self.peers.values())
 
     def close(self) -> None:
         """Release the port."""
@@ -162,47 +185,51 @@ class Connection:
         """Monotonic time, s."""
         return time.monotonic()
 
-    def send(self, messages: Sequence[Outgoing]) -> None:
-        """Send; what cannot be sent is lost, as on any radio."""
-        for message in messages:
-            data = self.codec.pack(express(message))
-            try:
-                if self.kind == "tcp":
-                    self.port.sendall(data)
-                elif self.kind.startswith("udp"):
-                    for peer in self.peers:
-                        self.port.sendto(data, peer)
-                else:
-                    self.port.write(data)
-            except OSError:
-                self.closed = self.closed or not self.kind.startswith("udp")
+    def send(self, messages: Sequence[Outgoing], to: Address | None = None) -> None:
+        """Send to one address or to all; what cannot be sent is lost, as on any radio."""
+        for address in [*self.peers] if to is None else [to]:
+            for message in messages:
+                self._transmit(self._peer(address).pack(express(message)), address)
 
-    def receive(self, until: float) -> list[Incoming]:
+    def _transmit(self, data: bytes, address: Address) -> None:
+        try:
+            if self.kind == "tcp":
+                self.port.sendall(data)
+            elif self.kind.startswith("udp"):
+                self.port.sendto(data, address)
+            else:
+                self.port.write(data)
+        except OSError:
+            self.closed = self.closed or not self.kind.startswith("udp")
+
+    def receive(self, until: float) -> list[Heard]:
         """What has been heard; waits for it until a time (s)."""
         wait = max(0.0, until - self.now())
-        if self.closed:
+        if self.closed or not select.select([self.port], [], [], wait)[0]:
             return []
-        ready, _, _ = select.select([self.port], [], [], wait)
-        return [meaning for m in self.codec.parse(self._bytes()) if (meaning := understand(m))] if ready else []
+        data, origin = self._bytes()
+        meanings = map(understand, self._peer(origin).parse(data)) if data else ()
+        return [Heard(origin, meaning) for meaning in meanings if meaning is not None]
 
     def discard(self) -> None:
         """Throw away what has piled up."""
         while not self.closed and select.select([self.port], [], [], 0)[0]:
             self._bytes()
 
-    def _bytes(self) -> bytes:
+    def _bytes(self) -> tuple[bytes, Address]:
+        """What has arrived, and from where."""
         try:
             if self.kind.startswith("udp"):
-                data, peer = self.port.recvfrom(65536)
-                self.peers[peer] = None
-                return bytes(data)
+                data, origin = self.port.recvfrom(65536)
+                return bytes(data), origin
             if self.kind != "tcp":
-                return bytes(self.port.read(65536))  # nothing, now and then, although it was ready; its end is an error
+                # Nothing, now and then, although it was ready; its end is an error.
+                return bytes(self.port.read(65536)), THE_PEER
             data = self.port.recv(65536)
         except (BlockingIOError, ConnectionRefusedError):
-            return b""
+            return b"", THE_PEER
         except OSError:
             data = b""
         # A stream that is ready and has nothing to say has ended.
         self.closed = not data
-        return bytes(data)
+        return bytes(data), THE_PEER

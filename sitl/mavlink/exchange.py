@@ -5,14 +5,15 @@ No socket and no clock: see `sitl.mavlink.words` for how a conversation is drive
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from sitl.errors import SitlError
+from sitl.mavlink.contact import FRESH_S, TRIES, TRY_S, Contact
 from sitl.mavlink.words import (
     ACCEPTED,
-    AUTOPILOT,
+    DENIED,
+    DOES_NOT_EXIST,
     FAILED,
     IN_PROGRESS,
     INT32,
@@ -20,38 +21,37 @@ from sitl.mavlink.words import (
     REASONS,
     STORAGE_COMMAND,
     Ack,
-    Beat,
-    Heartbeat,
     Outgoing,
     Read,
     Refusal,
-    Sight,
     Steps,
     Store,
-    Turn,
     Value,
     Write,
     shortest,
 )
 
-#: One try, s; how many; how many requests may be under way. At 30 % loss each way 24 tries lose 1 exchange in 10^7.
-TRY_S, TRIES, WINDOW = 0.5, 24, 10
-#: A HEARTBEAT older than this (s) does not tell whether the vehicle is armed now: writing waits for the next.
-FRESH_S = 3.0
+#: How many requests may be under way.
+WINDOW = 10
 #: After so many tries that were answered with another value, the vehicle is believed to keep that.
 CONTRADICTIONS = 4
-#: PX4 saves by itself at most 2.3 s after a change, ArduPilot sooner.
+#: PX4 saves by itself at most 2.3 s after a change, ArduPilot sooner; what is read after that has outlasted it.
 AUTOSAVE_S = 2.5
 #: Least silence (s) after which what was sent before is taken to have arrived or to be lost.
 QUIET_S = 0.1
-BEAT_S = 1.0
+#: What a vehicle may say to being told to store.
+ENDS = {ACCEPTED: "acknowledged", DENIED: "denied", FAILED: "failed"}
 
 
 class Answer(NamedTuple):
-    """End of one request: the value that the vehicle stated last, and what is wrong (empty: nothing)."""
+    """End of one request: the value that the vehicle stated last, and what is wrong (empty: nothing).
+
+    `absent`: it was silent on this one, or said that it has none such.
+    """
 
     value: float | None
     problem: str = ""
+    absent: bool = False
 
 
 @dataclass
@@ -65,38 +65,15 @@ class _Request:
     kept: float | None = None
 
 
-class Conversation:
-    """State of a talk with one vehicle, from its first HEARTBEAT on.
+class Conversation(Contact):
+    """What is read from and written to the vehicle.
 
     Parameters
     ----------
-    now : float, s
-        Time at the start.
-    tries : int
-        How often a request is sent before its silence is final.
-    system : int
-        The vehicle's system number; 0: the first that is heard.
-    force_armed : bool
-        Write even while it is armed.
+    now, tries, system, force_armed
+        See `sitl.mavlink.contact.Contact`.
     integers : collection of str
         Names that may be whole numbers on the vehicle; all others must be floats there.
-
-    Attributes
-    ----------
-    vehicle : Heartbeat or None
-        Its last HEARTBEAT.
-    others : set of int
-        Systems of other autopilots on the link.
-    interrupted : bool
-        Set from outside (Ctrl-C): reading and writing end, putting back does not.
-    possible : dict
-        Name -> every value that the vehicle may hold now, given what was sent and heard.
-    written : set of str
-        Names for which a write was ever sent.
-    progress : callable
-        Told (phase, done, of) after each answer.
-    witness : callable
-        Told what else the vehicle says, whatever the talk is about.
     """
 
     def __init__(
@@ -107,86 +84,13 @@ class Conversation:
         force_armed: bool = False,
         integers: Collection[str] = (),
     ) -> None:
-        self.now, self.tries, self.system, self.force_armed = now, tries, system, force_armed
+        super().__init__(now, tries, system, force_armed)
         self.integers = integers
-        self.vehicle: Heartbeat | None = None
-        self.others: set[int] = set()
-        self.interrupted = self.closed = False
-        self.possible: dict[str, set[float]] = {}
-        self.written: set[str] = set()
-        self.progress: Callable[[str, int, int], None] = lambda phase, done, of: None
-        self.witness: Callable[[Sight], None] = lambda sight: None
         self._kinds: dict[str, int] = {}
-        self._heartbeat_at = self._heard_at = now
-        self._beat_due = now
+        # When the vehicle was last told to change or to store something.
+        self._changed_at = now - AUTOSAVE_S
         # Longest exchange, and longest of those answered at the first try: only these are sure to be a round trip.
         self._longest = self._round_trip = 0.0
-
-    @property
-    def patience(self) -> float:
-        """Silence that is taken for the end, s."""
-        return self.tries * TRY_S
-
-    @property
-    def silence(self) -> float:
-        """Age of the last HEARTBEAT, s."""
-        return self.now - self._heartbeat_at
-
-    @property
-    def gone(self) -> bool:
-        """True when the link is closed, or the vehicle silent for too long."""
-        return self.closed or self.now - self._heard_at >= self.patience
-
-    def resume(self, now: float) -> None:
-        """Go on after a pause in which nobody listened: writing waits for another HEARTBEAT."""
-        self.now = self._heard_at = now
-        self._heartbeat_at = now - FRESH_S
-
-    def turn(self, send: Sequence[Outgoing], wake: float) -> Steps[list[Value | Refusal | Ack]]:
-        """Send, wait, and return what the vehicle itself said; every other speaker is ignored."""
-        if self.now >= self._beat_due:
-            send = [Beat(), *send]
-            self._beat_due = self.now + BEAT_S
-        event = yield Turn(send, min(wake, self._beat_due))
-        self.now, self.closed = event.now, event.closed
-        heard: list[Value | Refusal | Ack] = []
-        for message in event.heard:
-            if message.component != AUTOPILOT:
-                continue
-            if self.vehicle is None and isinstance(message, Heartbeat) and self.system in (0, message.system):
-                self.vehicle = message
-            if self.vehicle is None or message.system != self.vehicle.system:
-                if isinstance(message, Heartbeat):
-                    self.others.add(message.system)
-                continue
-            self._heard_at = self.now
-            if isinstance(message, Heartbeat):
-                self.vehicle, self._heartbeat_at = message, self.now
-            elif isinstance(message, Value | Refusal | Ack):
-                heard.append(message)
-            else:
-                self.witness(message)
-        return heard
-
-    def meet(self) -> Steps[Heartbeat]:
-        """Wait for the vehicle's HEARTBEAT.
-
-        Raises
-        ------
-        SitlError
-            When none comes in time.
-        """
-        deadline = self.now + self.patience
-        while self.vehicle is None:
-            if self.interrupted:
-                raise SitlError("interrupted; nothing was written", exit_code=1)
-            if self.closed:
-                raise SitlError("the link was lost; nothing was written", exit_code=1)
-            if self.now >= deadline:
-                whose = f"of system {self.system}" if self.system else "of an autopilot"
-                raise SitlError(f"no HEARTBEAT {whose} in {self.patience:g} s", exit_code=1)
-            yield from self.turn([], deadline)
-        return self.vehicle
 
     def ask(self, names: Sequence[str], phase: str, keep_going: bool = False) -> Steps[dict[str, Answer]]:
         """Read each by name. Ends at the first that fails, unless told to keep going (which Ctrl-C does not end)."""
@@ -217,7 +121,7 @@ class Conversation:
                 name = waiting.pop()
                 under_way[name] = _Request(began=self.now, due=self.now)
             hold = writes and not keep_going and self.now - self._heartbeat_at >= FRESH_S
-            send: list[Outgoing] = []
+            send = self.request_heartbeat() if hold else []
             for name, request in under_way.items():
                 if request.due <= self.now and not hold:
                     send.append(self._order(name, orders[name]))
@@ -244,9 +148,11 @@ class Conversation:
             return ""
         if self.interrupted:
             return "interrupted"
+        if self.trouble:
+            return self.trouble
         if writes and self.vehicle.armed and not self.force_armed:
             return "the vehicle is armed"
-        wait = max(self.patience, FRESH_S)
+        wait = self.patience + FRESH_S  # a vehicle that says nothing at all is called that first
         if writes and self.now - max(self._heartbeat_at, begin) >= wait:
             return f"no HEARTBEAT in {wait:g} s"
         return ""
@@ -255,7 +161,7 @@ class Conversation:
         """Answer to a request whose tries are used up: what the vehicle held on to, or silence."""
         if request.kept is not None:
             return Answer(request.kept, f"stays {shortest(request.kept)}")
-        return Answer(None, f"no answer in {self.patience:g} s (a vehicle may be silent on what it lacks)")
+        return Answer(None, f"no answer in {self.patience:g} s (a vehicle may be silent on what it lacks)", True)
 
     def _order(self, name: str, value: float | None) -> Outgoing:
         assert self.vehicle is not None
@@ -263,13 +169,16 @@ class Conversation:
         if value is None:
             return Read(*address, name)
         self.written.add(name)
+        self.agree(name, None)
+        self._changed_at = self.now
         self.possible.setdefault(name, set()).add(value)
         return Write(*address, name, value, self._kinds.get(name, REAL32))
 
     def _judge(self, message: Value | Refusal, request: _Request, wanted: float | None) -> Answer | None:
         """What a message says about a request; None: nothing final."""
         if isinstance(message, Refusal):
-            return Answer(None, f"refused: {REASONS.get(message.reason, f'PARAM_ERROR {message.reason}')}")
+            reason = REASONS.get(message.reason, f"PARAM_ERROR {message.reason}")
+            return Answer(None, f"refused: {reason}", message.reason == DOES_NOT_EXIST)
         if message.kind != REAL32 and not (message.kind == INT32 and message.name in self.integers):
             return Answer(None, f"is no float on the vehicle (param_type {message.kind})")
         self._kinds[message.name] = message.kind
@@ -287,6 +196,8 @@ class Conversation:
             self._round_trip = max(self._round_trip, took)
         if wanted is not None:
             self.possible[message.name] = {wanted}
+        else:
+            self.agree(message.name, message.value)
         return Answer(message.value)
 
     def settle(self) -> Steps[None]:
@@ -304,22 +215,34 @@ class Conversation:
         Returns
         -------
         str
-            ``acknowledged``; ``autosave``: not, but the time passed in which vehicles save by themselves; ``failed``;
-            empty when the link closed.
+            ``acknowledged``; ``denied`` or ``failed``: it said so; ``autosave``: none of these, so that it depends on
+            what vehicles save by themselves; empty when the link closed.
         """
         assert self.vehicle is not None
         due, deadline, result = self.now, self.now + AUTOSAVE_S, IN_PROGRESS
-        while self.now < deadline and not self.closed:
+        while self.now < deadline and not self.closed and result == IN_PROGRESS:
             send: list[Outgoing] = []
-            if self.now >= due and result == IN_PROGRESS:
+            if self.now >= due:
                 send = [Store(self.vehicle.system, self.vehicle.component)]
-                due = self.now + TRY_S
-            wake = min(due, deadline) if result == IN_PROGRESS else deadline
-            for message in (yield from self.turn(send, wake)):
+                self._changed_at, due = self.now, self.now + TRY_S
+            for message in (yield from self.turn(send, min(due, deadline))):
                 if isinstance(message, Ack) and message.command == STORAGE_COMMAND:
                     result = message.result
-            if result == ACCEPTED:
-                return "acknowledged"
-        if self.closed:
-            return ""
-        return "failed" if result == FAILED else "autosave"
+        return "" if self.closed else ENDS.get(result, "autosave")
+
+    def outlast(self, keep_going: bool = False) -> Steps[str]:
+        """Wait until a vehicle has saved what was changed, and for a HEARTBEAT after that.
+
+        Returns
+        -------
+        str
+            Why there was none; empty when there was.
+        """
+        begin = due = max(self.now, self._changed_at + AUTOSAVE_S)
+        while self._heartbeat_at < due:
+            obstacle = self._obstacle(begin, keep_going, writes=True)
+            if obstacle or self.now >= begin + self.patience:
+                return obstacle or f"no HEARTBEAT in {self.patience:g} s"
+            send = self.request_heartbeat() if self.now >= due else []
+            yield from self.turn(send, self.now + TRY_S if self.now >= due else due)
+        return ""

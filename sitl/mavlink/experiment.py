@@ -226,6 +226,8 @@ def _danger(talk: Conversation, sights: Sights, mode: int, tilt: float) -> str:
         return "interrupted"
     if talk.closed:
         return "the link was lost"
+    if talk.trouble:
+        return talk.trouble
     if talk.silence > DEAF_S:
         return f"no HEARTBEAT for {DEAF_S:g} s"
     if not talk.vehicle.armed:

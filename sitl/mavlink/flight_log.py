@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,20 @@ from tuning.files import write_atomically
 BLOCK = 15_000  # rows, a minute
 
 
+@dataclass(frozen=True)
+class _Flight:
+    """A flight that has ended: its file, its records, (N,), whether it stood on the ground, and its gains, (36,)."""
+
+    path: Path
+    record: NDArray[Any]
+    landed: NDArray[np.bool_]
+    gains: NDArray[np.float32]
+
+
 class FlightLog:
     """Writes FILE.ulg for the first flight, FILE-2.ulg for the second, and so on.
+
+    A flight that cannot be written (a full disk) keeps its number and is kept until it can.
 
     Parameters
     ----------
@@ -30,6 +43,11 @@ class FlightLog:
         The vehicle.
     Ts : float, s
         Control period.
+
+    Attributes
+    ----------
+    flights : int
+        How many have ended.
 
     Raises
     ------
@@ -43,6 +61,7 @@ class FlightLog:
             raise SitlError(f"--log {path}: a file cannot be written there")
         self.path, self.airframe, self.Ts = path, airframe, Ts
         self.flights = 0
+        self._waiting: list[_Flight] = []
         self._spare: NDArray[Any] = np.zeros(1, RECORD)
         self._forget()
 
@@ -66,14 +85,34 @@ class FlightLog:
         self._landed.append(vehicle.lift.landed)
         return self._blocks[-1][place]
 
-    def save(self) -> Path | None:
-        """The flight ends: write it. None: there was none."""
-        if self._gains is None or not self._landed:
-            return None
-        record = np.concatenate(self._blocks)[: len(self._landed)]
-        content = vehicle_log(record, np.array(self._landed), self.Ts, self.airframe, self._gains)
-        self.flights += 1
-        name = self.path if self.flights == 1 else self.path.with_stem(f"{self.path.stem}-{self.flights}")
-        write_atomically(name, content)
+    @property
+    def unsaved(self) -> list[Path]:
+        """Files of the flights that could not be written yet."""
+        return [flight.path for flight in self._waiting]
+
+    def save(self) -> list[Path]:
+        """The flight ends: write it, and those that could not be written before.
+
+        Returns
+        -------
+        list of Path
+            What was written.
+
+        Raises
+        ------
+        OSError
+            When a file cannot be written; its flight and the later ones are kept for the next time.
+        """
+        if self._gains is not None and self._landed:
+            self.flights += 1
+            name = self.path if self.flights == 1 else self.path.with_stem(f"{self.path.stem}-{self.flights}")
+            record = np.concatenate(self._blocks)[: len(self._landed)]
+            self._waiting.append(_Flight(name, record, np.array(self._landed), self._gains))
         self._forget()
-        return name
+        written = []
+        while self._waiting:
+            flight = self._waiting[0]
+            content = vehicle_log(flight.record, flight.landed, self.Ts, self.airframe, flight.gains)
+            write_atomically(flight.path, content)
+            written.append(self._waiting.pop(0).path)
+        return written

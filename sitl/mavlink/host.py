@@ -230,10 +230,12 @@ class Host:
             self.log.begin(self.autopilot.controller.state["gains"][0])
             return
         try:
-            path = self.log.save()
-            self.vehicle.say(Severity.INFO, f"logged: {path.name if path else 'nothing'}")
+            written = self.log.save()
+            self.vehicle.say(Severity.INFO, f"logged: {', '.join(path.name for path in written) or 'nothing'}")
         except OSError as error:
-            self.vehicle.say(Severity.CRITICAL, f"not logged: {error.filename}: {error.strerror}")
+            kept = ", ".join(path.name for path in self.log.unsaved)
+            text = f"not logged: {error.filename}: {error.strerror}; kept for the next disarming: {kept}"
+            self.vehicle.say(Severity.CRITICAL, text)
         self.lateness.nothing_waits(0.0, time.monotonic())  # writing is not counted: nothing flies
 
     def _examine(self, fault: int) -> None:
@@ -269,6 +271,16 @@ class Host:
         if len(self._told) > 100:
             self._told.clear()
 
-    def leave(self) -> Path | None:
-        """Nobody flies any more: the log that was written, if any."""
-        return None if self.log is None else self.log.save()
+    def leave(self) -> list[Path]:
+        """Nobody flies any more: the logs that were written.
+
+        Raises
+        ------
+        SitlError
+            When a flight cannot be written, and is lost.
+        """
+        try:
+            return [] if self.log is None else self.log.save()
+        except OSError as error:
+            lost = ", ".join(map(str, self.log.unsaved)) if self.log else ""
+            raise SitlError(f"{error.filename}: {error.strerror}; lost: {lost}", exit_code=1) from error

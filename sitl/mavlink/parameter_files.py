@@ -1,4 +1,8 @@
-"""Parameter files of the three ground stations: every float32 is written so that it is read back with the same bits."""
+"""Parameter files of the three ground stations: every float32 is written so that it is read back with the same bits.
+
+The first line, a comment to all three, says how many parameters follow and the SHA-256 of the rest: half of a gain
+matrix is never taken for the whole.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,9 @@ from pathlib import Path
 
 from sitl.errors import SitlError
 from sitl.mavlink.words import REAL32, shortest, single
+from tuning.files import sha256
 
+SEAL = re.compile(r"# mimopilot: (\d+) parameters, sha256 ([0-9a-f]{64})")
 NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
 
 
@@ -30,7 +36,9 @@ def _mission_planner(values: Mapping[str, float], system: int, component: int) -
 FORMATS = {"qgc": _qgc, "mavproxy": _mavproxy, "missionplanner": _mission_planner}
 
 
-def parameter_text(form: str, values: Mapping[str, float], system: int = 1, component: int = 1) -> str:
+def parameter_text(
+    form: str, values: Mapping[str, float], system: int = 1, component: int = 1, seal: bool = True
+) -> str:
     """Text of a parameter file.
 
     Parameters
@@ -41,8 +49,12 @@ def parameter_text(form: str, values: Mapping[str, float], system: int = 1, comp
         Name -> value; rounded to single precision.
     system, component : int
         The vehicle's, which only QGroundControl's files hold.
+    seal : bool
+        Begin with the line that vouches for the rest; False for a file that is meant to be edited.
     """
-    return FORMATS[form](values, system, component)
+    body = FORMATS[form](values, system, component)
+    first = f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n" if seal else ""
+    return first + body
 
 
 def read_parameters(path: Path) -> dict[str, float]:
@@ -51,12 +63,14 @@ def read_parameters(path: Path) -> dict[str, float]:
     Raises
     ------
     SitlError
-        With the line, when it is none of them, a name is impossible or repeated, or a value is not a finite float.
+        With the line, when it is none of them, a name is impossible or repeated, or a value is not a finite float. When
+        it is not what its first line says was written.
     """
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise SitlError(f"{path}: cannot read the parameter file: {error}") from error
+    _check_seal(text, path)
     values: dict[str, float] = {}
     for number, line in enumerate(text.splitlines(), 1):
         content = line.split("#")[0].strip()
@@ -70,6 +84,24 @@ def read_parameters(path: Path) -> dict[str, float]:
     if not values:
         raise SitlError(f"{path}: holds no parameters")
     return values
+
+
+def _check_seal(text: str, path: Path) -> None:
+    """Refuse a file that is not what its first line says was written."""
+    seal = SEAL.match(text)
+    if seal is None:
+        return
+    body = text[seal.end() :].strip()
+    count = sum(bool(line) and not line.startswith("#") for line in body.splitlines())
+    if count != int(seal[1]):
+        raise SitlError(
+            f"{path}: holds {count} parameters, but its first line says {seal[1]}: it is not whole; use another copy"
+        )
+    if sha256(body) != seal[2]:
+        raise SitlError(
+            f"{path}: is not what its first line vouches for: it was cut short, damaged or edited; use another copy, "
+            "or delete the first line to take the values as they are"
+        )
 
 
 def _entry(content: str, where: str) -> tuple[str, float]:

@@ -15,10 +15,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from codegen.parameters import IDENTITY, PARAMETERS, check_ranges
+from codegen.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Parameter, check_ranges
+from codegen.parameters import Setting as VehicleSetting
 from sitl.errors import SitlError
 from sitl.mavlink.words import single
-from tuning.gains import AXES, AXIS_LETTERS, MATRICES, Gains
+from tuning.gains import AXES, AXIS_LETTERS, MATRICES, PARAMETER_PREFIX, Gains
 
 #: Largest off-diagonal, as a share of its row's diagonal, that a stock profile may drop unasked.
 DROPPED_SHARE = 0.1
@@ -51,6 +52,8 @@ class Plan:
         Code of a gain that the vehicle has no place for -> its size as a share of its row's diagonal.
     notes : tuple of str
         What else the vehicle's controller does differently.
+    profile : str
+        Which of `PROFILES` the vehicle must fit; empty: any vehicle will do.
     """
 
     settings: tuple[Setting, ...]
@@ -58,6 +61,7 @@ class Plan:
     scale: tuple[str, ...]
     dropped: dict[str, float]
     notes: tuple[str, ...] = ()
+    profile: str = ""
 
     @property
     def values(self) -> dict[str, float]:
@@ -164,7 +168,7 @@ def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> Plan:
                 f"{code}: the {profile} controller has no off-diagonals, and this one is {share:.0%} of its diagonal, "
                 f"expected at most {DROPPED_SHARE:.0%}; use the mimo profile, or give --drop-off-diagonals"
             )
-    return replace(plan, settings=tuple(replace(s, value=single(s.value)) for s in plan.settings))
+    return replace(plan, settings=tuple(replace(s, value=single(s.value)) for s in plan.settings), profile=profile)
 
 
 def off_diagonals(gains: Gains) -> dict[str, float]:
@@ -191,8 +195,52 @@ def _lost_limits(gains: Gains) -> tuple[str, ...]:
     return (f"moment_max ({', '.join(lost)}) has no counterpart and is not set",) if lost else ()
 
 
-def restoration(values: Mapping[str, float]) -> Plan:
-    """What to write to put values back that a vehicle held: no range of ours can judge them."""
-    units = {p.name: p.unit for p in PARAMETERS}
-    settings = (Setting(name, units.get(name, ""), value, -math.inf, math.inf) for name, value in values.items())
-    return Plan(tuple(settings), {}, (), {})
+#: All that our own vehicles have, by name; what their parameters begin with tells the other profiles.
+_OURS: tuple[Parameter | VehicleSetting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
+TABLE = {p.name: p for p in _OURS}
+PREFIXES = {"mimo": PARAMETER_PREFIX, "px4-stock": "MC_", "ardupilot-stock": "ATC_"}
+
+
+def out_of_range(name: str, value: float) -> str:
+    """The range of a parameter of ours that does not hold a value; empty when it does, or is none of ours."""
+    ours = TABLE.get(name)
+    if ours is None or ours.minimum <= value <= ours.maximum:
+        return ""
+    return f"{ours.minimum:g} to {ours.maximum:g} {ours.unit}".rstrip() + f" ({ours.description})"
+
+
+def restoration(values: Mapping[str, float], source: str) -> Plan:
+    """What to write to put values back that a vehicle held.
+
+    Parameters
+    ----------
+    values : mapping
+        Name -> value in single precision.
+    source : str
+        Where they come from.
+
+    Raises
+    ------
+    SitlError
+        When one is out of the range of our table, or some of our gains are there and others are not.
+    """
+    for name, value in values.items():
+        expected = out_of_range(name, value)
+        if expected:
+            raise SitlError(f"{source}: {name}: got {value:.6g}, expected {expected}")
+    writable = [p.name for p in PARAMETERS if p.writable]
+    lacking = [name for name in writable if name not in values]
+    if 0 < len(lacking) < len(writable):
+        raise SitlError(
+            f"{source}: holds {len(writable) - len(lacking)} of our {len(writable)} gains and lacks {lacking[0]}"
+            f"{f' and {len(lacking) - 1} more' if len(lacking) > 1 else ''}: half a set is a controller that nobody "
+            "tuned"
+        )
+    fixed = {p.name for p in (*PARAMETERS, *IDENTITY) if not p.writable}
+    settings = tuple(
+        Setting(name, TABLE[name].unit if name in TABLE else "", value, -math.inf, math.inf)
+        for name, value in values.items()
+        if name not in fixed
+    )
+    profile = next((p for p, prefix in PREFIXES.items() if any(name.startswith(prefix) for name in values)), "")
+    return Plan(settings, {name: values[name] for name in values if name in fixed}, (), {}, profile=profile)

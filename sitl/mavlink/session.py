@@ -11,10 +11,13 @@ from typing import Any
 
 from sitl.errors import SitlError
 from sitl.mavlink.connection import Connection
-from sitl.mavlink.exchange import TRY_S, Conversation
+from sitl.mavlink.contact import TRY_S
+from sitl.mavlink.exchange import Conversation
 from sitl.mavlink.signing import read_key
-from sitl.mavlink.upload import read
+from sitl.mavlink.upload import NoneHeldError, read
+from sitl.mavlink.vehicle_kinds import STOCK_PARAMETERS, check_kind, without_module
 from sitl.mavlink.words import Heartbeat, Steps, T, drive
+from tuning.gains import PARAMETER_PREFIX
 from tuning.output import progress_console
 
 
@@ -72,19 +75,24 @@ class Session:
                 self.talk.progress = progress
                 return drive(steps, self.link)
         except SitlError as error:
-            raise SitlError(f"{error}{self.link.hint}", error.exit_code) from error
+            raise type(error)(f"{error}{self.link.hint}", error.exit_code) from error
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
-    def read(self, names: Sequence[str]) -> dict[str, float]:
-        """What the vehicle holds, once it is clear which vehicle that is."""
-        vehicle = self.run(self.talk.meet())
-        held = self.run(read(self.talk, names))
-        if self.talk.others and not self.options.system:
-            systems = ", ".join(map(str, sorted({vehicle.system, *self.talk.others})))
-            raise SitlError(f"several vehicles are on this link (systems {systems}); say which with --system")
-        return held
+    def read(self, names: Sequence[str], profile: str = "") -> dict[str, float]:
+        """What the vehicle holds, once it is clear which vehicle that is, and that a profile fits it."""
+        check_kind(self.run(self.talk.meet()), profile)
+        try:
+            return self.run(read(self.talk, names))
+        except NoneHeldError as error:
+            probe = STOCK_PARAMETERS.get(self.vehicle.autopilot, "")
+            if not probe or not all(name.startswith(PARAMETER_PREFIX) for name in names):
+                raise
+            # A vehicle that does not hear us is silent, too: what its own controller has tells the two apart.
+            if self.run(self.talk.ask([probe], "reading"))[probe].absent:
+                raise
+            raise SitlError(f"{without_module(self.vehicle)}; nothing was written") from error
 
     @property
     def vehicle(self) -> Heartbeat:

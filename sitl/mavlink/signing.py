@@ -52,11 +52,18 @@ class Signer:
         The 32 bytes that both sides share.
     clock : callable
         Seconds since 1970.
+
+    Attributes
+    ----------
+    behind : float, s
+        How far the last message that was made with the key, and was too old to begin a stream, is behind our time; 0:
+        there was none.
     """
 
     def __init__(self, key: bytes, clock: Callable[[], float] = time.time) -> None:
         self.key, self.clock = key, clock
         self.stamp = 0
+        self.behind = 0.0
         self.heard: dict[tuple[int, int, int], int] = {}
 
     def _tail(self, signed: bytes) -> bytes:
@@ -83,6 +90,8 @@ class Signer:
         stream = frame[-SIGNATURE_BYTES], system, component
         stamp = int.from_bytes(frame[-SIGNATURE_BYTES + 1 : -TAIL_BYTES], "little")
         last = self.heard.get(stream, self._now() - NEW_STREAM_UNITS)
+        if stamp <= last and stream not in self.heard:
+            self.behind = (self._now() - stamp) / UNITS_PER_S
         if stamp <= last or (stream not in self.heard and len(self.heard) >= MAX_STREAMS):
             return False
         self.heard[stream] = stamp

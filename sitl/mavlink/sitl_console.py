@@ -99,7 +99,7 @@ def run(options: Options) -> None:
             print(f"flown at {pace:.3g} times real time")
         except KeyboardInterrupt:
             written = host.leave()
-            print(f"ended: {host.lateness}{f'; logged: {written}' if written else ''}")
+            print(f"ended: {host.lateness}{'; logged: ' if written else ''}{', '.join(map(str, written))}")
 
 
 def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:

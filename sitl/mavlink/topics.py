@@ -65,7 +65,7 @@ def _sys_status(s: Situation) -> Any:
         present |= mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION | mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
     healthy = present if not vehicle.complaints() else present & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
     if "plant" in vehicle.obstacles:
-        healthy = 0
+        healthy = mavlink.MAV_SYS_STATUS_GEOFENCE  # there is no fence to breach, which is what its absence means
     return mavlink.MAVLink_sys_status_message(
         present, present, healthy, round(1000 * min(s.load, 1)), UNKNOWN_16, -1, -1, 0, 0, 0, 0, 0, 0
     )

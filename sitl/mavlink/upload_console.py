@@ -11,8 +11,8 @@ import typer
 
 from sitl.errors import SitlError
 from sitl.mavlink.exchange import AUTOSAVE_S
-from sitl.mavlink.parameter_files import parameter_text
-from sitl.mavlink.profiles import Plan
+from sitl.mavlink.parameter_files import parameter_text, read_parameters
+from sitl.mavlink.profiles import Plan, out_of_range
 from sitl.mavlink.session import Options, Session, session
 from sitl.mavlink.upload import SMALLEST_CHANGE, Outcome, apply
 from sitl.mavlink.words import Heartbeat, shortest
@@ -24,9 +24,12 @@ from tuning.output import print_json, print_table
 STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",
     "autosave": f"storage was not acknowledged: waited {AUTOSAVE_S:g} s, in which PX4 and ArduPilot save by themselves",
-    "failed": "not stored",
+    "denied": "not stored: the vehicle refused it (PREFLIGHT_STORAGE: MAV_RESULT_DENIED)",
+    "failed": "not stored: the vehicle could not (PREFLIGHT_STORAGE: MAV_RESULT_FAILED)",
     "": "the link was lost before storage was acknowledged",
 }
+#: Ends of storage that leave the vehicle with values that it loses.
+UNSTORED = ("denied", "failed")
 
 
 def parse_scale(text: str | None) -> Triple | Literal["flown"] | None:
@@ -82,7 +85,7 @@ def transact(
             "ROLL,PITCH,YAW, or --moment-scale flown when the gains come from a log of this very vehicle"
         )
     with session(options) as vehicle:
-        held = vehicle.read([*plan.values, *plan.fixed, *(plan.scale if ask_scale else ())])
+        held = vehicle.read([*plan.values, *plan.fixed, *(plan.scale if ask_scale else ())], plan.profile)
         _check_vehicle(plan, held, vehicle, options)
         if ask_scale and gains is not None:
             check_moment_scale(gains, [held[name] for name in plan.scale], "the vehicle")
@@ -97,7 +100,7 @@ def transact(
                 typer.confirm(f"Write {len(changes)} parameters to vehicle {vehicle.vehicle.system}?", abort=True)
                 vehicle.link.discard()
                 vehicle.talk.resume(vehicle.link.now())
-                if vehicle.read(list(held)) != held:
+                if vehicle.read(list(held), plan.profile) != held:
                     raise SitlError("the vehicle's values changed while the question stood: run it again", exit_code=1)
             snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
             outcome = vehicle.run(apply(vehicle.talk, plan.values, held))
@@ -109,12 +112,18 @@ def _check_vehicle(plan: Plan, held: Mapping[str, float], vehicle: Session, opti
         if held[name] != value:
             raise SitlError(
                 f"{name}: the vehicle has {held[name]:.6g}, the gains are for {value:.6g}; generate its firmware "
-                "again, or tune for its period"
+                "again, or tune for what it has"
             )
     for name in plan.values:
         if not abs(held[name]) < float("inf"):
             raise SitlError(
                 f"{name}: the vehicle holds {held[name]}, which could not be put back; set it by hand first"
+            )
+        expected = out_of_range(name, held[name])
+        if expected:
+            raise SitlError(
+                f"{name}: the vehicle holds {held[name]:.6g}, expected {expected}: restore would not put it back; set "
+                "it by hand first"
             )
     if vehicle.vehicle.armed and not (options.force_armed or options.dry_run):
         raise SitlError("the vehicle is armed: nothing was written; disarm it, or give --force-armed", exit_code=1)
@@ -128,6 +137,8 @@ def _save_snapshot(plan: Plan, held: Mapping[str, float], vehicle: Heartbeat, op
         path = options.stem.with_name(f"{options.stem.name}.before-{number}.params")
     old = {name: held[name] for name in plan.values}
     write_atomically(path, parameter_text("qgc", old, vehicle.system, vehicle.component))
+    if read_parameters(path) != old:
+        raise SitlError(f"{path}: does not read back as it was written; nothing was sent to the vehicle", exit_code=1)
     if not options.as_json:
         print(f"old values saved: {path}")
     return path
@@ -174,6 +185,7 @@ def _report(
                 "state": outcome.state,
                 "reason": outcome.reason,
                 "storage": outcome.storage,
+                "armed": outcome.armed,
                 "snapshot": str(snapshot) if snapshot else None,
                 "parameters": {
                     s.name: {
@@ -194,9 +206,9 @@ def _report(
             print_table("read back from the vehicle", ["parameter", "unit", "value"], rows)
             written = sum(s.value != held[s.name] for s in plan.settings)
             print(f"{len(rows)} parameters verified, {written} of them written; {STORAGE[outcome.storage]}")
-        if outcome.storage == "failed":
+        if outcome.storage in UNSTORED:
             raise SitlError(
-                "all values were read back, but the vehicle could not store them: it loses them when it restarts",
+                f"all values were read back, but {STORAGE[outcome.storage]}: it loses them when it restarts",
                 exit_code=1,
             )
     elif outcome.state != "dry run":
@@ -206,13 +218,16 @@ def _report(
 def _failure(outcome: Outcome, held: Mapping[str, float], snapshot: Path | None, options: Options) -> str:
     if outcome.state == "untouched":
         return f"{outcome.reason}; nothing was written"
+    armed = ", although the vehicle was armed" if outcome.armed else ""
+    stored = f"; {STORAGE[outcome.storage]}" if outcome.storage in UNSTORED else ""
     if outcome.state == "rolled back":
-        return f"{outcome.reason}; the old values were put back and read back"
+        return f"{outcome.reason}; the old values were put back and read back{armed}{stored}"
     left = [
         f"{name} holds {' or '.join(shortest(value) for value in values)}"
         for name, values in outcome.held.items()
         if values != (held[name],)
     ]
     rest = "the others hold their old values" if left else "the old values were put back, but not all were read back"
+    sent = f"old values were sent{armed}" if armed else ""
     again = f"restore with: mimopilot restore {snapshot} --connect {options.connect}"
-    return "; ".join([outcome.reason, *left, rest, again])
+    return "; ".join(part for part in [outcome.reason, *left, rest, sent, again] if part) + stored

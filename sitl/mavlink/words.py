@@ -19,9 +19,15 @@ INT32, REAL32 = 6, 9
 #: Component number of an autopilot.
 AUTOPILOT = 1
 STORAGE_COMMAND = 245
-ACCEPTED, FAILED, IN_PROGRESS = 0, 4, 5
+#: MAV_RESULT.
+ACCEPTED, DENIED, FAILED, IN_PROGRESS = 0, 2, 4, 5
+HEARTBEAT = 0
+#: MAV_TYPE of a vehicle that does not say what it is.
+GENERIC = 0
+#: Of PARAM_ERROR.
+DOES_NOT_EXIST = 1
 REASONS = {
-    1: "it does not exist",
+    DOES_NOT_EXIST: "it does not exist",
     2: "value out of its range",
     3: "permission denied",
     4: "component not found",
@@ -40,6 +46,7 @@ class Heartbeat(NamedTuple):
     autopilot: int
     armed: bool
     mode: int = 0
+    type: int = GENERIC
 
 
 class Value(NamedTuple):
@@ -142,25 +149,44 @@ class Request(NamedTuple):
     interval: int
 
 
+class RequestOnce(NamedTuple):
+    """MAV_CMD_REQUEST_MESSAGE: send a message now."""
+
+    system: int
+    component: int
+    message: int
+
+
 #: What a vehicle tells of its flight.
 Sight = Attitude | Landed | Excited | Text
 Incoming = Heartbeat | Value | Refusal | Ack | Sight
-Outgoing = Beat | Read | Write | Store | Request
+Outgoing = Beat | Read | Write | Store | Request | RequestOnce
 T = TypeVar("T")
+#: Host and port of a speaker on a UDP link; `THE_PEER` on a link that has but one.
+Address = tuple[str, int]
+THE_PEER: Address = ("", 0)
+
+
+class Heard(NamedTuple):
+    """A message, and the address that it came from."""
+
+    origin: Address
+    message: Incoming
 
 
 class Turn(NamedTuple):
-    """What to send now, and the time (s) at which to come back at the latest."""
+    """What to send now, the time (s) at which to come back at the latest, and to whom; None: to every address."""
 
     send: Sequence[Outgoing]
     wake: float
+    to: Address | None = None
 
 
 class Event(NamedTuple):
     """The time (s) now, what was heard since, and whether the link is gone for good."""
 
     now: float
-    heard: Sequence[Incoming]
+    heard: Sequence[Heard]
     closed: bool = False
 
 
@@ -175,10 +201,10 @@ class Link(Protocol):
     def now(self) -> float:
         """Monotonic time, s."""
 
-    def send(self, messages: Sequence[Outgoing]) -> None:
-        """Send; may lose."""
+    def send(self, messages: Sequence[Outgoing], to: Address | None = None) -> None:
+        """Send, to one address or to every one; may lose."""
 
-    def receive(self, until: float) -> Sequence[Incoming]:
+    def receive(self, until: float) -> Sequence[Heard]:
         """What has been heard; waits for it until a time (s)."""
 
 
@@ -187,7 +213,7 @@ def drive(steps: Steps[T], link: Link) -> T:
     try:
         turn = next(steps)
         while True:
-            link.send(turn.send)
+            link.send(turn.send, turn.to)
             heard = link.receive(turn.wake)
             turn = steps.send(Event(link.now(), heard, link.closed))
     except StopIteration as end:

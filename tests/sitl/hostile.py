@@ -28,6 +28,7 @@ from sitl.mavlink.telemetry import Situation, Telemetry
 from sitl.mavlink.vehicle_commands import VehicleCommands
 from sitl.modes import Mode, Vehicle
 from sitl.sensors import euler_angles
+from tests.sitl.running import PATIENCE_S
 from tuning.output import print_table
 
 KEY = bytes(range(32))
@@ -91,7 +92,7 @@ class InTheAir:
         self.vehicle.said.clear()
         self.ground.send(now)
 
-    def answers(self, message, over_tcp=False, wait=5.0):
+    def answers(self, message, over_tcp=False, wait=PATIENCE_S):
         """Kinds of the vehicle's answers, once there is a PARAM_VALUE among them; empties the sockets before."""
         link = self.tcp if over_tcp else self.attacker
         drain(link)

@@ -14,11 +14,27 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from sitl.mavlink.flight_modes import custom_mode
 
+#: An event that comes at all is waited for so long, s: however busy the machine is, no test is decided by its speed.
+PATIENCE_S = 180.0
+#: Waits of an upload, shortened where a test does not measure them, s: (module, name) -> seconds.
+WAITS = {("sitl.mavlink.contact", "LISTEN_S"): 0.15, ("sitl.mavlink.exchange", "AUTOSAVE_S"): 0.15}
+_PATCHES = "".join(f"import {module}; {module}.{name} = {value}; " for (module, name), value in WAITS.items())
+#: The command line with them.
+QUICK = (sys.executable, "-c", f"{_PATCHES}import mimopilot; mimopilot.main()")
+
 
 def free_port(kind=socket.SOCK_STREAM):
     with socket.socket(socket.AF_INET, kind) as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
+
+
+def wait_for(condition, complaint=lambda: "it did not happen"):
+    """Wait until something is so that another thread or process does."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, complaint()
+        time.sleep(0.01)
 
 
 class Program:
@@ -41,13 +57,9 @@ class Program:
         while text := self.process.stdout.read(1):
             self.output += text
 
-    def until(self, text, seconds=30.0):
-        """Wait until it has said something; how long that took, s."""
-        begin = time.monotonic()
-        while text not in self.output:
-            assert time.monotonic() < begin + seconds, f"no {text!r} in:\n{self.output}"
-            time.sleep(0.01)
-        return time.monotonic() - begin
+    def until(self, text):
+        """Wait until it has said something."""
+        wait_for(lambda: text in self.output, lambda: f"no {text!r} in:\n{self.output}")
 
     def say(self, line):
         self.output = ""
@@ -58,11 +70,11 @@ class Program:
         if self.process.poll() is None:
             self.process.terminate()
         try:
-            self.process.wait(timeout=10)
+            self.process.wait(timeout=PATIENCE_S)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
-        self.reader.join(timeout=10)
+        self.reader.join(timeout=PATIENCE_S)
         self.process.stdin.close()
         self.process.stdout.close()
 
@@ -80,7 +92,7 @@ def running_sitl(*extra, **keywords):
     program = start("sitl", "adam0", *ports, *extra, **keywords)
     program.udp, program.local, program.tcp = udp, local, tcp
     try:
-        program.until("Ctrl-C ends", 120)  # a first start compiles
+        program.until("Ctrl-C ends")
         yield program
     finally:
         program.end()
@@ -112,20 +124,22 @@ class Pilot:
             self.beats += 1
         return message
 
-    def wait(self, condition, seconds=30.0):
-        """Listen until something is so; how long that took, s."""
-        begin = time.monotonic()
+    def wait(self, condition):
+        """Listen until something is so."""
+        deadline = time.monotonic() + PATIENCE_S
         while not condition():
-            assert time.monotonic() < begin + seconds, self.texts
+            assert time.monotonic() < deadline, self.texts
             self.take()
-        return time.monotonic() - begin
 
-    def hears(self, text, seconds=30.0):
-        return self.wait(lambda: any(text in said for said in self.texts), seconds)
+    def hears(self, text):
+        """Wait for a text; how many HEARTBEATs, which are sent once a second and with a text, came with it."""
+        before = self.beats
+        self.wait(lambda: any(text in said for said in self.texts))
+        return self.beats - before
 
-    def asks(self, kind, seconds=5.0):
+    def asks(self, kind):
         """The next message of a kind."""
-        deadline = time.monotonic() + seconds
+        deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             message = self.take()
             if message is not None and message.get_type() == kind:
@@ -152,9 +166,9 @@ class Pilot:
             )
         )
 
-    def flies(self, mode, seconds=60.0):
+    def flies(self, mode):
         """Wait until the vehicle shows a mode."""
-        return self.wait(lambda: self.beat.custom_mode == custom_mode(mode), seconds)
+        self.wait(lambda: self.beat.custom_mode == custom_mode(mode))
 
     def armed(self):
         return bool(self.beat.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)

@@ -18,7 +18,19 @@ import tty
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from sitl.mavlink.words import Ack, Heartbeat, Read, Refusal, Store, Value, Write
+from sitl.mavlink.words import (
+    HEARTBEAT,
+    THE_PEER,
+    Ack,
+    Heard,
+    Heartbeat,
+    Read,
+    Refusal,
+    RequestOnce,
+    Store,
+    Value,
+    Write,
+)
 
 SYSTEM, COMPONENT = 1, 1
 TELL_S = 0.1
@@ -40,11 +52,12 @@ class ScriptedVehicle:
         self.values = {name: float32(value) for name, value in values.items()}
         self.fault, self.victim, self.after, self.storage = fault, victim, after, storage
         self.armed = self.dead = False
+        self.autopilot, self.type = 12, 2  # a quadrotor with PX4
         self.first = self.values.get(victim, 0.0)
         self.writes = self.reads = self.stored = 0
 
     def heartbeat(self):
-        return [] if self.dead else [Heartbeat(SYSTEM, COMPONENT, 12, self.armed)]
+        return [] if self.dead else [Heartbeat(SYSTEM, COMPONENT, self.autopilot, self.armed, 0, self.type)]
 
     def value(self, name):
         kind = 6 if self.fault == "integer" and name == self.victim else 9
@@ -56,6 +69,8 @@ class ScriptedVehicle:
         if isinstance(order, Store):
             self.stored += 1
             return [] if self.storage is None else [Ack(SYSTEM, COMPONENT, 245, self.storage)]
+        if order == RequestOnce(SYSTEM, COMPONENT, HEARTBEAT):
+            return self.heartbeat()
         if not isinstance(order, Read | Write) or (order.system, order.component) != (SYSTEM, COMPONENT):
             return []
         if order.name not in self.values:
@@ -108,7 +123,7 @@ class SimulatedLink:
     """A link with loss, duplicates, reordering and latency each way, in simulated time; see words.Link."""
 
     def __init__(self, vehicle, seed=0, loss=0.0, duplicate=0.0, reorder=0.0, latency=0.05, noise=()):
-        self.vehicle, self.closed, self.time = vehicle, False, 0.0
+        self.vehicles, self.closed, self.time = {THE_PEER: vehicle}, False, 0.0
         self.random = random.Random(seed)
         self.loss, self.duplicate, self.reorder, self.latency = loss, duplicate, reorder, latency
         self.order = itertools.count()
@@ -116,9 +131,14 @@ class SimulatedLink:
         self.up = True
         self.noise = noise
         self.log = []
-        self.schedule(self.random.random(), "beat", None)
+        self.schedule(self.random.random(), "beat", THE_PEER)
         if hasattr(vehicle, "tell"):
             self.schedule(0.0, "tell", None)
+
+    def join(self, at, origin, vehicle):
+        """Another vehicle at another address, from a time (s) on."""
+        self.vehicles[origin] = vehicle
+        self.schedule(at, "beat", origin)
 
     def now(self):
         return self.time
@@ -134,29 +154,31 @@ class SimulatedLink:
                 late = 4 * self.latency * chance() if chance() < self.reorder else 0.0
                 self.schedule(self.time + self.latency + late, kind, message)
 
-    def send(self, messages):
+    def send(self, messages, to=None):
         for message in messages:
             self.log.append((self.time, message))
-            self.carry("to vehicle", message)
+            for target in self.vehicles if to is None else [to]:
+                self.carry("to vehicle", (target, message))
 
-    def say(self, messages):
+    def say(self, messages, origin=THE_PEER):
         for message in messages:
-            self.carry("to ground", message)
+            self.carry("to ground", Heard(origin, message))
             for other in self.noise:
-                self.carry("to ground", other(message))
+                self.carry("to ground", Heard(origin, other(message)))
 
     def receive(self, until):
         while self.queue and self.queue[0][0] <= until:
             at, _, kind, message = heapq.heappop(self.queue)
             self.time = max(self.time, at)
             if kind == "beat":
-                self.say(self.vehicle.heartbeat())
-                self.schedule(at + 1.0, "beat", None)
+                self.say(self.vehicles[message].heartbeat(), message)
+                self.schedule(at + 1.0, "beat", message)
             elif kind == "tell":
-                self.say(self.vehicle.tell(at))
+                self.say(self.vehicles[THE_PEER].tell(at))
                 self.schedule(at + TELL_S, "tell", None)
             elif self.up and kind == "to vehicle":
-                self.say(self.vehicle.answer(message))
+                target, order = message
+                self.say(self.vehicles[target].answer(order), target)
             elif self.up:
                 return [message]
         self.time = max(self.time, until)
@@ -167,7 +189,7 @@ def encode(message):
     """pymavlink's message for a word of the vehicle."""
     if isinstance(message, Heartbeat):
         mode = 128 if message.armed else 0
-        return mavlink.MAVLink_heartbeat_message(2, message.autopilot, mode, 0, 4, 3)
+        return mavlink.MAVLink_heartbeat_message(message.type, message.autopilot, mode, 0, 4, 3)
     if isinstance(message, Value):
         # Index 65535: unknown.
         return mavlink.MAVLink_param_value_message(message.name.encode(), message.value, message.kind, 100, 65535)
@@ -186,6 +208,8 @@ def decode(message):
         assert message.param_type == 9
         return Write(message.target_system, message.target_component, message.param_id, message.param_value)
     if kind == "COMMAND_LONG":
+        if message.command == 512:
+            return RequestOnce(message.target_system, message.target_component, message.param1)
         assert (message.command, message.param1) == (245, 1.0)
         return Store(message.target_system, message.target_component)
     return None
@@ -194,16 +218,21 @@ def decode(message):
 class ByteVehicle:
     """A scripted vehicle that speaks MAVLink in a thread; the transport gives it `receive` and `transmit`."""
 
-    def __init__(self, vehicle, beat=0.1, delay=0.0, key=None):
+    def __init__(self, vehicle, beat=0.1, delay=0.0, key=None, late=0.0):
         self.vehicle, self.beat, self.delay = vehicle, beat, delay
         self.first_beat_at = None
         self.mav = mavlink.MAVLink(None, SYSTEM, COMPONENT)
         self.mav.robust_parsing = True
+        self.late = late
         if key is not None:
             self.mav.signing.secret_key, self.mav.signing.sign_outgoing = key, True
-            self.mav.signing.timestamp = int((time.time() - 1420070400) * 1e5)
+            self.set_clock()
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self.run)
+
+    def set_clock(self):
+        """Its own time of signing, `late` s behind."""
+        self.mav.signing.timestamp = int((time.time() - 1420070400 - self.late) * 1e5)
 
     def __enter__(self):
         self.thread.start()
@@ -225,6 +254,8 @@ class ByteVehicle:
             while outbox and outbox[0][0] <= now:
                 message = outbox.pop(0)[1]
                 self.mav.srcSystem, self.mav.srcComponent = message.system, message.component
+                if self.late:
+                    self.set_clock()  # pymavlink would take over the time of whom it hears
                 self.transmit(encode(message).pack(self.mav))
                 self.mav.seq = (self.mav.seq + 1) % 256
             wake = min([due, *(at for at, _ in outbox[:1])])
@@ -243,6 +274,7 @@ class UdpVehicle(ByteVehicle):
         super().__init__(vehicle, **keywords)
         self.port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.port.bind(("127.0.0.1", 0))
+        self.port_number = self.port.getsockname()[1]
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.bind(("127.0.0.1", 0))
             self.ground = probe.getsockname()

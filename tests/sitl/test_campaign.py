@@ -36,6 +36,7 @@ from sitl.loop import fly
 from sitl.plant import GRAVITY, checked_inertia
 from sitl.scenario import doublet
 from tests.conftest import assert_one_clear_line
+from tests.sitl.running import PATIENCE_S
 
 RUNS = 60 * CHUNK  # enough that what interrupts a campaign finds it under way
 VARY = """
@@ -242,7 +243,7 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
         # A shell's background jobs, this one perhaps, ignore Ctrl-C, and so do their children.
         heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heed)
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + PATIENCE_S
         while len(list((out / "parts").glob("[0-9]*.parquet"))) < parts:
             assert time.monotonic() < deadline
             assert process.poll() is None, process.stderr.read()
@@ -251,7 +252,7 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
 
     process = begun(3)
     process.send_signal(signal.SIGINT)
-    _, message = process.communicate(timeout=60)
+    _, message = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     assert f"of {RUNS} runs; give the same command again" in message
     kept = {path: path.stat().st_mtime_ns for path in (out / "parts").glob("[0-9]*.parquet")}
@@ -263,7 +264,7 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
     process.kill()
     process.communicate()
     assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + PATIENCE_S
     while any(alive(pid) for pid in workers):
         assert time.monotonic() < deadline, "the workers outlive the campaign"
         time.sleep(0.05)
@@ -306,7 +307,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(vehicle, tmp_path):
             [sys.executable, "-c", KILLER, str(tmp_path / "cluster" / "parts"), str(pids[0])], stdout=subprocess.PIPE
         )
         results = run_campaign(plan, tmp_path / "cluster", 1, cluster.scheduler_address)
-        assert 3 <= int(killer.communicate(timeout=60)[0]) < RUNS // CHUNK
+        assert 3 <= int(killer.communicate(timeout=PATIENCE_S)[0]) < RUNS // CHUNK
     assert results.read_bytes() == whole
 
 

@@ -15,6 +15,7 @@ from sitl.mavlink import lockstep
 from sitl.mavlink.link import Codec, listen
 from sitl.mavlink.plant_process import plant_process
 from sitl.scenario import doublet
+from tests.sitl.running import PATIENCE_S
 
 TS = 0.004
 
@@ -37,7 +38,7 @@ def test_a_flight_over_mavlink_has_the_same_bits_also_when_the_autopilot_starts_
 
 def test_the_plant_repeats_its_first_frame_until_it_is_answered_and_then_keeps_lockstep():
     with plant_process("adam0", 0, TS, 0, None) as port, socket.create_connection(("127.0.0.1", port)) as link:
-        link.settimeout(5)
+        link.settimeout(PATIENCE_S)
         codec, stamps = Codec(), []
         while len(stamps) < 3:
             stamps += [m.time_usec for m in codec.parse(link.recv(4096)) if m.get_type() == "HIL_STATE_QUATERNION"]

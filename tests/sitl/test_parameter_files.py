@@ -51,7 +51,7 @@ def test_a_value_that_six_digits_would_lose_is_kept(tmp_path):
 
 def test_qgroundcontrols_five_columns_hold_the_vehicle_and_the_type():
     text = parameter_text("qgc", {"MIMO_RP_RR": single(0.12)}, system=3, component=1)
-    assert text.splitlines()[1:] == ["3\t1\tMIMO_RP_RR\t0.12\t9"]
+    assert text.splitlines()[2:] == ["3\t1\tMIMO_RP_RR\t0.12\t9"]
     assert text.startswith("# ")
 
 
@@ -82,6 +82,26 @@ def test_a_file_that_is_none_is_refused_with_its_line(tmp_path, text, message):
     path.write_text(text)
     with pytest.raises(SitlError, match=message):
         read_parameters(path)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_file_of_ours_that_was_cut_or_changed_is_refused_at_every_byte(tmp_path, form):
+    values = {p.name: single(0.001 * i + 0.1) for i, p in enumerate(PARAMETERS)}
+    path = tmp_path / "x.params"
+    text = parameter_text(form, values)
+    for size in range(len(text) - 1):  # without its last line end it is whole
+        path.write_text(text[:size])
+        with pytest.raises(SitlError, match=r"holds no parameters|not whole|cut short"):
+            read_parameters(path)
+    lines = text.splitlines(keepends=True)
+    path.write_text("".join(lines[:-10]))
+    with pytest.raises(SitlError, match=r"x\.params: holds 26 parameters, but its first line says 36: it is not whole"):
+        read_parameters(path)
+    path.write_text(text.replace("0.105", "0.106"))
+    with pytest.raises(SitlError, match=r"damaged or edited.*delete the first line"):
+        read_parameters(path)
+    path.write_text(text.replace("0.105", "0.106").split("\n", 1)[1])
+    assert read_parameters(path) == values | {PARAMETERS[5].name: single(0.106)}
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):

@@ -1,7 +1,6 @@
 """The vehicle's parameters: ranges, refusals, the running controller, and the file that keeps them."""
 
 import math
-import time
 
 import numpy as np
 import pytest
@@ -17,6 +16,7 @@ from sitl.injector import Injector
 from sitl.mavlink.parameter_files import read_parameters
 from sitl.mavlink.parameter_server import ParameterServer
 from sitl.mavlink.parameter_store import ParameterStore
+from tests.sitl.running import wait_for
 
 ALL = len(PARAMETERS + IDENTITY + EXCITATION)
 
@@ -106,9 +106,7 @@ def settle(server):
 def test_a_change_is_in_the_file_soon_after_without_being_asked(tmp_path):
     server = start(ParameterStore(tmp_path / "p.params"))
     server.write("MIMO_RP_RR", 0.12, 9)
-    deadline = time.monotonic() + 10
-    while not server.store.path.exists() and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_for(server.store.path.exists)
     assert read_parameters(server.store.path)["MIMO_RP_RR"] == np.float32(0.12)
     server.close()
 

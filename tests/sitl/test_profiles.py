@@ -112,7 +112,17 @@ def test_every_name_and_value_can_go_over_the_wire(diagonal, profile):
         assert value == single(value)
 
 
-def test_a_snapshot_is_put_back_whatever_its_range(diagonal):
-    plan = restoration({"MIMO_RP_RR": 99.0, "MC_ROLL_P": 6.5})
-    assert plan.values == {"MIMO_RP_RR": 99.0, "MC_ROLL_P": 6.5}
-    assert [s.unit for s in plan.settings] == ["s", ""]
+def test_a_snapshot_is_a_whole_set_within_our_ranges(diagonal):
+    values = make_plan(diagonal).values
+    plan = restoration(values | {"MIMO_TS": 0.004, "SYS_X": 1e9}, "old.params")
+    assert plan.values == values | {"SYS_X": 1e9}
+    assert (plan.fixed, plan.profile) == ({"MIMO_TS": 0.004}, "mimo")
+    assert [s.unit for s in plan.settings][:1] == ["1/s"]
+    with pytest.raises(SitlError, match=r"old\.params: MIMO_RP_RR: got 99, expected -?[0-9.e-]+ to 5 s"):
+        restoration(values | {"MIMO_RP_RR": 99.0}, "old.params")
+    with pytest.raises(SitlError, match=r"holds 33 of our 35 gains and lacks MIMO_RP_RP and 1 more"):
+        restoration({n: v for n, v in values.items() if n not in ("MIMO_RP_RP", "MIMO_D_POLE")}, "old.params")
+    foreign = restoration({"MC_ROLL_P": 99.0}, "px4.params")
+    assert (foreign.values, foreign.profile) == ({"MC_ROLL_P": 99.0}, "px4-stock")
+    assert restoration({"ATC_ANG_RLL_P": 5.0}, "x").profile == "ardupilot-stock"
+    assert restoration({"WPNAV_SPEED": 5.0}, "x").profile == ""

@@ -1,5 +1,6 @@
 """MAVLink 2 signing, against pymavlink's own, and what a thief can do with frames that he has heard."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
@@ -66,6 +67,13 @@ def test_a_replayed_frame_is_dropped_on_every_link_of_the_vehicle():
 def test_a_stream_never_heard_may_be_a_minute_behind_and_not_more():
     for late, taken in ((59.0, ["PING"]), (61.0, [])):
         assert heard(Codec(signer=signer()), Codec(255, 190, signer(now=NOW - late)).pack(PING)) == taken
+
+
+def test_a_clock_that_is_behind_is_told_from_a_wrong_key():
+    for key, late, behind in ((KEY, 3600.0, 3600.0), (KEY[::-1], 3600.0, 0.0), (KEY, 0.0, 0.0)):
+        ours = signer()
+        heard(Codec(signer=ours), Codec(255, 190, signer(key, NOW - late)).pack(PING))
+        assert ours.behind == pytest.approx(behind, abs=0.1)
 
 
 def test_a_forged_time_stamp_does_not_shut_out_the_one_whose_stream_it_names():

@@ -1,13 +1,10 @@
 """`mimopilot sitl` with a key, with a file of parameters, and with several ground stations."""
 
-import time
-
 import numpy as np
-import pytest
 from pymavlink import mavutil
 
 from tests.conftest import assert_one_clear_line
-from tests.sitl.running import Pilot, free_port, running_sitl
+from tests.sitl.running import PATIENCE_S, Pilot, free_port, running_sitl
 
 KEY = bytes(range(32))
 
@@ -17,17 +14,19 @@ def test_a_signed_vehicle_obeys_who_has_the_key_and_nobody_else(tmp_path, mimopi
     key.write_bytes(KEY)
     with running_sitl("--signing-key", key) as sitl:
         assert ", signed" in sitl.output
-        link = ("params", "--connect", f"tcp:127.0.0.1:{sitl.tcp}", "--timeout", 3)
+        link = ("params", "--connect", f"tcp:127.0.0.1:{sitl.tcp}", "--timeout", 60)
         done = mimopilot(*link, "--signing-key", key)
         assert (done.returncode, "MIMO_RP_RR" in done.stdout) == (0, True), done.stderr
-        assert_one_clear_line(mimopilot(*link), "no answer", "give --signing-key", code=1)
+        unsigned = mimopilot(*link, "--timeout", 3)
+        assert_one_clear_line(unsigned, "no answer", "give --signing-key", code=1)
         # pymavlink's own signing, as MAVProxy uses it.
         other = mavutil.mavlink_connection(f"udpin:127.0.0.1:{sitl.udp}", dialect="common", source_system=254)
-        other.wait_heartbeat(timeout=10)  # it learns the protocol's version, and forgets a key that it had before
+        # It learns the protocol's version, and forgets a key that it had before.
+        other.wait_heartbeat(timeout=PATIENCE_S)
         other.setup_signing(KEY, sign_outgoing=True)
-        assert other.wait_heartbeat(timeout=10).get_signed()
+        assert other.wait_heartbeat(timeout=PATIENCE_S).get_signed()
         other.mav.param_set_send(1, 1, b"MIMO_RP_RR", 0.125, 9)
-        assert other.recv_match(type="PARAM_VALUE", blocking=True, timeout=5).param_value == 0.125
+        assert other.recv_match(type="PARAM_VALUE", blocking=True, timeout=PATIENCE_S).param_value == 0.125
         other.close()
 
 
@@ -60,16 +59,14 @@ def test_two_stations_by_udp_and_tcp_see_each_others_changes_and_only_their_own_
         assert second.asks("PARAM_VALUE").param_value == 0.125
         second.link.mav.param_request_read_send(1, 1, b"MIMO_TS", -1)
         assert second.asks("PARAM_VALUE").param_value == np.float32(0.004)
-        with pytest.raises(AssertionError, match="no PARAM_VALUE"):
-            first.asks("PARAM_VALUE", 1.0)
+        first.link.mav.param_request_read_send(1, 1, b"MIMO_RP_RR", -1)
+        assert first.asks("PARAM_VALUE").param_id == "MIMO_RP_RR"  # it did not hear the other's answer before
         assert second.link.packet_loss() == 0.0
         assert first.link.packet_loss() == 0.0
-        begin = time.monotonic()
         for pilot in (first, second):
             pilot.link.mav.param_request_list_send(1, 1)
         for pilot in (first, second):
             assert {pilot.asks("PARAM_VALUE").param_index for _ in range(47)} == set(range(47))
-        assert time.monotonic() - begin < 10
         first.close()
         second.close()
 

@@ -6,14 +6,12 @@ import os
 import random
 import signal
 import subprocess
-import sys
-import time
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from codegen.parameters import IDENTITY, PARAMETERS
+from codegen.parameters import PARAMETERS
 from codegen.render import render
 from sitl.airframe import load_airframe
 from sitl.errors import SitlError
@@ -24,7 +22,7 @@ from sitl.mavlink.profiles import make_plan
 from sitl.mavlink.signing import Signer, read_key
 from sitl.mavlink.words import Beat, Heartbeat, Read, Refusal, Store, Value, Write
 from tests.conftest import assert_one_clear_line
-from tests.sitl.running import Pilot, running_sitl
+from tests.sitl.running import PATIENCE_S, QUICK, Pilot, running_sitl, wait_for
 from tests.sitl.scripted_vehicle import FAILING, ScriptedVehicle, SerialVehicle, TcpVehicle, UdpVehicle, encode, float32
 from tuning.gains import load_gains
 
@@ -32,25 +30,16 @@ KEY = bytes(range(32))
 
 
 @pytest.fixture
-def certified(gains, tmp_path):
-    """A gains file with a certificate for its very matrices."""
-    path = tmp_path / "my.gains.toml"
-    certificate = {"verdict": "certified", "reason": "by this test", "matrices_sha256": gains.matrices_sha256()}
-    dataclasses.replace(gains, certificate=certificate).save(path)
-    return path
+def mimopilot(quick_mimopilot):
+    return quick_mimopilot
 
 
-@pytest.fixture
-def new(gains):
-    return make_plan(gains).values
-
-
-@pytest.fixture
-def old(gains, new):
-    """Every gain on the vehicle differs from the new one; the period and the unit of moment do not."""
-    identity = dict(zip((p.name for p in IDENTITY), gains.moment_scale, strict=True))
-    values = {name: value * 0.875 for name, value in new.items()} | {"MIMO_TS": gains.Ts} | identity
-    return {name: float32(value) for name, value in values.items()}
+def read_until(process, words):
+    shown = ""
+    while words not in shown:
+        character = process.stdout.read(1)
+        assert character, process.stderr.read()
+        shown += character
 
 
 def named(values, names):
@@ -100,7 +89,7 @@ def test_json_is_one_object_for_success_and_for_failure(mimopilot, certified, ol
 def test_no_fault_gets_past_the_command(mimopilot, certified, old, new, fault):
     vehicle = ScriptedVehicle(old, fault, victim="MIMO_RP_PP", after=12)
     with UdpVehicle(vehicle) as link:
-        failed = mimopilot("upload", certified, "--connect", link.url, "--yes", "--timeout", "1")
+        failed = mimopilot("upload", certified, "--connect", link.url, "--yes", "--timeout", "3")
         assert named(vehicle.values, new) == named(old, new)
     assert_one_clear_line(failed, "nothing was written" if fault == "integer" else "put back and read back", code=1)
     assert "verified" not in failed.stdout
@@ -109,7 +98,7 @@ def test_no_fault_gets_past_the_command(mimopilot, certified, old, new, fault):
 def test_a_vehicle_that_goes_away_is_told_name_by_name_and_restored_later(mimopilot, certified, old, new):
     vehicle = ScriptedVehicle(old, "dies", after=20)
     with UdpVehicle(vehicle) as link:
-        failed = mimopilot("upload", certified, "--connect", link.url, "--yes", "--timeout", "1")
+        failed = mimopilot("upload", certified, "--connect", link.url, "--yes", "--timeout", "3")
         held = dict(vehicle.values)
         changed = [name for name in new if held[name] != old[name]]
         assert len(changed) == 20
@@ -132,9 +121,7 @@ def test_a_connection_that_breaks_is_noticed_at_once(mimopilot, certified, old):
     write = link.vehicle.write
     link.vehicle.write = lambda name, value: (link.vehicle.writes == 9 and link.hang_up()) or write(name, value)
     with link:
-        begin = time.monotonic()
-        failed = mimopilot("upload", certified, "--connect", link.url, "--yes")
-        assert time.monotonic() - begin < 10  # 24 s of patience are not needed
+        failed = mimopilot("upload", certified, "--connect", link.url, "--yes", "--timeout", "600")
         link.stop.set()
     assert_one_clear_line(failed, "the link was lost", "MIMO_AP_RR holds", "mimopilot restore", code=1)
 
@@ -143,15 +130,13 @@ def test_a_connection_that_breaks_is_noticed_at_once(mimopilot, certified, old):
 def test_ctrl_c_and_a_closed_terminal_put_the_old_values_back(certified, old, new, number):
     vehicle = ScriptedVehicle(old, "deaf to one", victim="MIMO_RF_PP")
     with UdpVehicle(vehicle) as link:
-        command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url, "--yes"]
+        command = [*QUICK, "upload", str(certified), "--connect", link.url, "--yes"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-            deadline = time.monotonic() + 20
-            while vehicle.writes < 20 and time.monotonic() < deadline:
-                time.sleep(0.01)
+            wait_for(lambda: vehicle.writes >= 20)
             process.send_signal(number)
-            time.sleep(0.2)  # it knows by now, and would wait 12 s for the one that is deaf
+            wait_for(lambda: vehicle.values["MIMO_AP_RR"] == old["MIMO_AP_RR"])  # it knows, and puts the old ones back
             vehicle.fault = ""
-            _, message = process.communicate(timeout=60)
+            _, message = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 1
         assert "interrupted" in message
         assert "the old values were put back and read back" in message
@@ -162,15 +147,11 @@ def test_ctrl_c_and_a_closed_terminal_put_the_old_values_back(certified, old, ne
 def test_a_person_at_a_terminal_is_asked(certified, old, new, answer, written):
     near, far = os.openpty()
     with UdpVehicle(ScriptedVehicle(old)) as link:
-        command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url]
+        command = [*QUICK, "upload", str(certified), "--connect", link.url]
         with subprocess.Popen(command, stdin=far, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-            shown = ""
-            while "Write 35 parameters to vehicle 1?" not in shown:
-                character = process.stdout.read(1)
-                assert character, process.stderr.read()
-                shown += character
+            read_until(process, "Write 35 parameters to vehicle 1?")
             os.write(near, answer.encode())
-            _, told = process.communicate(timeout=60)
+            _, told = process.communicate(timeout=PATIENCE_S)
         assert (process.returncode == 0) == written, told
         assert named(link.vehicle.values, new) == (new if written else named(old, new))
     os.close(near)
@@ -180,15 +161,12 @@ def test_a_person_at_a_terminal_is_asked(certified, old, new, answer, written):
 def test_values_that_change_while_the_question_stands_are_not_overwritten(certified, old, new):
     near, far = os.openpty()
     with UdpVehicle(ScriptedVehicle(old)) as link:
-        command = [sys.executable, "-m", "mimopilot", "upload", str(certified), "--connect", link.url]
+        command = [*QUICK, "upload", str(certified), "--connect", link.url]
         with subprocess.Popen(command, stdin=far, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-            deadline = time.monotonic() + 20
-            while link.vehicle.reads < len(old) and time.monotonic() < deadline:
-                time.sleep(0.01)
-            time.sleep(0.5)  # the last answer is on its way
+            read_until(process, "Write 35 parameters to vehicle 1?")
             link.vehicle.values["MIMO_RP_RR"] = 0.5
             os.write(near, b"y\n")
-            _, message = process.communicate(timeout=60)
+            _, message = process.communicate(timeout=PATIENCE_S)
         assert (process.returncode, link.vehicle.writes) == (1, 0)
         assert "changed while the question stood" in message
     os.close(near)
@@ -206,7 +184,7 @@ def test_signed_links_need_the_key_and_say_so(mimopilot, certified, old, new, tm
             assert done.returncode == 0, done.stderr
             assert named(link.vehicle.values, new) == new
     with UdpVehicle(ScriptedVehicle(old), key=KEY) as link:
-        arguments = ("upload", certified, "--connect", link.url, "--yes", "--timeout", "1")
+        arguments = ("upload", certified, "--connect", link.url, "--yes", "--timeout", "3")
         assert_one_clear_line(mimopilot(*arguments), "no answer", "give --signing-key", code=1)
         wrong = mimopilot(*arguments, "--signing-key", "wrong")
         assert_one_clear_line(wrong, "no HEARTBEAT", "not signed with this key", code=1)
@@ -236,18 +214,20 @@ def test_gains_for_another_vehicle_are_refused_before_anything_is_written(mimopi
 def test_a_vehicle_without_its_unit_of_moment_takes_gains_whose_unit_is_told(mimopilot, certified, old, new):
     silent = {name: value for name, value in old.items() if not name.startswith("MIMO_SCALE")}
     with UdpVehicle(ScriptedVehicle(silent)) as link:
-        arguments = ("upload", certified, "--connect", link.url, "--yes", "--timeout", "1")
+        arguments = ("upload", certified, "--connect", link.url, "--yes", "--timeout", "3")
         assert_one_clear_line(mimopilot(*arguments), "MIMO_SCALE_R", "no answer", code=1)
         assert mimopilot(*arguments, "--moment-scale", "2.546,2.546,0.2736").returncode == 0
         assert named(link.vehicle.values, new) == new
 
 
-@pytest.mark.parametrize(("profile", "count"), [("px4-stock", 25), ("ardupilot-stock", 24)])
-def test_a_stock_autopilot_gets_the_diagonal(mimopilot, certified, gains, profile, count):
+@pytest.mark.parametrize(("profile", "autopilot", "count"), [("px4-stock", 12, 25), ("ardupilot-stock", 3, 24)])
+def test_a_stock_autopilot_gets_the_diagonal(mimopilot, certified, gains, profile, autopilot, count):
     wanted = make_plan(gains, profile, drop=True).values
     assert len(wanted) == count
     arguments = ("upload", certified, "--yes", "--profile", profile)
-    with UdpVehicle(ScriptedVehicle(dict.fromkeys(wanted, 0.25))) as link:
+    vehicle = ScriptedVehicle(dict.fromkeys(wanted, 0.25))
+    vehicle.autopilot = autopilot
+    with UdpVehicle(vehicle) as link:
         at = ("--connect", link.url)
         assert_one_clear_line(mimopilot(*arguments, *at), "13% of its diagonal", "--drop-off-diagonals")
         told = (*arguments, *at, "--drop-off-diagonals")
@@ -307,7 +287,7 @@ def test_mistakes_are_one_clear_line(mimopilot, certified, tmp_path):
         (("upload", certified, "--connect", "tcp:127.0.0.1:9"), ("nobody to ask", "--yes"), 2),
         (("upload", certified, "--connect", "tcp:127.0.0.1:9", "--yes"), ("cannot be opened", "refused"), 1),
         (("upload", certified, "--connect", "/dev/nowhere,57600", "--yes"), ("/dev/nowhere", "cannot be opened"), 1),
-        (("upload", certified, "--connect", "udpin:127.0.0.1:9999", "--yes", "--timeout", "1"), ("no HEARTBEAT",), 1),
+        (("upload", certified, "--connect", "udpin:127.0.0.1:9999", "--yes", "--timeout", "3"), ("no HEARTBEAT",), 1),
         (("upload", certified, "--connect", "x", "--yes", "--moment-scale", "1,2"), ("--moment-scale: got '1,2'",), 2),
         (("upload", certified, "--connect", "x", "--yes", "--profile", "x"), ("--profile: got 'x'",), 2),
         (("upload", "none.toml", "--connect", "x"), ("none.toml",), 2),

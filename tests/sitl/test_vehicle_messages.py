@@ -303,6 +303,15 @@ def test_telemetry_tells_the_truth(bench):
     assert shown("EXTENDED_SYS_STATE").landed_state == mavlink.MAV_LANDED_STATE_ON_GROUND
 
 
+def test_no_fence_is_ever_breached(bench):
+    """MAVProxy says "fence breach" when the bit goes from the healthy."""
+    for obstacles in ({}, {"plant": "no plant is connected"}, {"rate": "the plant's period is wrong"}):
+        bench.vehicle.obstacles = obstacles
+        status = bench.telemetry.build(mavlink.MAVLINK_MSG_ID_SYS_STATUS)
+        for field in ("present", "enabled", "health"):
+            assert getattr(status, f"onboard_control_sensors_{field}") & mavlink.MAV_SYS_STATUS_GEOFENCE
+
+
 def test_readiness_to_arm_is_shown(bench):
     def status():
         message = bench.telemetry.build(mavlink.MAVLINK_MSG_ID_SYS_STATUS)

@@ -1,0 +1,55 @@
+"""What several tests of the upload share."""
+
+import dataclasses
+import io
+import subprocess
+import sys
+
+import pytest
+
+import mimopilot as front_door
+from codegen.parameters import IDENTITY
+from sitl.mavlink.profiles import make_plan
+from tests.sitl.running import WAITS
+from tests.sitl.scripted_vehicle import float32
+
+
+@pytest.fixture
+def quick_mimopilot(monkeypatch, capsys, tmp_path):
+    """The command line in this process, with `WAITS`: a real upload waits for seconds."""
+    for (module, name), value in WAITS.items():
+        monkeypatch.setattr(f"{module}.{name}", value)
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["mimopilot", *map(str, arguments)])
+        monkeypatch.setattr(sys, "stdin", io.StringIO())
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            front_door.main()
+        code = end.value.code or 0
+        return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
+
+    return run
+
+
+@pytest.fixture
+def certified(gains, tmp_path):
+    """A gains file with a certificate for its very matrices."""
+    path = tmp_path / "my.gains.toml"
+    certificate = {"verdict": "certified", "reason": "by this test", "matrices_sha256": gains.matrices_sha256()}
+    dataclasses.replace(gains, certificate=certificate).save(path)
+    return path
+
+
+@pytest.fixture
+def new(gains):
+    return make_plan(gains).values
+
+
+@pytest.fixture
+def old(gains, new):
+    """Every gain on the vehicle differs from the new one; the period and the unit of moment do not."""
+    identity = dict(zip((p.name for p in IDENTITY), gains.moment_scale, strict=True))
+    values = {name: value * 0.875 for name, value in new.items()} | {"MIMO_TS": gains.Ts} | identity
+    return {name: float32(value) for name, value in values.items()}
