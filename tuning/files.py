@@ -145,16 +145,19 @@ def write_atomically(path: Path, content: str | bytes) -> bool:
     return True
 
 
-def seal(content: bytes) -> bytes:
-    """`content` followed by its SHA-256; see `unseal`."""
-    return content + hashlib.sha256(content).digest()
+def seal(content: bytes, label: str) -> bytes:
+    """`content`, a line that says what it is, and the SHA-256 of both in hexadecimal; see `unseal`."""
+    body = content + f"\n{label}\n".encode()
+    return body + sha256(body).encode()
 
 
-def unseal(sealed: bytes) -> bytes | None:
-    """What `seal` was given; None when a byte of it is another or is missing."""
-    size = len(sealed) - hashlib.sha256().digest_size
-    content = sealed[: max(size, 0)]
-    return content if size >= 0 and seal(content) == sealed else None
+def unseal(sealed: bytes) -> tuple[bytes, str] | None:
+    """Content and label that `seal` was given; None when a byte of them is another or is missing."""
+    body, digest = sealed[:-64], sealed[-64:]
+    parts = body.rsplit(b"\n", 2)
+    if len(parts) < 3 or sha256(body).encode() != digest:
+        return None
+    return parts[0], parts[1].decode()
 
 
 def sha256(content: bytes | str) -> str:

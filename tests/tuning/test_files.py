@@ -6,7 +6,7 @@ import socket
 import pytest
 
 from tuning.errors import TuningError
-from tuning.files import MAX_TEXT_BYTES, inside, read_bytes, read_text, seal, unseal, write_atomically
+from tuning.files import MAX_TEXT_BYTES, inside, read_bytes, read_text, seal, sha256, unseal, write_atomically
 
 
 def test_only_a_regular_file_of_bounded_size_is_read(tmp_path, monkeypatch):
@@ -76,9 +76,10 @@ def test_a_link_below_an_output_folder_is_refused_and_the_folder_itself_may_be_o
 
 
 def test_a_seal_is_broken_by_every_byte_that_changes_or_is_missing():
-    sealed = seal(b"content")
-    assert unseal(sealed) == b"content"
-    assert unseal(seal(b"")) == b""
+    sealed = seal(b"con\ntent\n", "label")
+    assert unseal(sealed) == (b"con\ntent\n", "label")
+    assert unseal(seal(b"", "")) == (b"", "")
+    assert unseal(sha256(b"").encode()) is None
     for place in range(len(sealed)):
         assert unseal(sealed[:place]) is None
         assert unseal(sealed[:place] + bytes([sealed[place] ^ 1]) + sealed[place + 1 :]) is None
