@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -17,12 +18,13 @@ from sitl.campaign.variation import Variation
 from sitl.errors import SitlError
 from sitl.faults import parse_fault
 from sitl.scenario import Scenario, make_scenario
-from tuning.files import inside, read_text, write_atomically
+from tuning.files import inside, read_text, sha256, write_atomically
 from tuning.gains import Gains, gains_from_toml, gains_to_toml
 from tuning.toml import checked, parse_toml, shown, toml_entries
 
 SPEC, AIRFRAME = "spec.toml", "airframe.toml"
-RESULTS, PARTS = "results.parquet", "parts"
+RESULTS, PARTS, LOCK = "results.parquet", "parts", "campaign.lock"
+SUMMARY, REPORT = "summary.json", "report.html"
 HEAD = "# A campaign of mimopilot. Run k is drawn from the seed and k alone; every gain set flies the same runs."
 MAX_RUNS = 100_000_000
 
@@ -84,6 +86,10 @@ class Plan:
     airframe: Airframe
     gains: dict[str, Gains]
     scenarios: list[Scenario]
+
+    def sha256(self) -> str:
+        """Hash of all that decides what the flights are."""
+        return sha256(json.dumps(self.files, sort_keys=True))
 
 
 def make_plan(vehicle: Vehicle, gains: dict[str, Gains], **entries: Any) -> Plan:
