@@ -88,10 +88,14 @@ def inside(folder: Path, name: str) -> Path:
         if step == folder:
             break
         if step.is_symlink():
-            raise OSError(
-                errno.ELOOP, "is a link, and nothing is written through it; remove it or give another --out", str(step)
-            )
+            raise _link(step)
     return path
+
+
+def _link(path: Path) -> OSError:
+    return OSError(
+        errno.ELOOP, "is a link, and nothing is written through it; remove it or give another --out", str(path)
+    )
 
 
 def write_atomically(path: Path, content: str | bytes) -> bool:
@@ -112,15 +116,17 @@ def write_atomically(path: Path, content: str | bytes) -> bool:
     Raises
     ------
     OSError
-        When the folder or file cannot be written, or a device or a pipe is there; the old file, if any, is then
-        untouched. A link is replaced, the file that it names is not.
+        When the folder or file cannot be written, or a link, a device or a pipe is there; what was there is then
+        untouched.
     """
     data = content.encode() if isinstance(content, str) else content
+    if path.is_symlink():
+        raise _link(path)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "is a folder, expected a file", str(path))
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "is a device or a pipe, expected a file or nothing", str(path))
-    if path.is_file() and not path.is_symlink() and path.stat().st_size == len(data) and path.read_bytes() == data:
+    if path.is_file() and path.stat().st_size == len(data) and path.read_bytes() == data:
         return False
     path.parent.mkdir(parents=True, exist_ok=True)
     try:

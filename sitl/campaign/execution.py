@@ -51,10 +51,14 @@ def run_campaign(plan: Plan, folder: Path, workers: int, scheduler: str | None =
     Raises
     ------
     SitlError
-        When the folder holds another campaign or one is being flown into it, when it was interrupted, or when
+        When the folder holds another campaign, or one is being flown into it, when it was interrupted, or when
         workers are lost.
+    OSError
+        When a link lies where one of its files belongs, or a file cannot be written.
     """
-    results, parts, _, _ = (inside(folder, name) for name in (RESULTS, PARTS, SUMMARY, REPORT))
+    for name in (RESULTS, PARTS, SUMMARY, REPORT, *plan.files):
+        inside(folder, name)
+    results, parts = folder / RESULTS, folder / PARTS
     if not results.is_file():  # compiles before workers are forked, and finds what is wrong before the folder is taken
         list(stand_of(tuple(plan.files.items())).flights(0))
     with _alone(folder):

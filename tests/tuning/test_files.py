@@ -40,18 +40,19 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path, monkeypatch):
         read_bytes(tmp_path / "full", "gains file")
 
 
-def test_a_device_is_not_replaced_and_a_link_is_without_what_it_names(tmp_path):
+def test_neither_a_link_nor_a_device_is_replaced_or_written_through(tmp_path):
     os.mkfifo(tmp_path / "pipe")
-    (tmp_path / "null").symlink_to("/dev/null")
-    for name in ("pipe", "null"):
-        with pytest.raises(OSError, match="a device or a pipe"):
-            write_atomically(tmp_path / name, "x")
     (tmp_path / "own").write_text("old")
-    (tmp_path / "link").symlink_to("own")
-    (tmp_path / "loop").symlink_to("loop")
-    for name, text in (("link", "old"), ("loop", "new")):
-        assert write_atomically(tmp_path / name, text)
-        assert not (tmp_path / name).is_symlink()
+    for name, target in (("null", "/dev/null"), ("link", "own"), ("loop", "loop"), ("dangling", "nothing")):
+        (tmp_path / name).symlink_to(target)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(OSError, match="is a device or a pipe"):
+        write_atomically(tmp_path / "pipe", "new")
+    for name in ("null", "link", "loop", "dangling"):
+        with pytest.raises(OSError, match="is a link"):
+            write_atomically(tmp_path / name, "new")
+        assert (tmp_path / name).is_symlink()
+    assert sorted(tmp_path.iterdir()) == before
     assert (tmp_path / "own").read_text() == "old"
 
 
