@@ -50,7 +50,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def read_text(path: Path, what: str) -> str:
-    """Text of a small UTF-8 file that a user names; see `read_bytes`.
+    """Text of a small UTF-8 file that a user names, with or without a byte order mark; see `read_bytes`.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def read_text(path: Path, what: str) -> str:
         As `read_bytes`, and when it is not UTF-8.
     """
     try:
-        return read_bytes(path, what).decode()
+        return read_bytes(path, what).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise TuningError(
             f"{path}: cannot read the {what}: byte {error.start} is not UTF-8 text; is it the right file?"

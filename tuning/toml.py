@@ -129,6 +129,8 @@ def complaint(error: ValidationError) -> str:
     first = error.errors()[0]
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "missing":  # what pydantic calls its input is the table around it
+        return f"{shown_text(field)}: {message}"
     return f"{shown_text(field)}: {message}, got {shown(first.get('input'))}" if field else message
 
 

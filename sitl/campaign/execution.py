@@ -200,7 +200,7 @@ def _merge(plan: Plan, parts: Path, results: Path) -> None:
     whole, count = inside(parts, RESULTS), chunks(plan)
     begin = pq.read_table(_table(plan, parts, 0))
     schema, a_group = begin.schema, max(1, ROW_GROUP // begin.num_rows)
-    with pq.ParquetWriter(whole, schema, compression="zstd") as writer:
+    with pq.ParquetWriter(whole, schema, compression="zstd", write_page_checksum=True) as writer:
         for first in range(0, count, a_group):
             chosen = range(first, min(first + a_group, count))
             tables = [pq.read_table(_table(plan, parts, chunk), schema=schema) for chunk in chosen]

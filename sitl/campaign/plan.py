@@ -199,5 +199,7 @@ def reading(results: Path) -> Iterator[None]:
     """A table of results that is damaged is told in one line."""
     try:
         yield
-    except pa.ArrowInvalid as error:
+    except (pa.ArrowException, ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno:  # of the system: not the fault of what is in the file
+            raise
         raise SitlError(f"{results}: damaged; remove it and give the campaign's command again") from error

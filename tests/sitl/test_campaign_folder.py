@@ -8,7 +8,8 @@ import pytest
 from sitl.airframe import load_airframe
 from sitl.campaign.execution import run_campaign
 from sitl.campaign.flights import CHUNK, fly_chunk
-from sitl.campaign.plan import LOCK, PARTS, make_plan, settle
+from sitl.campaign.plan import LOCK, PARTS, RESULTS, make_plan, settle
+from sitl.campaign.summary import Results
 from sitl.errors import SitlError
 
 RUNS = 5 * CHUNK
@@ -107,3 +108,18 @@ def test_damage_between_the_flight_and_the_table_is_told(flown, tmp_path, monkey
     monkeypatch.setattr("sitl.campaign.execution._missing", lambda *_: [])
     with pytest.raises(SitlError, match=r"0000002\.part is damaged"):
         run_campaign(plan, folder, 1)
+
+
+def test_a_damaged_table_of_results_is_told_or_does_no_harm(flown, tmp_path):
+    plan, results, _ = flown
+    path = tmp_path / RESULTS
+    path.write_bytes(results)
+    sound, told = Results(plan, path).summarise(), 0
+    for place in range(0, len(results), len(results) // 60):
+        path.write_bytes(results[:place] + bytes([results[place] ^ 8]) + results[place + 1 :])
+        try:
+            assert Results(plan, path).summarise() == sound
+        except SitlError as error:
+            assert f"{path}: damaged; remove it" in str(error)
+            told += 1
+    assert told > 20

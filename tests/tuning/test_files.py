@@ -35,6 +35,8 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path, monkeypatch):
     (tmp_path / "full").write_bytes(b"x" * MAX_TEXT_BYTES)
     (tmp_path / "link").symlink_to("full")
     assert len(read_text(tmp_path / "link", "gains file")) == MAX_TEXT_BYTES
+    (tmp_path / "marked").write_bytes("\ufeffa = 1".encode())
+    assert read_text(tmp_path / "marked", "gains file") == "a = 1"
     (tmp_path / "full").write_bytes(b"x" * (MAX_TEXT_BYTES + 1))
     with pytest.raises(TuningError, match=f"{MAX_TEXT_BYTES + 1} bytes"):
         read_bytes(tmp_path / "full", "gains file")
