@@ -137,3 +137,12 @@ def test_without_room_for_machine_code_functions_are_compiled_all_the_same(place
     monkeypatch.setattr("tuning.compiled.write_atomically", full)
     (tmp_path / "functions.py").write_text(MODULE)
     assert load(tmp_path / "functions.py").double(21.0) == 42.0
+
+
+def test_machine_code_for_other_types_is_not_taken_even_from_the_same_file(places, tmp_path, monkeypatch):
+    monkeypatch.setattr("tuning.compiled._Files._path", lambda self, key: self.folder / f"{self.name}.nbc")
+    (tmp_path / "functions.py").write_text(MODULE)
+    assert load(tmp_path / "functions.py").double(21.5) == 43.0
+    other = load(tmp_path / "functions.py").double
+    assert other(21) == 42
+    assert not other.stats.cache_hits
