@@ -14,9 +14,8 @@ def cache_folder() -> Path:
 
     Code is run from it: the first is taken that nobody else can write to.
     """
-    base = os.environ.get("XDG_CACHE_HOME")
-    usual = (Path(base) if base else Path.home() / ".cache") / "mimopilot"
-    for folder in (usual, Path(tempfile.gettempdir()) / f"mimopilot-{os.geteuid()}"):
+    usual = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
+    for folder in (usual / "mimopilot", Path(tempfile.gettempdir()) / f"mimopilot-{os.geteuid()}"):
         if found := _own(folder):
             return found
     return Path(_temporary().name)
@@ -34,6 +33,7 @@ def _own(folder: Path) -> Path | None:
     the sticky bit is enough: there only owners can rename or remove.
     """
     try:
+        folder = folder.expanduser()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         folder = folder.resolve()
         for step in (folder, *folder.parents):
@@ -42,6 +42,6 @@ def _own(folder: Path) -> Path | None:
             sticky = step != folder and status.st_mode & stat.S_ISVTX
             if status.st_uid not in (0, os.geteuid()) or (shared and not sticky):
                 return None
-    except (OSError, RuntimeError):  # RuntimeError: links that form a loop
+    except (OSError, RuntimeError):  # RuntimeError: links that form a loop, or no home
         return None
     return folder if os.access(folder, os.R_OK | os.W_OK | os.X_OK) else None

@@ -92,6 +92,15 @@ def test_a_link_counts_as_the_folder_that_it_leads_to(places, tmp_path):
         assert cache_folder().parent == temporary
 
 
+def test_without_a_home_there_is_a_folder_all_the_same(places, monkeypatch):
+    def no_home(_):
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    monkeypatch.setattr("pathlib.Path.expanduser", lambda path: path if path.is_absolute() else no_home(path))
+    assert cache_folder() == places[1] / f"mimopilot-{os.geteuid()}"
+
+
 def load(path):
     specification = importlib.util.spec_from_file_location("functions", path)
     module = importlib.util.module_from_spec(specification)
