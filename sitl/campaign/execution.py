@@ -67,7 +67,10 @@ def run_campaign(plan: Plan, folder: Path, workers: int, scheduler: str | None =
             missing = _missing(plan, parts)
             if missing:
                 _fly(plan, parts, missing, workers, scheduler)
-            _merge(plan, parts, results)
+            try:
+                _merge(plan, parts, results)
+            except _WrongPartError as error:  # whole a moment ago
+                raise SitlError(f"{parts}: {error}; {AGAIN}", exit_code=1) from error
         shutil.rmtree(parts, ignore_errors=True)
     return results
 

@@ -118,7 +118,7 @@ def runs_of(plan: Plan, chunk: int) -> range:
 def label(plan: Plan, chunk: int) -> str:
     """What a part is: of which campaign, and of which of its runs."""
     runs = runs_of(plan, chunk)
-    return f"{plan.sha256()} runs {runs[0]} to {runs[-1]}"
+    return f"{plan.digest} runs {runs[0]} to {runs[-1]}"
 
 
 def fly_chunk(files: dict[str, str], chunk: int) -> bytes:

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,7 +88,8 @@ class Plan:
     gains: dict[str, Gains]
     scenarios: list[Scenario]
 
-    def sha256(self) -> str:
+    @cached_property
+    def digest(self) -> str:
         """Hash of all that decides what the flights are."""
         return sha256(json.dumps(self.files, sort_keys=True))
 

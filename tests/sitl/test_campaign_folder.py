@@ -106,7 +106,7 @@ def test_damage_between_the_flight_and_the_table_is_told(flown, tmp_path, monkey
     folder = begin(plan, tmp_path, dict(enumerate(parts)))
     (folder / PARTS / "0000002.part").write_bytes(parts[2][:-1])
     monkeypatch.setattr("sitl.campaign.execution._missing", lambda *_: [])
-    with pytest.raises(SitlError, match=r"0000002\.part is damaged"):
+    with pytest.raises(SitlError, match=r"0000002\.part is damaged; give the same command again"):
         run_campaign(plan, folder, 1)
 
 
