@@ -17,7 +17,9 @@ def register(app: typer.Typer) -> None:
 
 def generate(
     gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
-    out: Annotated[Path, typer.Option(help="Folder to write to; changed files are replaced, nothing is deleted.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder to write to; changed files are replaced, nothing is deleted, no link followed.")
+    ],
     target: Annotated[
         str,
         typer.Option(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import re
 import tempfile
@@ -18,7 +17,8 @@ from codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
 from codegen.parameters import to_array
 from codegen.render import TEMPLATES, interface_hash, render, write_tree
 from codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
-from tuning.files import sha256
+from tuning.cache import cache_folder
+from tuning.files import inside, seal, sha256, unseal, write_atomically
 from tuning.gains import Gains
 
 HEADER = TEMPLATES / "native" / "mimo_pid_native.h"
@@ -38,20 +38,6 @@ LAYOUT = (
     OUTPUT.fields["fault"][1],  # type: ignore[index]
     STATE.fields["integral"][1],  # type: ignore[index]
 )
-
-
-def cache_folder() -> Path:
-    """Where compiled libraries are kept between runs: $XDG_CACHE_HOME/mimopilot, or a temporary folder."""
-    base = os.environ.get("XDG_CACHE_HOME")
-    folder = (Path(base) if base else Path.home() / ".cache") / "mimopilot"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:
-        folder = Path(tempfile.gettempdir()) / f"mimopilot-{os.getuid()}"
-        folder.mkdir(mode=0o700, exist_ok=True)
-        return folder
 
 
 def build_native(gains: Gains, folder: Path | None = None) -> Path:
@@ -84,20 +70,25 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
     name = f"libmimo_pid-{key}.so"
     if folder is not None:
         write_tree(files, folder)
-        return _compile(compiler, folder, folder / "build" / name)
-    library = cache_folder() / name
-    if library.is_file():
-        return library
-    with tempfile.TemporaryDirectory() as scratch:  # of its own: other processes may be building the same
-        write_tree(files, Path(scratch))
-        return _compile(compiler, Path(scratch), library)
-
-
-def _compile(compiler: str, tree: Path, library: Path) -> Path:
-    if not library.is_file():
-        library.parent.mkdir(exist_ok=True)
-        compile_shared(compiler, [tree / name for name in SOURCES], library)
+        library = inside(folder, f"build/{name}")
+    else:
+        library = cache_folder() / name
+    if not _whole(library):
+        with tempfile.TemporaryDirectory() as scratch:  # of its own: other processes may be building the same
+            tree = Path(scratch)
+            write_tree(files, tree)
+            compile_shared(compiler, [tree / source for source in SOURCES], tree / name)
+            write_atomically(library, seal((tree / name).read_bytes(), name))  # the loader ignores what is appended
     return library
+
+
+def _whole(library: Path) -> bool:
+    """Whether a library is as it was written: a damaged one ends the process, or does anything else."""
+    try:
+        found = unseal(library.read_bytes())
+    except OSError:
+        return False
+    return found is not None and found[1] == library.name
 
 
 def _declarations() -> str:

@@ -18,7 +18,7 @@ from codegen.parameters import EXCITATION, PARAMETERS, check_names, check_ranges
 from codegen.px4 import APIS, entries
 from codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
 from codegen.vectors import emitted_vectors
-from tuning.files import sha256, write_atomically
+from tuning.files import inside, read_text, sha256, write_atomically
 from tuning.gains import Gains, gains_to_toml
 
 TEMPLATES = Path(__file__).resolve().parent.parent / "firmware_templates"
@@ -165,22 +165,23 @@ def write_tree(files: dict[str, str], folder: Path, force: bool = False) -> list
 
     Raises
     ------
+    OSError
+        When `folder` is no folder, or a link lies below it where a file or folder of the tree belongs.
     CodegenError
-        When `folder` is a file, a file's place is taken or cannot be written, or, without `force`, something
-        that mimopilot did not generate is there. Nothing has been written then.
+        When a file's place is taken or cannot be written, or, without `force`, something that mimopilot did not
+        generate is there. In all cases nothing has been written.
     """
-    if folder.exists() and not folder.is_dir():
-        raise CodegenError(f"{folder}: is a file; give --out a folder")
+    paths = [inside(folder, name) for name in files]
     if not force:
         _check_ours(files, folder)
-    for name in files:
-        path = folder / name
-        if path.is_dir():
-            raise CodegenError(f"{path}: is a folder, expected a file or nothing; give --out another folder")
+    for path in paths:
+        if path.exists() and not path.is_file():
+            kind = "a folder" if path.is_dir() else "a device or a pipe"
+            raise CodegenError(f"{path}: is {kind}, expected a file or nothing; give --out another folder")
         parent = next(parent for parent in path.parents if parent.exists())
         if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
             raise CodegenError(f"{parent}: cannot be written to; give --out a folder that can")
-    return [name for name, content in files.items() if write_atomically(folder / name, content)]
+    return [name for path, (name, content) in zip(paths, files.items(), strict=True) if write_atomically(path, content)]
 
 
 def _check_ours(files: dict[str, str], folder: Path) -> None:
@@ -189,9 +190,9 @@ def _check_ours(files: dict[str, str], folder: Path) -> None:
         return
     hint = "give --out another folder, or --force to write all the same"
     try:
-        manifest = json.loads((folder / MANIFEST).read_text())
+        manifest = json.loads(read_text(folder / MANIFEST, "manifest"))
         ours = {MANIFEST, *manifest["files"]} if manifest["generator"].startswith("mimopilot ") else set()
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         ours = set()
     if not ours:
         raise CodegenError(f"{folder}: holds files that mimopilot did not generate; {hint}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import tomllib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +10,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from sitl.allocation import Allocation, make_allocation, moment_scale
 from sitl.errors import SitlError
 from sitl.plant import GRAVITY, PlantParameters, checked_inertia
+from tuning.files import read_text
 from tuning.gains import Gains, load_gains
+from tuning.toml import checked, parse_toml
 
 MAX_HOVER = 0.9  # share of the thrust that may carry the weight
 FOLDER = Path(__file__).resolve().parent / "airframes"
@@ -193,10 +195,11 @@ def _check_flies(airframe: Airframe) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """An airframe and where its file is: what commands work with."""
+    """An airframe, where its file is and what stands in it: what commands work with."""
 
     airframe: Airframe
     path: Path
+    text: str
 
     def default_gains(self) -> Gains:
         """The gains that the airframe's file names: a file beside it, else one that comes with mimopilot."""
@@ -228,35 +231,28 @@ def load_airframe(name_or_path: str) -> Vehicle:
     Raises
     ------
     SitlError
-        When the name is unknown (listing the known ones) or the file is not a valid airframe.
+        When the name is unknown (listing the known ones) or the vehicle cannot fly.
+    TuningError
+        When the file cannot be read, is not TOML, or an entry is unknown or impossible.
     """
     path = FOLDER / f"{name_or_path}.toml"
     if name_or_path not in known_airframes():
         path = Path(name_or_path)
-        if not path.is_file():
+        if not os.path.lexists(path):
             raise SitlError(
                 f"unknown airframe {name_or_path!r}: neither a file nor one of {', '.join(known_airframes())}"
             )
-    try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SitlError(f"{path}: not an airframe file: {error}") from error
-    return Vehicle(airframe_from_toml(text, str(path)), path)
+    text = read_text(path, "airframe file")
+    return Vehicle(airframe_from_toml(text, str(path)), path, text)
 
 
 def airframe_from_toml(text: str, where: str) -> Airframe:
     """Parse the text of an airframe's file; `where` names it in messages. See `load_airframe`."""
+    airframe = checked(Airframe, parse_toml(text, where), where)
     try:
-        airframe = Airframe.model_validate(tomllib.loads(text))
         checked_inertia(airframe.inertia)
         airframe.allocation()
         _check_flies(airframe)
-    except tomllib.TOMLDecodeError as error:
-        raise SitlError(f"{where}: not an airframe file: {error}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise SitlError(f"{where}: {place}: {first['msg']}, got {first.get('input')!r}") from error
     except SitlError as error:
         raise SitlError(f"{where}: {error}") from error
     return airframe

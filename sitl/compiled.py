@@ -1,30 +1,15 @@
-"""The decorator for functions that numba compiles, and where their machine code is kept."""
+"""What the bench needs of numba: the decorators, and calls of the generated C++ from compiled code."""
 
 from __future__ import annotations
 
-import hashlib
-from pathlib import Path
 from typing import Any
 
 import numba
 from llvmlite import ir
-from numba.core import config, types
+from numba.core import types
 from numba.extending import intrinsic
 
-from codegen.native import cache_folder
-
-
-def _sources_hash() -> str:
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-# numba's own cache does not notice that a *called* function changed: keep one folder for each state of the room.
-config.CACHE_DIR = str(cache_folder() / f"numba-{_sources_hash()}")
-
-compiled = numba.njit(cache=True, error_model="numpy")
+from tuning.compiled import compiled as compiled
 
 #: For small functions in the innermost loops: LLVM does not inline all of them by itself, which costs a factor of 2.5.
 inlined = numba.njit(error_model="numpy", inline="always")

@@ -16,6 +16,7 @@ from sitl.loop import Flight, fly
 from sitl.plant import GRAVITY
 from sitl.recorder import save_flight
 from sitl.scenario import excitation_flight
+from tuning.files import inside
 from tuning.gains import Gains
 from tuning.parallel import processes, run_all
 
@@ -109,7 +110,7 @@ def repeat_experiment(
 
 def log_name(folder: Path, seed: int) -> Path:
     """Where the log of a seed lies."""
-    return folder / f"flight-{seed:04d}.ulg"
+    return inside(folder, f"flight-{seed:04d}.ulg")
 
 
 def _record(plan: ExperimentPlan, folder: Path, seed: int) -> float | None:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from sitl.airframe import Vector
 from sitl.errors import SitlError
 from tuning.gains import AXES
+from tuning.toml import complaint
 
 NOTATION = re.compile(r"([a-z-]+)(?::([^=@]+))?(?:=([^@]+))?@([^+]+)(?:\+(.+))?")
 FOR_EVER = 1 << 62  # periods
@@ -231,14 +232,6 @@ def make_fault(table: dict[str, Any], where: str) -> Fault:
         return Fault.model_validate(table)
     except ValidationError as error:
         raise SitlError(f"{where}: {complaint(error)}") from error
-
-
-def complaint(error: ValidationError) -> str:
-    """The first thing that pydantic found wrong, in one line."""
-    first = error.errors()[0]
-    field = ".".join(str(part) for part in first["loc"])
-    message = first["msg"].removeprefix("Value error, ")
-    return f"{field}: {message}, got {first.get('input')!r}" if field else message
 
 
 def parse_fault(text: str) -> Fault:

@@ -17,18 +17,18 @@ A scenario file names a manoeuvre and its faults:
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from sitl.errors import SitlError
-from sitl.faults import Fault, complaint, make_fault
+from sitl.faults import Fault, make_fault
 from tuning.excitation import hold_from_bandwidth, prbs
+from tuning.toml import checked, read_toml
 
 AXES = ("roll", "pitch")
 LEAD = 1.0  # s of hover before a manoeuvre
@@ -172,20 +172,14 @@ def read_scenario(path: Path) -> tuple[Task, tuple[Fault, ...]]:
 
     Raises
     ------
-    SitlError
+    TuningError, SitlError
         When the file is not TOML, or an entry is unknown or wrong.
     """
-    try:
-        table = tomllib.loads(path.read_text())
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise SitlError(f"{path}: not a TOML file: {error}") from error
+    table = read_toml(path, "scenario file")
     faults = table.pop("fault", [])
     if not (isinstance(faults, list) and all(isinstance(fault, dict) for fault in faults)):
         raise SitlError(f"{path}: fault: expected [[fault]] tables")
-    try:
-        task = Task.model_validate(table)
-    except ValidationError as error:
-        raise SitlError(f"{path}: {complaint(error)}") from error
+    task = checked(Task, table, str(path))
     return task, tuple(make_fault(fault, f"{path}: fault {i + 1}") for i, fault in enumerate(faults))
 
 

@@ -9,7 +9,20 @@ import pytest
 TOP = Path(__file__).resolve().parents[1]
 FORBIDDEN = {"tuning": {"codegen", "sitl"}, "codegen": {"sitl"}}
 #: What the bench may know of tuning, outside of its studies.
-BENCH_MAY_USE = {"drawing", "errors", "excitation", "files", "flown", "gains", "output", "parallel", "reference"}
+BENCH_MAY_USE = {
+    "cache",
+    "compiled",
+    "drawing",
+    "errors",
+    "excitation",
+    "files",
+    "flown",
+    "gains",
+    "output",
+    "parallel",
+    "reference",
+    "toml",
+}
 
 
 def imports(path):

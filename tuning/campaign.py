@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tuning.cascade import tune
 from tuning.drawing import STYLES, svg
 from tuning.errors import TuningError
-from tuning.files import write_atomically
+from tuning.files import inside, write_atomically
 from tuning.gains import MATRICES, Gains
 from tuning.logs.columns import Columns
 from tuning.logs.reader import read_log
@@ -162,6 +162,8 @@ def tune_all(
     """
     from rich.progress import Progress
 
+    summary, figure = inside(out, "summary.json"), inside(out, "gains.svg")
+    inside(out, "gains")
     outcomes: dict[Path, Outcome] = {}
     with processes(workers) as executor, Progress(console=progress_console(), transient=True) as bar:
         task = bar.add_task("tuning", total=len(logs))
@@ -170,14 +172,14 @@ def tune_all(
             outcomes[log] = outcome
             bar.advance(task)
             if outcome.gains is not None:
-                outcome.gains.save(out / "gains" / f"{log.stem}.gains.toml")
+                outcome.gains.save(inside(out, f"gains/{log.stem}.gains.toml"))
 
         run_all(executor, 2 * workers, partial(_tune, spec, columns), logs, keep)
     found = Repeated(tuple(outcomes[log] for log in logs))
     if not found.tuned:
         raise TuningError(f"all {len(logs)} logs were refused, the first: {found.outcomes[0].refusal}")
-    write_atomically(out / "summary.json", json_text(found.as_json()))
-    write_atomically(out / "gains.svg", svg(gains_figure(found), "gains"))
+    write_atomically(summary, json_text(found.as_json()))
+    write_atomically(figure, svg(gains_figure(found), "gains"))
     return found
 
 

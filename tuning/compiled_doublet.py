@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from tuning.compiled import compiled
 
 Signal = NDArray[np.float64]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def allocated(part, rest, commands):  # type: ignore[no-untyped-def]
     """Commands `rest` + share `part` within 0..1, the collective lowered where that makes room; fills `commands` (n,)
     and returns the largest share for which a collective that is not higher does it; up to 1 is given.
@@ -30,7 +31,7 @@ def allocated(part, rest, commands):  # type: ignore[no-untyped-def]
     return share
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def kept(room, soft):  # type: ignore[no-untyped-def]
     """Share of the integral's growth that anti-windup lets pass, `room` before the limit: 1 or 0, or in between."""
     if soft > 0.0:
@@ -38,7 +39,7 @@ def kept(room, soft):  # type: ignore[no-untyped-def]
     return 1.0 if room >= 0.0 else 0.0
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def fly(A, B, C, trim, motors, setpoint, gains, limits, Ts, pole, soft, angles, moments):  # type: ignore[no-untyped-def]
     """The flown difference equation, axis by axis and gain set by gain set, without noise.
 

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from datetime import date, time
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +20,7 @@ from numpy.typing import NDArray
 
 from tuning.errors import TuningError
 from tuning.files import sha256, write_atomically
+from tuning.toml import parse_toml, read_toml, shown, shown_text, toml_entries, toml_value
 
 SCHEMA = 1
 PARAMETER_PREFIX = "MIMO_"
@@ -295,22 +294,18 @@ def load_gains(path: Path) -> Gains:
     TuningError
         When the file is missing, is not TOML, lacks a matrix, or holds a number that is not finite.
     """
-    try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise TuningError(f"{path}: cannot read the gains file: {error}") from error
-    return gains_from_toml(text, str(path))
+    return _gains_from_table(read_toml(path, "gains file"), str(path))
 
 
 def gains_from_toml(text: str, where: str) -> Gains:
     """Parse the text of a gains file; `where` names it in messages. See `load_gains`."""
-    try:
-        table = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise TuningError(f"{where}: not a TOML file: {error}") from error
+    return _gains_from_table(parse_toml(text, where), where)
+
+
+def _gains_from_table(table: dict[str, Any], where: str) -> Gains:
     if table.get("schema") != SCHEMA:
         raise TuningError(
-            f"{where}: schema: got {table.get('schema')!r}, expected {SCHEMA}; not a mimopilot gains file?"
+            f"{where}: schema: got {shown(table.get('schema'))}, expected {SCHEMA}; not a mimopilot gains file?"
         )
     known = {
         "schema",
@@ -324,10 +319,10 @@ def gains_from_toml(text: str, where: str) -> Gains:
         "provenance",
     }
     for key in sorted(set(table) - known):
-        raise TuningError(f"{where}: {key}: unknown entry; known: {', '.join(sorted(known))}")
+        raise TuningError(f"{where}: {shown_text(key)}: unknown entry; known: {', '.join(sorted(known))}")
     for name in ("certificate", "provenance"):
         if not isinstance(table.get(name, {}), dict):
-            raise TuningError(f"{where}: {name}: got {table[name]!r}, expected a table")
+            raise TuningError(f"{where}: {name}: got {shown(table[name])}, expected a table")
     try:
         scale = _get(table, "moment_scale", "")
         return Gains(
@@ -354,7 +349,7 @@ def _get(table: Any, key: str, section: str) -> Any:
 def _number(table: Any, key: str, section: str) -> float:
     value = _get(table, key, section)
     if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TuningError(f"{f'{section}.' if section else ''}{key}: got {value!r}, expected a number")
+        raise TuningError(f"{f'{section}.' if section else ''}{key}: got {shown(value)}, expected a number")
     return float(value)
 
 
@@ -367,7 +362,7 @@ def _matrix(table: Any, key: str) -> Matrix:
         and all(isinstance(v, int | float) and not isinstance(v, bool) for row in rows for v in row)
     )
     if not well_formed:
-        raise TuningError(f"roll_pitch.{key}: got {rows!r}, expected a 2x2 list of numbers, roll then pitch")
+        raise TuningError(f"roll_pitch.{key}: got {shown(rows)}, expected a 2x2 list of numbers, roll then pitch")
     return np.array(rows, dtype=np.float64)
 
 
@@ -377,7 +372,7 @@ def _triple(value: Any, name: str) -> Triple:
         or len(value) != 3
         or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
     ):
-        raise TuningError(f"{name}: got {value!r}, expected three numbers: roll, pitch, yaw")
+        raise TuningError(f"{name}: got {shown(value)}, expected three numbers: roll, pitch, yaw")
     return (float(value[0]), float(value[1]), float(value[2]))
 
 
@@ -408,24 +403,5 @@ def gains_to_toml(gains: Gains) -> str:
     ]
     for name in ("certificate", "provenance"):
         if getattr(gains, name):
-            entries = (f"{key} = {toml_value(value)}" for key, value in getattr(gains, name).items())
-            lines += ["", f"[{name}]", *entries]
+            lines += ["", f"[{name}]", *toml_entries(getattr(gains, name))]
     return "\n".join(lines) + "\n"
-
-
-def toml_value(value: Any) -> str:
-    """A plain value (bool, number, text, list, mapping) as TOML text on one line."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, float | np.floating):
-        return repr(float(value))
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {toml_value(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, date | time):
-        return value.isoformat()
-    return "[" + ", ".join(toml_value(item) for item in value) + "]"

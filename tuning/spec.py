@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from tuning.errors import TuningError
 from tuning.reference import ReferenceModel, second_order
 from tuning.thresholds import DEFAULT_THRESHOLDS, Thresholds
+from tuning.toml import checked, read_toml
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -138,19 +138,9 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
     TuningError
         When the file cannot be read, is not TOML, or holds an unknown or impossible entry.
     """
-    table: dict[str, object] = {}
-    if path is not None:
-        try:
-            table = tomllib.loads(path.read_text())
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise TuningError(f"{path}: cannot read the specification: {error}") from error
+    table = read_toml(path, "specification") if path is not None else {}
     table |= {name: value for name, value in overrides.items() if value is not None}
-    try:
-        return TuningSpec.model_validate(table)
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise TuningError(f"{path or 'specification'}: {where}: {first['msg']}, got {first.get('input')!r}") from error
+    return checked(TuningSpec, table, str(path or "specification"))
 
 
 def parse_model(text: str) -> tuple[float, float, int]:

@@ -57,7 +57,7 @@ def campaign(
     from sitl.airframe import load_airframe
     from sitl.campaign.execution import run_campaign
     from sitl.campaign.figures import parse_map
-    from sitl.campaign.plan import make_plan
+    from sitl.campaign.plan import SUMMARY, make_plan
     from sitl.campaign.report import INTERVALS, write_campaign_report
     from sitl.campaign.summary import (
         FIGURE_COLUMNS,
@@ -69,7 +69,7 @@ def campaign(
         worst_rows,
     )
     from sitl.campaign.variation import read_variation
-    from tuning.files import write_atomically
+    from tuning.files import inside, write_atomically
     from tuning.output import json_text, print_json, print_table
     from tuning.parallel import cores
 
@@ -85,7 +85,7 @@ def campaign(
     over = parse_map(plan, survival_map) if survival_map else None
     results = Results(plan, run_campaign(plan, out, workers or cores(), scheduler))
     summary = results.summarise()
-    write_atomically(out / "summary.json", json_text(summary.as_json(".")))
+    write_atomically(inside(out, SUMMARY), json_text(summary.as_json(".")))
     report = write_campaign_report(results, summary, over)
     if as_json:
         print_json({"results": str(results.path), "report": str(report), **summary.as_json(str(out))})

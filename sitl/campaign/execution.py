@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor
 from concurrent.futures.process import BrokenProcessPool
@@ -15,14 +17,15 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from sitl.campaign.flights import CHUNK, chunks, fly_chunk, stand_of
-from sitl.campaign.plan import PARTS, RESULTS, Plan, settle
+from sitl.campaign.flights import CHUNK, chunks, fly_chunk, label, stand_of
+from sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, Plan, settle
 from sitl.errors import SitlError
-from tuning.files import write_atomically
+from tuning.files import inside, unseal, write_atomically
 from tuning.output import progress_console
 from tuning.parallel import processes, run_all
 
 ROW_GROUP = 1 << 14  # rows: what is in memory at a time
+SHOWN = 3  # parts that one message names
 AGAIN = "give the same command again to go on"
 
 
@@ -48,24 +51,83 @@ def run_campaign(plan: Plan, folder: Path, workers: int, scheduler: str | None =
     Raises
     ------
     SitlError
-        When the folder holds another campaign, when it was interrupted, or when workers are lost.
+        When the folder holds another campaign, or one is being flown into it, when it was interrupted, or when
+        workers are lost.
+    OSError
+        When a link lies where one of its files belongs, or a file cannot be written.
     """
+    for name in (RESULTS, PARTS, SUMMARY, REPORT, *plan.files):
+        inside(folder, name)
     results, parts = folder / RESULTS, folder / PARTS
     if not results.is_file():  # compiles before workers are forked, and finds what is wrong before the folder is taken
         list(stand_of(tuple(plan.files.items())).flights(0))
-    settle(plan, folder)
-    if not results.is_file():
-        parts.mkdir(exist_ok=True)
-        missing = [chunk for chunk in range(chunks(plan)) if not _part(parts, chunk).is_file()]
-        if missing:
-            _fly(plan, parts, missing, workers, scheduler)
-        _merge(parts, chunks(plan), results)
-    shutil.rmtree(parts, ignore_errors=True)
+    with _alone(folder):
+        settle(plan, folder)
+        if not results.is_file():
+            missing = _missing(plan, parts)
+            if missing:
+                _fly(plan, parts, missing, workers, scheduler)
+            try:
+                _merge(plan, parts, results)
+            except _WrongPartError as error:  # whole a moment ago
+                raise SitlError(f"{parts}: {error}; {AGAIN}", exit_code=1) from error
+        shutil.rmtree(parts, ignore_errors=True)
     return results
 
 
+@contextmanager
+def _alone(folder: Path) -> Iterator[None]:
+    """Keep other campaigns out of a folder; the lock ends with this process, however that ends."""
+    path = inside(folder, LOCK)
+    folder.mkdir(parents=True, exist_ok=True)
+    with path.open("ab") as stream:
+        try:
+            fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # of this process alone, not of the workers it forks
+        except (BlockingIOError, PermissionError):
+            raise SitlError(
+                f"{folder}: another process is flying a campaign into it; wait until it ends, or give another --out"
+            ) from None
+        yield
+
+
 def _part(parts: Path, chunk: int) -> Path:
-    return parts / f"{chunk:07d}.parquet"
+    return inside(parts, f"{chunk:07d}.part")
+
+
+def _missing(plan: Plan, parts: Path) -> list[int]:
+    """Chunks that are to be flown: their parts are not there, or not what they should be, which is told."""
+    missing, wrong = [], []
+    for chunk in range(chunks(plan)):
+        if not _part(parts, chunk).is_file():
+            missing.append(chunk)
+            continue
+        try:
+            _table(plan, parts, chunk)
+        except _WrongPartError as error:
+            missing.append(chunk)
+            wrong.append(str(error))
+    if wrong:
+        more = f" and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
+        print(f"mimopilot: warning: {parts}: flown again: {'; '.join(wrong[:SHOWN])}{more}", file=sys.stderr)
+    return missing
+
+
+class _WrongPartError(SitlError):
+    """A part that cannot be used."""
+
+
+def _table(plan: Plan, parts: Path, chunk: int) -> pa.BufferReader:
+    """The Parquet file in a part, checked: whole, of this campaign, and of the runs of its chunk."""
+    path, wanted = _part(parts, chunk), label(plan, chunk)
+    found = unseal(path.read_bytes())
+    if found is None:
+        raise _WrongPartError(f"{path.name} is damaged")
+    table, is_of = found
+    if is_of != wanted:
+        campaign, _, runs = is_of.partition(" ")
+        whose = f"is of {runs}" if wanted.startswith(campaign) else "is of another campaign"
+        raise _WrongPartError(f"{path.name} {whose}")
+    return pa.BufferReader(table)
 
 
 def _fly(plan: Plan, parts: Path, missing: list[int], workers: int, scheduler: str | None) -> None:
@@ -136,14 +198,15 @@ def _progress(plan: Plan, flown: int) -> Iterator[Callable[[int], Any]]:
         yield advance
 
 
-def _merge(parts: Path, count: int, results: Path) -> None:
+def _merge(plan: Plan, parts: Path, results: Path) -> None:
     """All parts as one file, in order; only one row group is in memory at a time."""
-    whole = parts / RESULTS
-    schema = pq.read_schema(_part(parts, 0))
-    with pq.ParquetWriter(whole, schema, compression="zstd") as writer:
-        a_group = max(1, ROW_GROUP // pq.read_metadata(_part(parts, 0)).num_rows)
+    whole, count = inside(parts, RESULTS), chunks(plan)
+    begin = pq.read_table(_table(plan, parts, 0))
+    schema, a_group = begin.schema, max(1, ROW_GROUP // begin.num_rows)
+    with pq.ParquetWriter(whole, schema, compression="zstd", write_page_checksum=True) as writer:
         for first in range(0, count, a_group):
-            tables = [pq.read_table(_part(parts, i), schema=schema) for i in range(first, min(first + a_group, count))]
+            chosen = range(first, min(first + a_group, count))
+            tables = [pq.read_table(_table(plan, parts, chunk), schema=schema) for chunk in chosen]
             writer.write_table(pa.concat_tables(tables).unify_dictionaries().combine_chunks())
     with whole.open("rb") as stream:
         os.fsync(stream.fileno())

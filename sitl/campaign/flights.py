@@ -22,6 +22,7 @@ from sitl.injection import Injection
 from sitl.loop import TRUTH, Flight, Simulator, first_loss
 from sitl.metrics import Performance, performance
 from sitl.models import reference_models
+from tuning.files import seal
 
 CHUNK = 64  # runs: what is lost of a worker that dies
 FIGURES = tuple(field.name for field in fields(Performance))
@@ -109,6 +110,17 @@ def chunks(plan: Plan) -> int:
     return -(-plan.description.runs // CHUNK)
 
 
+def runs_of(plan: Plan, chunk: int) -> range:
+    """The runs of a chunk."""
+    return range(chunk * CHUNK, min((chunk + 1) * CHUNK, plan.description.runs))
+
+
+def label(plan: Plan, chunk: int) -> str:
+    """What a part is: of which campaign, and of which of its runs."""
+    runs = runs_of(plan, chunk)
+    return f"{plan.digest} runs {runs[0]} to {runs[-1]}"
+
+
 def fly_chunk(files: dict[str, str], chunk: int) -> bytes:
     """Fly the runs of a chunk.
 
@@ -122,7 +134,7 @@ def fly_chunk(files: dict[str, str], chunk: int) -> bytes:
     Returns
     -------
     bytes
-        A Parquet file: a row for each flight, by run, gain set and axis.
+        A Parquet file, a row for each flight, by run, gain set and axis; sealed under `label`.
 
     Raises
     ------
@@ -134,12 +146,10 @@ def fly_chunk(files: dict[str, str], chunk: int) -> bytes:
         version = stand.plan.description.mimopilot
         if version != generator_version():
             raise SitlError(f"a worker has mimopilot {generator_version()}, the campaign is one of {version}")
-        first = chunk * CHUNK
-        last = min(first + CHUNK, stand.plan.description.runs)
-        rows = [row for run in range(first, last) for row, _ in stand.flights(run)]
+        rows = [row for run in runs_of(stand.plan, chunk) for row, _ in stand.flights(run)]
     stream = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(rows, schema(rows[0])), stream)
-    return stream.getvalue()
+    return seal(stream.getvalue(), label(stand.plan, chunk))
 
 
 def schema(row: dict[str, Any]) -> pa.Schema:

@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
-import tomllib
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
 import pyarrow as pa
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from codegen.render import generator_version
 from sitl.airframe import Airframe, Vehicle, airframe_from_toml
 from sitl.campaign.variation import Variation
 from sitl.errors import SitlError
-from sitl.faults import complaint, parse_fault
+from sitl.faults import parse_fault
 from sitl.scenario import Scenario, make_scenario
-from tuning.files import write_atomically
-from tuning.gains import Gains, gains_from_toml, gains_to_toml, toml_value
+from tuning.files import inside, read_text, sha256, write_atomically
+from tuning.gains import Gains, gains_from_toml, gains_to_toml
+from tuning.toml import checked, parse_toml, shown, toml_entries
 
 SPEC, AIRFRAME = "spec.toml", "airframe.toml"
-RESULTS, PARTS = "results.parquet", "parts"
+RESULTS, PARTS, LOCK = "results.parquet", "parts", "campaign.lock"
+SUMMARY, REPORT = "summary.json", "report.html"
 HEAD = "# A campaign of mimopilot. Run k is drawn from the seed and k alone; every gain set flies the same runs."
 MAX_RUNS = 100_000_000
 
@@ -85,6 +88,11 @@ class Plan:
     gains: dict[str, Gains]
     scenarios: list[Scenario]
 
+    @cached_property
+    def digest(self) -> str:
+        """Hash of all that decides what the flights are."""
+        return sha256(json.dumps(self.files, sort_keys=True))
+
 
 def make_plan(vehicle: Vehicle, gains: dict[str, Gains], **entries: Any) -> Plan:
     """A plan from its parts.
@@ -105,9 +113,8 @@ def make_plan(vehicle: Vehicle, gains: dict[str, Gains], **entries: Any) -> Plan
     """
     entries = {"mimopilot": generator_version(), **entries, "gains": list(gains)}
     vary = entries.pop("vary", {})
-    lines = [HEAD, *(f"{name} = {toml_value(value)}" for name, value in entries.items())]
-    lines += ["", "[vary]", *(f"{name} = {toml_value(value)}" for name, value in vary.items())]
-    files = {SPEC: "\n".join(lines) + "\n", AIRFRAME: vehicle.path.read_text()}
+    lines = [HEAD, *toml_entries(entries), "", "[vary]", *toml_entries(vary)]
+    files = {SPEC: "\n".join(lines) + "\n", AIRFRAME: vehicle.text}
     return plan_from_files(files | {gains_file(name): gains_to_toml(one) for name, one in gains.items()})
 
 
@@ -122,19 +129,17 @@ def plan_from_files(files: dict[str, str], where: str = "campaign") -> Plan:
     Raises
     ------
     SitlError
-        When a file is missing or wrong; TuningError for a gains file.
+        When a file is missing, or what it says cannot be flown.
+    TuningError
+        When a file is not TOML, or an entry is unknown or impossible.
     """
     try:
-        description = Description.model_validate(tomllib.loads(files[SPEC]))
+        description = checked(Description, parse_toml(files[SPEC], f"{where}/{SPEC}"), f"{where}/{SPEC}")
         airframe = airframe_from_toml(files[AIRFRAME], f"{where}/{AIRFRAME}")
         names = description.gains
         gains = {name: gains_from_toml(files[gains_file(name)], f"{where}/{gains_file(name)}") for name in names}
     except KeyError as error:
         raise SitlError(f"{where}: {error.args[0]} is missing") from error
-    except tomllib.TOMLDecodeError as error:
-        raise SitlError(f"{where}/{SPEC}: not a TOML file: {error}") from error
-    except ValidationError as error:
-        raise SitlError(f"{where}/{SPEC}: {complaint(error)}") from error
     periods = {one.Ts for one in gains.values()}
     if len(periods) > 1:
         raise SitlError(f"gains: the sets are for different control periods, {sorted(periods)} s; fly each by itself")
@@ -149,13 +154,13 @@ def read_files(folder: Path) -> dict[str, str]:
     """Texts of the campaign in a folder, by name; empty when there is none."""
     if not (folder / SPEC).is_file():
         return {}
-    spec = (folder / SPEC).read_text()
-    try:
-        names = [str(name) for name in tomllib.loads(spec).get("gains", ())]
-    except tomllib.TOMLDecodeError:
-        names = []
-    others = [AIRFRAME, *map(gains_file, names)]
-    return {SPEC: spec, **{name: (folder / name).read_text() for name in others if (folder / name).is_file()}}
+    texts = {SPEC: read_text(folder / SPEC, "campaign's specification")}
+    listed = parse_toml(texts[SPEC], str(folder / SPEC)).get("gains")
+    names = [name for name in listed if isinstance(name, str)] if isinstance(listed, list) else []
+    for name in (AIRFRAME, *map(gains_file, names)):
+        if (folder / name).exists():
+            texts[name] = read_text(folder / name, "campaign's file")
+    return texts
 
 
 def settle(plan: Plan, folder: Path) -> None:
@@ -165,6 +170,10 @@ def settle(plan: Plan, folder: Path) -> None:
     ------
     SitlError
         When the folder holds another campaign: names the first difference; or results of an unknown one.
+    TuningError
+        When a file of the campaign that it holds cannot be read.
+    OSError
+        When a link lies on the way to one of the files, or one cannot be written.
     """
     there = read_files(folder)
     if not there and ((folder / RESULTS).exists() or (folder / PARTS).exists()):
@@ -175,17 +184,14 @@ def settle(plan: Plan, folder: Path) -> None:
             "arguments to go on with it"
         )
     for name, text in sorted(plan.files.items(), key=lambda item: item[0] == SPEC):  # the spec last: it counts
-        write_atomically(folder / name, text)
+        write_atomically(inside(folder, name), text)
 
 
 def _difference(there: dict[str, str], here: dict[str, str]) -> str:
-    try:
-        old, new = tomllib.loads(there[SPEC]), tomllib.loads(here[SPEC])
-    except tomllib.TOMLDecodeError:
-        return f"its {SPEC} is not TOML"
+    old, new = parse_toml(there[SPEC], SPEC), parse_toml(here[SPEC], SPEC)
     for name in [*new, *old]:
         if old.get(name) != new.get(name):
-            return f"{name}: {old.get(name)!r} there, {new.get(name)!r} here"
+            return f"{name}: {shown(old.get(name))} there, {shown(new.get(name))} here"
     names = [name for name in [*here, *there] if here.get(name) != there.get(name)]
     return f"{names[0]} differs"
 
@@ -195,5 +201,7 @@ def reading(results: Path) -> Iterator[None]:
     """A table of results that is damaged is told in one line."""
     try:
         yield
-    except pa.ArrowInvalid as error:
+    except (pa.ArrowException, ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno:  # of the system: not the fault of what is in the file
+            raise
         raise SitlError(f"{results}: damaged; remove it and give the campaign's command again") from error

@@ -80,7 +80,7 @@ def _flown(results: Path, run: int, gains: str, axis: str) -> dict[str, Any] | N
         return None
     chosen = (pc.field("run") == run) & (pc.field("gains") == gains) & (pc.field("axis") == axis)
     with reading(results):
-        (row,) = pq.read_table(results, filters=chosen).to_pylist()
+        (row,) = pq.read_table(results, filters=chosen, page_checksum_verification=True).to_pylist()
     return dict(row)
 
 

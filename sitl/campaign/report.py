@@ -6,7 +6,7 @@ from pathlib import Path
 
 from sitl.campaign import figures
 from sitl.campaign.flights import stand_of
-from sitl.campaign.plan import SPEC
+from sitl.campaign.plan import REPORT, SPEC
 from sitl.campaign.summary import (
     FIGURE_COLUMNS,
     SURVIVAL_COLUMNS,
@@ -19,6 +19,7 @@ from sitl.campaign.summary import (
 )
 from sitl.figures import svg
 from sitl.report import Section, Table, write_report
+from tuning.files import inside
 
 INTERVALS = (
     "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "
@@ -78,6 +79,6 @@ def write_campaign_report(results: Results, summary: Summary, over: tuple[str, s
     sections.append(
         Section("What was flown", "", tables=[Table(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])])
     )
-    path = results.path.with_name("report.html")
+    path = inside(results.path.parent, REPORT)
     write_report(path, f"mimopilot campaign: {plan.airframe.name}", lead, sections)
     return path

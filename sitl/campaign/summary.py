@@ -99,7 +99,7 @@ class Results:
         stride = len(self.plan.gains) * len(axes)
         offset = list(self.plan.gains).index(gains) * len(axes) + axes.index(axis)
         parts, start = [], 0
-        with reading(self.path), pq.ParquetFile(self.path) as table:
+        with reading(self.path), pq.ParquetFile(self.path, page_checksum_verification=True) as table:
             for batch in table.iter_batches(BATCH, columns=[name]):
                 values = batch.column(0).to_numpy(zero_copy_only=False)
                 parts.append(values[(offset - start) % stride :: stride].copy())

@@ -7,17 +7,15 @@ Whole numbers of samples are rounded, so that ``delay = { uniform = [0.5, 3.5] }
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from sitl.airframe import Vector
-from sitl.errors import SitlError
-from sitl.faults import complaint
+from tuning.toml import checked, parse_toml, read_toml
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pair = tuple[Finite, Finite]
@@ -194,12 +192,9 @@ class Variation(_Table):
 
 def read_variation(path: Path) -> dict[str, Any]:
     """The table of a specification's file, checked; see `variation_from_toml`."""
-    try:
-        text = path.read_text()
-    except UnicodeDecodeError as error:
-        raise SitlError(f"{path}: not a TOML file: {error}") from error
-    variation_from_toml(text, str(path))
-    return tomllib.loads(text)
+    table = read_toml(path, "specification")
+    checked(Variation, table, str(path))
+    return table
 
 
 def variation_from_toml(text: str, where: str) -> Variation:
@@ -207,15 +202,10 @@ def variation_from_toml(text: str, where: str) -> Variation:
 
     Raises
     ------
-    SitlError
+    TuningError
         When it is not TOML, or an entry is unknown or impossible.
     """
-    try:
-        return Variation.model_validate(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
-        raise SitlError(f"{where}: not a TOML file: {error}") from error
-    except ValidationError as error:
-        raise SitlError(f"{where}: {complaint(error)}") from error
+    return checked(Variation, parse_toml(text, where), where)
 
 
 #: Beginning of a drawn quantity's name -> its unit.

@@ -13,7 +13,8 @@ from pathlib import Path
 
 from sitl.errors import SitlError
 from sitl.mavlink.words import REAL32, shortest, single
-from tuning.files import sha256
+from tuning.files import read_text, sha256
+from tuning.toml import shown
 
 SEAL = re.compile(r"# mimopilot: (\d+) parameters, sha256 ([0-9a-f]{64})")
 NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
@@ -62,14 +63,13 @@ def read_parameters(path: Path) -> dict[str, float]:
 
     Raises
     ------
+    TuningError
+        When the file cannot be read.
     SitlError
         With the line, when it is none of them, a name is impossible or repeated, or a value is not a finite float. When
         it is not what its first line says was written.
     """
-    try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise SitlError(f"{path}: cannot read the parameter file: {error}") from error
+    text = read_text(path, "parameter file")
     _check_seal(text, path)
     values: dict[str, float] = {}
     for number, line in enumerate(text.splitlines(), 1):
@@ -113,7 +113,9 @@ def _entry(content: str, where: str) -> tuple[str, float]:
     else:
         fields = content.split(",") if "," in content else content.split()
     if len(fields) != 2 or not NAME.fullmatch(fields[0].strip()):
-        raise SitlError(f"{where}: got {content!r}, expected a parameter's name (16 capitals at most) and its value")
+        raise SitlError(
+            f"{where}: got {shown(content)}, expected a parameter's name (16 capitals at most) and its value"
+        )
     try:
         value = float(fields[1])
     except ValueError:
@@ -121,4 +123,4 @@ def _entry(content: str, where: str) -> tuple[str, float]:
     try:
         return fields[0].strip(), single(value)
     except SitlError as error:
-        raise SitlError(f"{where}: {fields[0]}: got {fields[1]!r}, expected a finite number") from error
+        raise SitlError(f"{where}: {fields[0]}: got {shown(fields[1])}, expected a finite number") from error

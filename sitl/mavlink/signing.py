@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sitl.errors import SitlError
+from tuning.files import read_bytes
 
 KEY_BYTES = 32
 EPOCH_S, UNITS_PER_S = 1420070400, 100_000  # 2015-01-01
@@ -28,10 +29,12 @@ def read_key(path: Path) -> bytes:
 
     Raises
     ------
+    TuningError
+        When it cannot be read.
     SitlError
         When it holds neither.
     """
-    content = path.read_bytes()
+    content = read_bytes(path, "signing key")
     if len(content) == KEY_BYTES:
         return content
     try:

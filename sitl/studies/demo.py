@@ -27,6 +27,7 @@ from sitl.recorder import save_flight
 from sitl.report import Section, Table, write_report
 from sitl.scenario import AXES, Scenario, doublet, excitation_flight
 from tuning.cascade import tune
+from tuning.files import inside
 from tuning.gains import MATRICES, Gains
 from tuning.logs.reader import read_log
 from tuning.output import print_table
@@ -95,29 +96,30 @@ def run_demo(out: Path, seed: int) -> Summary:
         When a flight is lost, or the flight over MAVLink differs from the one in process.
     """
     begin = time.monotonic()
+    log, report = inside(out, "flight.ulg"), inside(out, "report.html")
+    paths = {method: inside(out, f"{method}.gains.toml") for method in METHODS}
+    firmware = {method: inside(out, f"firmware/{method}") for method in METHODS}
     vehicle = load_airframe(AIRFRAME)
     airframe, gains = vehicle.airframe, {"default": vehicle.default_gains()}
 
     with _stage("experiment: 40 s of flight with a PRBS moment on roll, then on pitch (the first run compiles)"):
-        controllers = {"default": _controller(gains["default"], out, "default")}
+        controllers = {"default": _controller(gains["default"], firmware["default"])}
         generator = np.random.default_rng(seed)
         scenario = excitation_flight(SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH, gains["default"].Ts, generator)
         autopilot = Autopilot(airframe, gains["default"], controllers["default"])
         flight = _survived(fly(airframe, autopilot, scenario, seed))
-        log = out / "flight.ulg"
         save_flight(log, flight, airframe, gains["default"])
 
     with _stage("tuning: SISO and MIMO VRFT from the log"):
         experiment = read_log(log)
         for method in ("siso", "mimo"):
             gains[method] = tune(experiment, load_spec(method=method))
-        paths = {method: out / f"{method}.gains.toml" for method in METHODS}
         for method, path in paths.items():
             gains[method].save(path)
 
     with _stage("firmware: emitting and compiling the C++ of each gain set"):
         for method in ("siso", "mimo"):
-            controllers[method] = _controller(gains[method], out, method)
+            controllers[method] = _controller(gains[method], firmware[method])
 
     with _stage("doublets: in process, then over MAVLink"):
         flights: dict[str, dict[str, Flight]] = {}
@@ -133,16 +135,15 @@ def run_demo(out: Path, seed: int) -> Summary:
         }
         for axis, methods in flights.items()
     }
-    report = out / "report.html"
     with _stage("report"):
         _write_report(report, gains, figures, flights, flight)
     samples = len(flights["roll"]["mimo"].record)
     return Summary(paths, gains, figures, report, log, samples, speed, time.monotonic() - begin)
 
 
-def _controller(gains: Gains, out: Path, method: str) -> NativeController:
+def _controller(gains: Gains, folder: Path) -> NativeController:
     """Emit, compile and load the C++ of a set; it starts with the gains that were compiled in."""
-    return NativeController(load_native(gains, out / "firmware" / method))
+    return NativeController(load_native(gains, folder))
 
 
 def _survived(flight: Flight) -> Flight:

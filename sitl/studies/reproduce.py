@@ -14,6 +14,7 @@ from sitl.studies.attitude_runs import Statistics, run_studies
 from sitl.studies.benchmark_studies import study_lv100, study_numerical_example
 from sitl.studies.expectations import expectations, expectations_table
 from sitl.studies.part import Part
+from tuning.files import inside
 from tuning.output import print_table
 
 #: Noise seeds of the attitude studies: what is expected is expected of their medians.
@@ -57,13 +58,13 @@ def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = No
     workers : int, optional
         Processes; by default one a core. The result does not depend on it.
     """
+    report = inside(out, f"{name}.html")
     chosen = STUDIES if name == ALL else (name,)
     parts = {study: BENCHMARKS[study]() for study in chosen if study in BENCHMARKS}
     known = studies()
     flown = [known[study] for study in chosen if study in known]
     if flown:
         parts |= _attitude_parts(run_studies(flown, seeds, workers), seeds)
-    report = out / f"{name}.html"
     lead = " ".join(part.lead for part in parts.values() if part.lead)
     sections = [section for part in parts.values() for section in part.sections]
     write_report(report, f"mimopilot reproduce {name}", lead, sections)

@@ -281,3 +281,29 @@ def test_a_library_of_another_interface_is_refused(gains, tmp_path):
 
 def test_the_library_carries_the_gains_it_was_generated_with(gains, library):
     assert (library.default_gains() == to_array(gains)).all()
+
+
+@pytest.mark.parametrize("cached", [True, False])
+def test_a_damaged_library_is_built_again(gains, tmp_path, monkeypatch, cached):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    folder = None if cached else tmp_path / "tree"
+    path = build_native(gains, folder)
+    whole = path.read_bytes()
+    assert NativeLibrary(path).default_gains().tolist() == to_array(gains).tolist()
+    middle = len(whole) // 2
+    for damaged in (whole[:middle], bytes(len(whole)), whole[:middle] + b"\xff" + whole[middle + 1 :]):
+        path.unlink()  # the loaded one is not to be changed under the process
+        path.write_bytes(damaged)
+        assert build_native(gains, folder) == path
+        assert path.read_bytes() == whole
+    before = path.stat().st_mtime_ns
+    assert build_native(gains, folder) == path
+    assert path.stat().st_mtime_ns == before
+
+
+def test_the_library_of_other_gains_is_not_taken_for_the_own(gains, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    other = gains.with_elements({"RP_RR": 0.25})
+    mine, foreign = build_native(gains), build_native(other)
+    mine.write_bytes(foreign.read_bytes())
+    assert load_native(gains).default_gains().tolist() == to_array(gains).tolist()

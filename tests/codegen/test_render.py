@@ -116,6 +116,32 @@ def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_is_writte
     assert read_tree(tmp_path) == {}
 
 
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("name", ["core", "manifest.json", "native/Makefile"])
+@pytest.mark.parametrize("target", ["outside", "outside/file", "outside/new", "loop"])
+def test_no_link_is_followed_out_of_the_tree(gains, tmp_path, force, name, target):
+    write_tree(render(gains), tmp_path / "x")
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside/file").write_text((tmp_path / "x/manifest.json").read_text())
+    link = tmp_path / "x" / name
+    link.rename(tmp_path / "own")
+    link.symlink_to(link if target == "loop" else tmp_path / target)
+    before = {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")}
+    changed = gains.with_elements({"RP_RR": 0.25})
+    with pytest.raises(OSError, match="is a link, and nothing is written through it") as caught:
+        write_tree(render(changed), tmp_path / "x", force)
+    assert caught.value.filename == str(link)
+    assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
+
+
+def test_a_device_or_a_pipe_in_a_files_place_is_refused_before_anything_is_written(gains, tmp_path):
+    (tmp_path / "native").mkdir()
+    os.mkfifo(tmp_path / "native/Makefile")
+    with pytest.raises(CodegenError, match="native/Makefile: is a device or a pipe"):
+        write_tree(render(gains), tmp_path, force=True)
+    assert [path.name for path in tmp_path.rglob("*")] == ["native", "Makefile"]
+
+
 def make(folder, *targets, **variables):
     command = ["make", "-s", "-C", str(folder / "native"), *targets, *(f"{k}={v}" for k, v in variables.items())]
     return subprocess.run(command, capture_output=True, text=True, check=False)

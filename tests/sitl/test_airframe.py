@@ -40,7 +40,7 @@ def test_an_unknown_airframe_lists_the_known_ones():
         ("drag = 0.3", "drag = 0.3\ncolour = 'red'", "colour: Extra inputs"),
         ('"ccw"', '"up"', "direction"),
         ("[0.0172, 0.0016, 0.0]", "[0.0172, 0.5, 0.0]", "symmetric"),
-        ("mass = 1.45", "mass = = 1", "not an airframe file"),
+        ("mass = 1.45", "mass = = 1", "not a TOML file"),
     ],
 )
 def test_a_wrong_entry_of_an_airframe_file_is_named(tmp_path, old, new, message):
@@ -48,7 +48,7 @@ def test_a_wrong_entry_of_an_airframe_file_is_named(tmp_path, old, new, message)
     text = (FOLDER / "adam0.toml").read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(SitlError, match=rf"mine.toml: .*{message}"):
+    with pytest.raises((SitlError, TuningError), match=rf"mine.toml: .*{message}"):
         load_airframe(str(path))
 
 

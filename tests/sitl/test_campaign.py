@@ -37,6 +37,7 @@ from sitl.plant import GRAVITY, checked_inertia
 from sitl.scenario import doublet
 from tests.conftest import assert_one_clear_line
 from tests.sitl.running import PATIENCE_S
+from tuning.errors import TuningError
 
 RUNS = 60 * CHUNK  # enough that what interrupts a campaign finds it under way
 VARY = """
@@ -155,7 +156,7 @@ def test_draws_of_no_vehicle_are_replaced_and_counted_and_a_hopeless_specificati
     ],
 )
 def test_a_wrong_specification_is_refused_by_the_name_of_its_entry(text, words):
-    with pytest.raises(SitlError) as error:
+    with pytest.raises(TuningError) as error:
         variation_from_toml(text, "spec.toml")
     assert words in str(error.value)
 
@@ -244,7 +245,7 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
         heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heed)
         deadline = time.monotonic() + PATIENCE_S
-        while len(list((out / "parts").glob("[0-9]*.parquet"))) < parts:
+        while len(list((out / "parts").glob("[0-9]*.part"))) < parts:
             assert time.monotonic() < deadline
             assert process.poll() is None, process.stderr.read()
             time.sleep(0.005)
@@ -255,7 +256,7 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
     _, message = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
     assert f"of {RUNS} runs; give the same command again" in message
-    kept = {path: path.stat().st_mtime_ns for path in (out / "parts").glob("[0-9]*.parquet")}
+    kept = {path: path.stat().st_mtime_ns for path in (out / "parts").glob("[0-9]*.part")}
     assert len(kept) >= 3
 
     process = begun(len(kept) + 3)
@@ -315,7 +316,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(vehicle, tmp_path):
 KILLER = """
 import os, signal, sys, time
 from pathlib import Path
-while (parts := len(list(Path(sys.argv[1]).glob("[0-9]*.parquet")))) < 3:
+while (parts := len(list(Path(sys.argv[1]).glob("[0-9]*.part")))) < 3:
     time.sleep(0.005)
 os.kill(int(sys.argv[2]), signal.SIGKILL)
 print(parts)

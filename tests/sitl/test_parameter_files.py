@@ -12,6 +12,7 @@ from codegen.parameters import PARAMETERS
 from sitl.errors import SitlError
 from sitl.mavlink.parameter_files import FORMATS, NAME, parameter_text, read_parameters
 from sitl.mavlink.words import single
+from tuning.errors import TuningError
 
 names = st.from_regex(NAME, fullmatch=True)
 #: -0.0 comes back as 0.0 by intention: zero has no sign here.
@@ -105,10 +106,10 @@ def test_a_file_of_ours_that_was_cut_or_changed_is_refused_at_every_byte(tmp_pat
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    with pytest.raises(SitlError, match=r"none\.params: cannot read"):
+    with pytest.raises(TuningError, match=r"none\.params: cannot read"):
         read_parameters(tmp_path / "none.params")
     (tmp_path / "binary.params").write_bytes(bytes(range(128, 256)))
-    with pytest.raises(SitlError, match=r"binary\.params: cannot read"):
+    with pytest.raises(TuningError, match=r"binary\.params: cannot read"):
         read_parameters(tmp_path / "binary.params")
 
 

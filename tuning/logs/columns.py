@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from tuning.errors import TuningError
+from tuning.toml import checked, read_toml, shown_text
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _FACTORS = TIME_UNITS | {"rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180}
@@ -127,14 +127,9 @@ def load_columns(path: Path) -> Columns:
     TuningError
         When it cannot be read, is not TOML, or holds an unknown signal, unit or sign.
     """
-    if not path.is_file():
-        raise TuningError(f"{path}: no such file; give the path of a column file (TOML)")
-    try:
-        return Columns.model_validate(tomllib.loads(path.read_text()))
-    except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        known = f"; known signals: {', '.join(Columns.model_fields)}" if first["type"] == "extra_forbidden" else ""
-        raise TuningError(f"{path}: {where}: {first['msg']}, got {first.get('input')!r}{known}") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise TuningError(f"{path}: cannot read the column file: {error}") from error
+    table = read_toml(path, "column file")
+    unknown = [name for name in table if name not in Columns.model_fields]
+    if unknown:
+        known = ", ".join(Columns.model_fields)
+        raise TuningError(f"{path}: {shown_text(unknown[0])}: no signal; known signals: {known}")
+    return checked(Columns, table, str(path))
