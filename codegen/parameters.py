@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from codegen.errors import CodegenError
 from tuning.flown import SCALE
 from tuning.gains import AXES, LIMITS, MATRICES, PARAMETER_PREFIX, Gains
+from tuning.thresholds import DEFAULT_THRESHOLDS
 
 AXIS_NAMES = dict(zip("RPY", AXES, strict=True))
 

@@ -20,7 +20,6 @@ from tuning.files import inside
 from tuning.gains import Gains
 from tuning.parallel import processes, run_all
 
-
 #: Largest amplitude of the injected torque that is proposed, and the share of the motors' room that it may take.
 AMPLITUDE, ROOM = 0.15, 0.2
 

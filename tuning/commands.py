@@ -286,8 +286,8 @@ def identify(
     """Identify the plant from control moment to body rates (PBSID, closed loop)."""
     from tuning.files import write_atomically
     from tuning.identification import identify_rates, model_toml
-    from tuning.plant_response import measured_plant
     from tuning.output import print_json, print_table
+    from tuning.plant_response import measured_plant
 
     experiment = read_warned(log, columns)
     found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)

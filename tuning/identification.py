@@ -237,7 +237,7 @@ class _States:
     @property
     def most(self) -> int:
         """Largest order that the windows allow."""
-        return self.future * self.now_y.shape[1] - 1
+        return self.future * int(self.now_y.shape[1]) - 1
 
     def gap(self) -> int:
         """The order where the singular values fall most."""

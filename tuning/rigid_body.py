@@ -56,15 +56,14 @@ class RigidBody:
         (...) array, rad/s^2 per rad
         """
         action = self.B @ Ki_i
-        least: Signal = np.linalg.eigvalsh((action + np.swapaxes(action, -1, -2)) / 2)[..., 0]
-        return least
+        return np.asarray(np.linalg.eigvalsh((action + np.swapaxes(action, -1, -2)) / 2)[..., 0])
 
 
 def rigid_body(plant: PlantResponse) -> RigidBody:
     """Fit of G_i = B exp(-j w delay) / ((1 + j w lag) (j w + damping)) with a real B to the known frequencies.
 
-    The shape is common to all elements, so nothing but B can turn a sign: no delay or lag within its range looks like one
-    over a decade of frequency.
+    The shape is common to all elements, so nothing but B can turn a sign: no delay or lag within its range looks like
+    one over a decade of frequency.
 
     Raises
     ------

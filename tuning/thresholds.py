@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Self
+from typing import Annotated, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -16,16 +16,16 @@ class Thresholds(BaseModel):
         Largest peak of the sensitivity and smallest phase margin of ``certified``. With Ms of 1.8 no loop has less than
         32 degrees and 7 dB; the position loop around it takes its share of the rest.
     thin_Ms, thin_phase_deg : float, -, deg
-        Of ``stable, thin margin``; anything thinner is ``not certified``. A loop at 10 degrees rolled by 25 degrees in a
-        genuine PX4.
+        Of ``stable, thin margin``; anything thinner is ``not certified``: a loop at 10 degrees rolled by 25 degrees in
+        a genuine PX4.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    Ms: float = Field(1.8, gt=1, allow_inf_nan=False)
-    phase_deg: float = Field(40.0, gt=0, lt=90)
-    thin_Ms: float = Field(2.5, gt=1, allow_inf_nan=False)
-    thin_phase_deg: float = Field(25.0, gt=0, lt=90)
+    Ms: Annotated[float, Field(gt=1, allow_inf_nan=False)] = 1.8
+    phase_deg: Annotated[float, Field(gt=0, lt=90)] = 40.0
+    thin_Ms: Annotated[float, Field(gt=1, allow_inf_nan=False)] = 2.5
+    thin_phase_deg: Annotated[float, Field(gt=0, lt=90)] = 25.0
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:

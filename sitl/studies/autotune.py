@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
 
-from tuning.experiment import Experiment
+from tuning.experiment import Experiment, external_signal
 from tuning.gains import Gains
-from tuning.instruments import excited_stretches, external_signal
+from tuning.instruments import excited_stretches
 
 BAND_HZ = (0.5, 30.0)
 PERIOD = 0.010  # s, at most

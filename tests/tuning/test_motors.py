@@ -20,6 +20,7 @@ from tuning.doublet import doublet_model
 from tuning.gain_stack import GainStack
 from tuning.identification import identify_rates
 from tuning.logs.reader import read_log
+from tuning.measured import Measured
 from tuning.motors import fit_motors, rotor_lag
 from tuning.spec import Manoeuvre, load_spec
 
@@ -57,7 +58,7 @@ def test_the_motor_that_carries_a_mass_hovers_higher(logs):
 
 @pytest.mark.parametrize("name", ["adam0_nominal", "adam0_perturbed", "antr"])
 def test_the_lag_of_the_rotors_is_a_pole_of_the_identified_plant(logs, name):
-    lag = rotor_lag(identify_rates(logs[name])[0].plant)
+    lag = rotor_lag(Measured(logs[name]).identified.model.plant)
     # Half a period is the hold's.
     assert lag == pytest.approx(load_airframe(name).airframe.motors.time_constant, rel=0.08)
 

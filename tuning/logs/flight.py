@@ -48,7 +48,7 @@ def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str,
         raise TuningError(f"{source}: no flight: {recording.evidence} says that it never left the ground; fly it")
     marked = _marked(recording.signals.get("u_bar"))
     said: list[str] = []
-    parts = (marked,) if marked else ((-np.inf, np.inf),)
+    parts: tuple[Interval, ...] = (marked,) if marked else ((-np.inf, np.inf),)
     if airborne:
         parts = intersection(parts, airborne)
         if marked and not parts:

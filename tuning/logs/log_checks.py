@@ -221,8 +221,8 @@ def _blame(
             f"{names.mend(blamed, (0, 1), 'other')}{_alike(names.all(other))}"
         )
     for axis, name in enumerate(AXES):
-        reversed_ = [relation.reversed[axis] for relation in relations]
-        guilty = _guilty(*reversed_, injected is not None)
+        first, second, third = (relation.reversed[axis] for relation in relations)
+        guilty = _guilty(first, second, third, injected is not None)
         if guilty:
             blamed, other = guilty[0], guilty[1] or either
             raise TuningError(
@@ -265,7 +265,8 @@ def _check_derivative(kinematics: _Kinematics, names: _Names) -> None:
 
 def _check_units(kinematics: Matrix, body: RigidBody | None, names: _Names) -> None:
     """Refuse degrees that are taken for radians, and the reverse, in rates, in angles or in both."""
-    wrong, lines = [], []
+    wrong: list[str] = []
+    lines: list[tuple[tuple[str, ...], int]] = []
     for axis, name in enumerate(AXES):
         factor, extreme = float(kinematics[axis, axis]), _extreme(body, axis)
         if SAME_UNIT[0] < factor < SAME_UNIT[1]:
