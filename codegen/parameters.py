@@ -57,6 +57,10 @@ _TERMS = {
     "Kd_i": ("s^2", 0.5, "moment from angular acceleration, subtracted"),
     "Kff_i": ("s", 5.0, "moment from rate set-point"),
 }
+#: Matrix -> least value of its diagonal: a loop without positive P, or with negative I, is none. D and feed-forward may
+#: be negative: a reference model may ask for less damping than the vehicle has. P is a hundredth of what small
+#: vehicles have, or more.
+_DIAGONAL = {"Kp_o": 0.01, "Kp_i": 1e-4, "Ki_i": 0.0}
 _LIMITS = {
     "rate_max": ("rad/s", 0.01, 50.0, "limit of the rate set-point"),
     "moment_max": ("norm", 0.01, 1.0, "limit of the moment, excitation included"),
@@ -70,7 +74,8 @@ def _gain(matrix: str, output: str, error: str) -> Parameter:
     what = (
         f"{text}, {AXIS_NAMES[output]} from {AXIS_NAMES[error]}" if output != error else f"{text}, {AXIS_NAMES[output]}"
     )
-    return Parameter(PARAMETER_PREFIX + code, code, unit, -largest, largest, True, f"{matrix}: {what}")
+    smallest = _DIAGONAL.get(matrix, -largest) if output == error else -largest
+    return Parameter(PARAMETER_PREFIX + code, code, unit, smallest, largest, True, f"{matrix}: {what}")
 
 
 def _limit(limit: str, axis: str) -> Parameter:
@@ -228,9 +233,9 @@ def _loose_thresholds(gains: Gains) -> str:
     """What is to be said where a certificate asked for less margin than usual."""
     asked = {**DEFAULT_THRESHOLDS.model_dump(), **dict((gains.certificate or {}).get("thresholds", {}))}
     usual = DEFAULT_THRESHOLDS
-    if asked["thin_Ms"] <= usual.thin_Ms and asked["thin_phase_deg"] >= usual.thin_phase_deg:
-        if asked["Ms"] <= usual.Ms and asked["phase_deg"] >= usual.phase_deg:
-            return ""
+    peaks = asked["Ms"] <= usual.Ms and asked["thin_Ms"] <= usual.thin_Ms
+    if peaks and asked["phase_deg"] >= usual.phase_deg and asked["thin_phase_deg"] >= usual.thin_phase_deg:
+        return ""
     return (
         f"the certificate asked for less margin than usual: Ms {asked['Ms']:g} and {asked['phase_deg']:g} degrees "
         f"(thin: {asked['thin_Ms']:g} and {asked['thin_phase_deg']:g})"

@@ -11,7 +11,8 @@ import typer
 AirframeArgument = Annotated[
     str,
     typer.Argument(
-        help="Airframe: adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, antr, px4_sih, or a TOML file."
+        help="Airframe: adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, antr, px4_sih; or a TOML "
+        "file."
     ),
 ]
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
@@ -146,7 +147,8 @@ def experiment(
             raise SitlError("--out: name the log to write, FILE.ulg")
         if (axis, mode, tilt_deg) != (None,) * 3:
             raise SitlError("--axis, --mode, --tilt-deg: belong to --connect; a simulated flight excites both axes")
-        _simulated_experiment(airframe, out, gains, (seconds_per_axis, amplitude, bandwidth, excitation_seed), seed, runs)
+        excitation = (seconds_per_axis, amplitude, bandwidth, excitation_seed)
+        _simulated_experiment(airframe, out, gains, excitation, seed, runs)
         return
     if (out, gains, runs, excitation_seed) != (None,) * 4:
         raise SitlError(

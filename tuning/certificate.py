@@ -111,8 +111,8 @@ def certify(
     thresholds : Thresholds
         Margins that the verdict needs.
     model : callable, optional
-        Gives the plant from torque to body rates, identified from the same log, or None. It cannot certify; but where the response leaves a loop
-        open that is unstable around it, the verdict is ``unstable``.
+        Gives the plant from torque to body rates, identified from the same log, or None. It cannot certify; but where the
+        response leaves a loop open that is unstable around it, the verdict is ``unstable``.
     """
 
     def verdict(text: str, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
@@ -121,7 +121,7 @@ def certify(
             radius = model_spectral_radius(gains, identified)
             if radius > GROWING:
                 text = UNSTABLE
-                reason = f"around the model identified from the log the loop has a spectral radius of {radius:.4f}; {reason}"
+                reason = f"the loop has a spectral radius of {radius:.4f} around the model identified from the log; {reason}"
         return Certificate(text, reason, figures, band, thresholds.model_dump(), log_sha256)
 
     try:
@@ -255,8 +255,8 @@ def _beyond_the_band(
         omega, gain = again
         return (
             f"at {omega:.0f} rad/s ({omega / (2 * np.pi):.0f} Hz) the loop's gain may reach {gain:.2f} again (at most "
-            f"{HIGH_FREQUENCY_LOOP:g}): a mode of the frame; stiffen it, filter the rates (notch, lower cut-off), or ask "
-            "for a lower derivative filter or gain"
+            f"{HIGH_FREQUENCY_LOOP:g}): a mode of the frame; stiffen it, filter the rates (notch, lower cut-off), or "
+            "lower the derivative filter or the gains"
         )
     if loop + _outer_loop_above(gains, known) >= 1:
         return (
@@ -273,9 +273,9 @@ def _beyond_the_band(
         )
     if np.any(gains.Ki_i) and body.integral_action(gains.Ki_i) <= 0:
         return (
-            f"Ki_i through the measured plant is not positive in every direction ({body.integral_action(gains.Ki_i):.3g} "
-            "1/s^2 per rad/s): the integral terms run away below the excitation; raise the diagonal of Ki_i, or leave the "
-            "integral out"
+            "Ki_i through the measured plant is not positive in every direction (at least "
+            f"{body.integral_action(gains.Ki_i):.3g} rad/s^2 per rad): the integral terms run away below the excitation; "
+            "raise the diagonal of Ki_i, or leave the integral out"
         )
     if np.linalg.eigvalsh(gains.Kp_o + gains.Kp_o.T)[0] <= 0:
         return f"below {known.omega[0]:.1f} rad/s the attitude loop's gain is not positive in every direction"
@@ -335,7 +335,7 @@ def large_again(gains: Gains, plant: PlantResponse) -> tuple[float, float] | Non
 
 
 def _told(plant: PlantResponse, gain: Signal, error: Signal) -> NDArray[np.bool_]:
-    """Where the log says something of a loop's gain: it knows the response, or the excitation is seen on an axis, or the
+    """Where the log says something of a loop's gain: it knows the response, the excitation is seen on an axis, or the
     gain is not noise.
     """
     seen = np.any(plant.coherence > COHERENT, axis=1)
@@ -353,7 +353,7 @@ def _peak_beyond(gains: Gains, plant: PlantResponse, end: float) -> float:
 
 
 def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]:
-    """sigma_max of the rate loop, (K,), and the RMS of its error's largest singular value, two deviations of an element."""
+    """sigma_max of the rate loop, (K,), and the RMS of the error's norm: two deviations of an element."""
     C_e, C_d = inner_controllers(gains, plant.omega)
     controller = C_e + C_d
     gain = singular_values(controller @ plant.G_i)[0]

@@ -81,7 +81,7 @@ def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
 
 
 def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
-    """Of a gain set around an identified plant, without limits: the larger of the rate loop's alone and of the cascade's.
+    """Of a gain set around an identified plant, without limits: the larger one of the rate loop and of the cascade.
 
     Parameters
     ----------

@@ -161,7 +161,7 @@ class Gains:
         return sha256(json.dumps([said, numbers, self.moment_scale], sort_keys=True, default=str))
 
     def verdict(self) -> tuple[str, str]:
-        """Verdict of the certificate and its reason; ``none`` without one, ``void`` when gains or certificate were edited."""
+        """Verdict of the certificate and its reason: ``none`` without one, ``void`` when it or a gain was edited."""
         if self.certificate is None:
             return "none", "stability was never examined"
         if "seal" not in self.certificate:

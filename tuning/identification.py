@@ -173,8 +173,8 @@ def pbsid_by_response(
 ) -> tuple[IdentifiedModel, float]:
     """`pbsid` with the order whose frequency response is nearest to the measured one.
 
-    A gap in the singular values says little in closed loop: on logs of a genuine PX4 it asked for order 2, whose predictor
-    diverged, where orders 4 to 8 fit.
+    A gap in the singular values says little in closed loop: on logs of a genuine PX4 it asked for order 2, whose
+    predictor diverged, where orders 4 to 8 fit.
 
     Parameters
     ----------
@@ -210,8 +210,8 @@ def pbsid_by_response(
     least = min(error for error, _ in found)
     if least > POOR:
         raise TuningError(
-            f"identification: no model of order 1 to {RESPONSE_ORDER} is near the measured response (the best is off by "
-            f"{least:.0%}, at most {POOR:.0%}); record longer, or excite more strongly"
+            f"identification: no model of order 1 to {RESPONSE_ORDER} is near the measured response (the best is off "
+            f"by {least:.0%}, at most {POOR:.0%}); record longer, or excite more strongly"
         )
     error, model = next((error, model) for error, model in found if error <= NEARLY * least)
     return model, 100 * (1 - error)
@@ -359,8 +359,8 @@ def identify_rates(
         model = pbsid(u, y, experiment.Ts, order=order, past=past, future=future, segments=segments)
         if not model.predictor_stable:
             raise TuningError(
-                f"identification: the predictor of order {order} is not stable, its predictions grow without bound; ask "
-                "for another order, or leave it out"
+                f"identification: the predictor of order {order} is not stable, its predictions grow without bound; "
+                "ask for another order, or leave it out"
             )
         off = known.omega[:, None, None] * (model.plant.frequency_response(known.omega) - known.G_i)
         response = 100 * (1 - float(np.linalg.norm(off) / np.linalg.norm(known.omega[:, None, None] * known.G_i)))

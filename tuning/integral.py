@@ -56,15 +56,15 @@ def with_positive_integral(
         floor = LEAST * _least(B @ loop.gain("P"))
         if floor <= 0:
             raise TuningError(
-                "the proportional gains that VRFT finds are not positive through the measured plant: the log is too short "
-                "or too noisy for this rate loop; record longer, or excite more strongly"
+                "the proportional gains that VRFT finds are not positive through the measured plant: the log is too "
+                "short or too noisy for this rate loop; record longer, or excite more strongly"
             )
         if "I" in loop.gains and _least(B @ loop.gains["I"]) < floor:
             before = loop.gains["I"]
             loop = _moved(loop, _nearest(loop, B, floor))
             old, new = (", ".join(f"{v:.3g}" for v in matrix.ravel()) for matrix in (before, loop.gains["I"]))
             warnings.append(
-                f"the log asks for integral gains that run away ({old}): they are kept to the nearest that do not ({new}); "
+                f"the log asks for integral gains that run away ({old}): the nearest that do not are taken ({new}); "
                 "record longer or excite lower frequencies to know them"
             )
         found.append(loop)

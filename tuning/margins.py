@@ -27,8 +27,8 @@ def peak(S: Complex) -> float:
 
 
 def disk_margin(S: Complex) -> float:
-    """Largest radius of the disk about 1 in which any complex factors on both channels may lie together: 1 over the peak
-    of S - I/2 (P. Seiler, A. Packard, P. Gahinet, "An introduction to disk margins", IEEE Control Systems 40, 2020).
+    """Largest radius of the disk about 1 in which complex factors on both channels may lie together: 1 over the peak of
+    S - I/2 (P. Seiler, A. Packard, P. Gahinet, "An introduction to disk margins", IEEE Control Systems 40, 2020).
     """
     return 1 / peak(S - np.eye(2) / 2)
 
@@ -64,7 +64,7 @@ def phase_margin(loop: Complex, omega: Signal) -> tuple[float, float]:
 
 
 def gain_margin(loop: Complex) -> float:
-    """Smallest factor, up or down, that makes one loop (K,) unstable, dB; infinite where its phase is never 180 degrees."""
+    """Smallest factor, up or down, that makes one loop (K,) unstable, dB; infinite where its phase is never 180 deg."""
     at, place = _crossings(loop.imag)
     if not len(at):
         return np.inf
@@ -86,8 +86,8 @@ def gain_margins(loops: Complex, above: float) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``gain_margin_db``: by axis, never negative. ``gain_margin``: by axis, what the number is: ``exact``, ``at least``
-        or ``not known`` (the number is then 0).
+        ``gain_margin_db``: by axis, never negative. ``gain_margin``: by axis, what the number is: ``exact``, ``at
+        least`` or ``not known`` (the number is then 0).
     """
     ceiling = -20 * float(np.log10(above)) if above > 0 else np.inf
     margins, kinds = {}, {}

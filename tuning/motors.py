@@ -16,7 +16,7 @@ ROTORS = (5.0, 100.0)
 MIN_SAMPLES = 50
 #: A command this near to 0 or 1 is at its end: half of the step of a 10 bit output.
 END = 5e-4
-#: Share of the samples with a motor at an end that is told; and of those that the amplitude that is advised keeps within.
+#: Share of the samples with a motor at an end that is told; and that the amplitude that is advised keeps within.
 SATURATED, NEARLY_ALL = 0.01, 0.999
 
 Signal = NDArray[np.float64]
@@ -69,7 +69,7 @@ def fit_motors(u: Signal, commands: Signal) -> Motors | None:
 
 
 def saturation_warnings(u: Signal, commands: Signal, motors: Motors | None, amplitude: float) -> list[str]:
-    """What is to be said of motors at an end of their range: in which share of the samples, and which amplitude avoids it.
+    """What is to be said of motors at an end of their range: share of the samples, and the amplitude that avoids it.
 
     Parameters
     ----------

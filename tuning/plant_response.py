@@ -83,7 +83,7 @@ class PlantResponse:
         return max(runs, key=len)
 
     def band(self, axis: int) -> tuple[float, float] | None:
-        """Where the excitation explains an axis' rate, rad/s: from the first to the last such frequency; None: nowhere."""
+        """Where the excitation explains an axis' rate, rad/s: the first and the last such frequency; None: nowhere."""
         where = self.omega[self.coherence[:, axis] > COHERENT]
         return (float(where[0]), float(where[-1])) if len(where) else None
 

@@ -127,6 +127,9 @@ def params(
         str, typer.Option("--format", help="qgc, mavproxy, missionplanner; for a gains file also c-header, px4-yaml.")
     ] = "qgc",
     out: Annotated[Path | None, typer.Option(help="File to write; by default standard output.")] = None,
+    uncertified: Annotated[
+        bool, typer.Option("--uncertified", help="Write gains whose stability is in doubt.")
+    ] = False,
     timeout: TimeoutOption = 12.0,
     signing_key: KeyOption = None,
     system: SystemOption = 0,
@@ -141,7 +144,7 @@ def params(
     if gains is None or connect is None:
         if as_json:
             raise SitlError("--json: belongs to the comparison of a gains file with a vehicle")
-        export(gains, options, form, out)
+        export(gains, options, form, out, uncertified)
     elif out is not None:
         raise SitlError("--out: a comparison is printed; give either a gains file or --connect to write a file")
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from codegen.parameters import PARAMETERS
+from codegen.parameters import PARAMETERS, check_verdict
 from sitl.errors import SitlError
 from sitl.mavlink.parameter_files import FORMATS, parameter_text
 from sitl.mavlink.profiles import make_plan
@@ -48,7 +48,7 @@ def compare(file: Path, options: Options) -> None:
         raise SitlError(f"{len(differ)} of {len(wanted)} parameters differ", exit_code=1)
 
 
-def export(file: Path | None, options: Options, form: str, out: Path | None) -> None:
+def export(file: Path | None, options: Options, form: str, out: Path | None, uncertified: bool = False) -> None:
     """Write a gains file, or what a vehicle holds, as a parameter file.
 
     Raises
@@ -60,6 +60,9 @@ def export(file: Path | None, options: Options, form: str, out: Path | None) -> 
         raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *GENERATED])}")
     if file is not None:
         gains = load_gains(file)
+        warning = check_verdict(gains, allow=uncertified)
+        if warning:
+            print(f"mimopilot: warning: {file}: {warning}", file=sys.stderr)
         text = _generated(gains, form) if form in GENERATED else parameter_text(form, make_plan(gains).values)
     elif not options.connect:
         raise SitlError("give a gains file to write, --connect to read from a vehicle, or both to compare them")

@@ -18,8 +18,8 @@ from tuning.cascade import NO_MOTORS, tune
 from tuning.compiled_doublet import allocated
 from tuning.doublet import doublet_model
 from tuning.gain_stack import GainStack
-from tuning.identification import identify_rates
 from tuning.logs.reader import read_log
+from tuning.measured import Measured
 from tuning.measured import Measured
 from tuning.motors import fit_motors, rotor_lag
 from tuning.spec import Manoeuvre, load_spec

@@ -147,7 +147,8 @@ class Truth:
     def margins(self, g, points=6000):
         """Peak of the sensitivity at u, and the smallest phase margin (deg) of an axis with the other one closed."""
         # Denser where modes are narrow.
-        omega = np.unique(np.concatenate([np.geomspace(0.05, np.pi / TS * 0.999, points), np.linspace(60, 300, points)]))
+        grids = np.geomspace(0.05, np.pi / TS * 0.999, points), np.linspace(60, 300, points)
+        omega = np.unique(np.concatenate(grids))
         L = self.return_ratio(g, omega)
         S = np.linalg.inv(np.eye(2) + L)
         peak = float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())

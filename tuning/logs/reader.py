@@ -135,8 +135,7 @@ def _experiment(recording: Recording, said: list[str]) -> Experiment:
 
 
 def _motors(recording: Recording, parts: tuple[Interval, ...], said: list[str]) -> Motors | None:
-    """How the allocator moved the motors in the usable parts of a log, where it holds their commands; saturation is said.
-    """
+    """How the allocator moved the motors in the usable parts of a log, where it holds their commands."""
     commands, torque = recording.commands, recording.signals["u"]
     if commands is None:
         return None
