@@ -111,8 +111,8 @@ def certify(
     thresholds : Thresholds
         Margins that the verdict needs.
     model : callable, optional
-        Gives the plant from torque to body rates, identified from the same log, or None. It cannot certify; but where the
-        response leaves a loop open that is unstable around it, the verdict is ``unstable``.
+        Gives the plant from torque to body rates, identified from the same log, or None. It cannot certify; but where
+        the response leaves a loop open that is unstable around it, the verdict is ``unstable``.
     """
 
     def verdict(text: str, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
@@ -121,7 +121,7 @@ def certify(
             radius = model_spectral_radius(gains, identified)
             if radius > GROWING:
                 text = UNSTABLE
-                reason = f"the loop has a spectral radius of {radius:.4f} around the model identified from the log; {reason}"
+                reason = f"around the model identified from the log the spectral radius is {radius:.4f}; {reason}"
         return Certificate(text, reason, figures, band, thresholds.model_dump(), log_sha256)
 
     try:
@@ -274,8 +274,8 @@ def _beyond_the_band(
     if np.any(gains.Ki_i) and body.integral_action(gains.Ki_i) <= 0:
         return (
             "Ki_i through the measured plant is not positive in every direction (at least "
-            f"{body.integral_action(gains.Ki_i):.3g} rad/s^2 per rad): the integral terms run away below the excitation; "
-            "raise the diagonal of Ki_i, or leave the integral out"
+            f"{body.integral_action(gains.Ki_i):.3g} rad/s^2 per rad): the integral terms run away below the "
+            "excitation; raise the diagonal of Ki_i, or leave the integral out"
         )
     if np.linalg.eigvalsh(gains.Kp_o + gains.Kp_o.T)[0] <= 0:
         return f"below {known.omega[0]:.1f} rad/s the attitude loop's gain is not positive in every direction"

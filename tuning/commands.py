@@ -39,7 +39,7 @@ def tune(
         str | None, typer.Option(help="mimo (full matrices, the default) or siso (each axis by itself).")
     ] = None,
     inner: Annotated[
-        str | None, typer.Option(help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 20,0.4,0.")
+        str | None, typer.Option(help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 30,0.7,0 by default.")
     ] = None,
     outer: Annotated[str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY; 10,0.7,0.")] = None,
     doublet: Annotated[

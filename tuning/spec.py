@@ -101,7 +101,7 @@ class TuningSpec(_Table):
     """
 
     method: Literal["mimo", "siso"] = "mimo"
-    inner: tuple[Model, Model] = ((20.0, 0.4, 0), (20.0, 0.4, 0))
+    inner: tuple[Model, Model] = ((30.0, 0.7, 0), (30.0, 0.7, 0))
     outer: tuple[Model, Model] = ((10.0, 0.7, 0), (10.0, 0.7, 0))
     structure: Annotated[str, Field(pattern="^PI?D?F?$")] = "PID"
     instrument: Literal["external", "u", "model", "repeated"] = "external"

@@ -20,7 +20,6 @@ from tuning.doublet import doublet_model
 from tuning.gain_stack import GainStack
 from tuning.logs.reader import read_log
 from tuning.measured import Measured
-from tuning.measured import Measured
 from tuning.motors import fit_motors, rotor_lag
 from tuning.spec import Manoeuvre, load_spec
 
