@@ -12,7 +12,7 @@ import numpy as np
 from sitl.studies.benchmark_studies import gain_spread
 from sitl.studies.benchmarks import lv100, numerical_example
 from tests.tuning.literal import literal_cascade
-from tuning.cascade import estimate, measured_plant, tune
+from tuning.cascade import estimate, tune
 from tuning.certificate import certify
 from tuning.experiment import Experiment
 from tuning.spec import load_spec

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tuning.errors import TuningError
-from tuning.plant_response import MIN_FREQUENCIES, PlantResponse
+from tuning.plant_response import PlantResponse
 
 #: Above this a frame bends and filters act, rad/s: it is not the body that is measured.
 UPPER = 60.0
+#: Known frequencies that the fit needs: as many as a log of some five seconds has.
+MIN_FREQUENCIES = 4
 #: What lies between torque and rate besides the body: delays (s), rotor lags (s) and damping (1/s) that are tried.
 DELAYS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06)
 LAGS = (0.0, 0.015, 0.025, 0.035, 0.05, 0.07, 0.1)

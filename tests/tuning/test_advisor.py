@@ -10,8 +10,8 @@ from tests.tuning.test_certificate import experiment
 from tuning.advisor import Doublet, advise, predict
 from tuning.cascade import tune
 from tuning.certificate import CERTIFIED
-from tuning.closed_loop import plant_response
 from tuning.errors import TuningError
+from tuning.plant_response import plant_response
 from tuning.spec import TuningSpec
 
 TS = 0.004

@@ -151,7 +151,7 @@ def test_gains_that_cannot_be_told_apart_are_refused_and_hardly_warned_about(log
 
 
 def test_the_band_of_the_excitation_is_named_by_axis(log):
-    from tuning.cascade import measured_plant
+    from tuning.plant_response import measured_plant
 
     plant = measured_plant(log)
     assert examine_band("log", plant, (20.0, 20.0)) == []

@@ -14,7 +14,8 @@ from tuning.gains import Gains
 from tuning.instruments import excited_stretches
 from tuning.logs.columns import Columns
 from tuning.logs.flight import flying_parts, intersection
-from tuning.logs.reader import experiment_of, open_log
+from tuning.logs.log_checks import check_log
+from tuning.logs.reader import open_log, unchecked_experiment
 from tuning.logs.recording import Recording
 from tuning.logs.resample import MAX_GAP, Interval, Series, held_samples, sampling_period
 
@@ -133,12 +134,13 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
     try:
         recording.require_signals()
         parts = flying_parts(recording)[0]
-        experiment = experiment_of(recording)
+        experiment = unchecked_experiment(recording)
         if experiment.flown is not None:
             limit = min(experiment.flown.limits.moment_max[:2])
         instrument, name = external_signal(experiment)
         excitation = {f"{name} {axis}": _excitation(instrument[:, i], experiment) for i, axis in enumerate(AXES)}
         excited_stretches(experiment, instrument, "mimo")
+        check_log(experiment, recording)
     except TuningError as error:
         reason = str(error).removeprefix(f"{path}: ").removeprefix(f"{path.name}: ")
     first, last = recording.span or (0.0, 0.0)

@@ -96,7 +96,10 @@ def check_log(experiment: Experiment, recording: Recording) -> None:
             f"({np.linalg.norm(injected, axis=1).min():.2f} of it, expected 1): log the torque after the injection, at the "
             "same rate"
         )
-    body = rigid_body(measured_plant(experiment))
+    try:
+        body = rigid_body(measured_plant(experiment))
+    except TuningError as error:
+        raise TuningError(f"{names.path}: {str(error).removeprefix(f'{experiment.source}: ')}") from error
     torque = _relation(body.B)
     _blame(names, injected, torque, angles, kinematics.matrix, body)
     _check_units(kinematics.matrix, body, names)

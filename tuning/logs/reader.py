@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -100,13 +101,25 @@ def experiment_of(recording: Recording) -> Experiment:
     TuningError
         When the log lacks a signal, never flew, is too slow or too short.
     """
+    experiment = unchecked_experiment(recording)
+    try:
+        check_log(experiment, recording)
+    except TuningError as error:
+        raise _with_warnings(error, experiment.warnings) from error
+    return experiment
+
+
+def unchecked_experiment(recording: Recording) -> Experiment:
+    """The experiment in a log whose signals may contradict each other, `tuning.logs.log_checks`; see `experiment_of`."""
     said = [*recording.warnings]
     try:
         return _experiment(recording, said)
     except TuningError as error:
-        if not said:
-            raise
-        raise TuningError(f"{error} (the log: {'; '.join(said)})") from error
+        raise _with_warnings(error, said) from error
+
+
+def _with_warnings(error: TuningError, said: Sequence[str]) -> TuningError:
+    return TuningError(f"{error} (the log: {'; '.join(said)})") if said else error
 
 
 def _experiment(recording: Recording, said: list[str]) -> Experiment:
@@ -120,7 +133,7 @@ def _experiment(recording: Recording, said: list[str]) -> Experiment:
     parameters, changed = recording.parameters_during(begin, parts[-1][1])
     said += [CHANGED + "; ".join(changed)] if changed else []
     motors = _motors(recording, parts, said)
-    experiment = Experiment(
+    return Experiment(
         Ts=grid.Ts,
         segments=grid.segments,
         source=recording.path.name,
@@ -130,8 +143,6 @@ def _experiment(recording: Recording, said: list[str]) -> Experiment:
         warnings=tuple(said),
         **grid.signals,  # type: ignore[arg-type]  # of the names in Experiment
     )
-    check_log(experiment, recording)
-    return experiment
 
 
 def _motors(recording: Recording, parts: tuple[Interval, ...], said: list[str]) -> Motors | None:

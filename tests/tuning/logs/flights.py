@@ -1,4 +1,4 @@
-"""A made-up flight whose rates are the derivative of its angles, and writers of logs that hold it."""
+"""A made-up flight of a rigid body that follows set-points, and writers of logs that hold it."""
 
 import struct
 from dataclasses import dataclass
@@ -11,27 +11,52 @@ from sitl.ulog_writer import HEADER, _declare, _keyed, _message
 
 @dataclass(frozen=True)
 class Flight:
-    """Signals (N, 2) of torque, rad/s, rad, and the time (N,), s."""
+    """Signals (N, 2) of torque, rad/s, rad, and the time (N,), s; u_bar is what was injected, part of u."""
 
     t: np.ndarray
     u: np.ndarray
     y_i: np.ndarray
     y_o: np.ndarray
     r_o: np.ndarray
+    u_bar: np.ndarray
 
 
-def make_flight(seconds=8.0, Ts=0.004, start=10.0, still=(0.0, 0.0)):
+def make_flight(seconds=8.0, Ts=0.004, start=10.0, still=(0.0, 0.0), inject=lambda t: np.zeros((len(t), 2))):
     """A flight; for `still` seconds at its begin and its end the vehicle stands on the ground."""
-    k = np.arange(round(seconds / Ts))
-    t = start + k * Ts
-    tones = [(0.10, 2.0, 0.3), (0.05, 7.0, 1.1), (0.01, 31.0, 2.0)]
-    y_o = np.column_stack([sum(a * np.sin(w * t + f + axis) for a, w, f in tones) for axis in range(2)])
-    y_i = np.column_stack([sum(a * w * np.cos(w * t + f + axis) for a, w, f in tones) for axis in range(2)])
-    u = 0.05 * np.random.default_rng(1).standard_normal((len(t), 2)) + 0.02 * y_i
-    r_o = np.column_stack([np.where(np.sin(0.9 * t + axis) > 0, 0.2, -0.2) for axis in range(2)])
+    t = start + np.arange(round(seconds / Ts)) * Ts
     ground = (t < start + still[0]) | (t > t[-1] - still[1])
-    y_o[ground], y_i[ground], r_o[ground] = 0.0, 0.0, 0.0
-    return Flight(t, u, y_i, y_o, r_o)
+    generator = np.random.default_rng(1)
+    hold = max(1, round(0.1 / Ts))
+    r_o = 0.2 * generator.choice([-1.0, 1.0], (len(t) // hold + 1, 2)).repeat(hold, axis=0)[: len(t)]
+    r_o[ground] = 0.0
+    u_bar = inject(t)
+    u, y_i, y_o = np.zeros((3, len(t), 2))
+    dither = 0.01 * generator.standard_normal((len(t), 2))
+    for k in range(1, len(t)):
+        if ground[k]:
+            continue
+        y_i[k] = y_i[k - 1] + Ts * (ACCELERATION * u[k - 1] - y_i[k - 1])
+        y_o[k] = y_o[k - 1] + Ts * (y_i[k] + y_i[k - 1]) / 2
+        u[k] = 0.1 * (4.0 * (r_o[k] - y_o[k]) - y_i[k]) + dither[k] + u_bar[k]
+    return Flight(t, u, y_i, y_o, r_o, u_bar)
+
+
+#: Of roll and pitch for a unit of torque, rad/s^2.
+ACCELERATION = np.array([100.0, 120.0])
+
+
+def pulses(t, amplitude=0.1, begin=-np.inf, end=np.inf):
+    """Torque of random sign on both axes, (N, 2), held for 40 ms, from `begin` to `end` (s)."""
+    hold = max(1, round(0.04 / (t[1] - t[0])))
+    signs = np.random.default_rng(0).choice([-amplitude, amplitude], (len(t) // hold + 1, 2))
+    return np.where(((t >= begin) & (t < end))[:, None], signs.repeat(hold, axis=0)[: len(t)], 0.0)
+
+
+def injected(flight, publication=0.0004):
+    """The topic that holds what was injected, published so long after the gyro sample."""
+    x, y = flight.u_bar.astype(np.float32).T
+    name = np.full(len(flight.t), b"MIMO_EXC", "S10")
+    return {"timestamp": microseconds(flight.t + publication), "x": x.copy(), "y": y.copy(), "name": name}
 
 
 def three(values):

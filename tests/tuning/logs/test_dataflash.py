@@ -82,13 +82,22 @@ def test_wild_values_and_times_cost_single_samples(tmp_path, flight):
     assert np.abs(log.y_i).max() < 2
 
 
-def identification(flight, axes, seconds=3.0):
+def chirps(t, seconds=6.0):
+    """The waveforms of two runs with a second between, the first on roll and the second on pitch, (N, 2)."""
+    columns = []
+    for run in range(2):
+        since = t - (t[0] + 0.5 + run * (seconds + 1))
+        columns.append(np.where((since >= 0) & (since < seconds), 0.1 * np.sin(9 * since**2 + 0.1), 0.0))
+    return np.column_stack(columns)
+
+
+def identification(flight, axes, seconds=6.0):
     """Runs of the system identification mode, one after the other with a second between."""
-    waveforms, setups = [], []
+    waveforms, setups, columns = [], [], chirps(flight.t, seconds)
     for run, axis in enumerate(axes):
         begin = flight.t[0] + 0.5 + run * (seconds + 1)
-        t = flight.t[(flight.t >= begin) & (flight.t < begin + seconds)]
-        waveforms.append(np.column_stack([microseconds(t), 0.1 * np.sin(9 * (t - begin) ** 2 + 0.1)]))
+        inside = (flight.t >= begin) & (flight.t < begin + seconds)
+        waveforms.append(np.column_stack([microseconds(flight.t[inside]), columns[inside, run]]))
         setups.append((microseconds(begin - 0.001), axis))
     waveform, setup = np.concatenate(waveforms), np.array(setups)
     return [
@@ -98,18 +107,18 @@ def identification(flight, axes, seconds=3.0):
 
 
 def test_the_waveform_of_the_mixer_axes_is_the_excitation_and_marks_the_experiment(tmp_path):
-    flight = make_flight(12.0)
+    flight = make_flight(18.0, inject=chirps)
     log = read_log(write(tmp_path / "x.bin", [*ardupilot_messages(flight), *identification(flight, (10, 11))]))
-    assert len(log.u) * log.Ts == pytest.approx(7.0, abs=0.02)
-    assert np.abs(log.u_bar[:740, 0]).max() == pytest.approx(0.1, rel=1e-3)
-    assert not log.u_bar[:740, 1].any()
-    assert not log.u_bar[760:990].any()
-    assert np.abs(log.u_bar[1010:, 1]).max() == pytest.approx(0.1, rel=1e-3)
-    assert not log.u_bar[1010:, 0].any()
+    assert len(log.u) * log.Ts == pytest.approx(13.0, abs=0.02)
+    assert np.abs(log.u_bar[:1490, 0]).max() == pytest.approx(0.1, rel=1e-3)
+    assert not log.u_bar[:1490, 1].any()
+    assert not log.u_bar[1510:1740].any()
+    assert np.abs(log.u_bar[1760:, 1]).max() == pytest.approx(0.1, rel=1e-3)
+    assert not log.u_bar[1760:, 0].any()
 
 
 def test_a_waveform_added_elsewhere_is_no_part_of_the_moment(tmp_path):
-    flight = make_flight(12.0)
+    flight = make_flight(18.0)
     log = read_log(write(tmp_path / "x.bin", [*ardupilot_messages(flight), *identification(flight, (7, 2))]))
     assert log.u_bar is None
     assert log.r_o is not None

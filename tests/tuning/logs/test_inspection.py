@@ -7,6 +7,7 @@ from tests.conftest import assert_one_clear_line
 from tests.tuning.logs.flights import (
     ardupilot_messages,
     dataflash_bytes,
+    injected,
     make_flight,
     microseconds,
     px4_topics,
@@ -66,18 +67,13 @@ def test_a_log_without_signals_is_as_long_as_its_messages(tmp_path, flight):
     assert found.airborne == ((0.0, pytest.approx(1.996)),)
 
 
-def test_the_band_and_the_strength_of_the_excitation_are_given_for_each_axis(tmp_path, flight):
-    u_bar = np.zeros((len(flight.t), 2), np.float32)
-    u_bar[:, 0] = 0.1 * np.sin(2 * np.pi * 4 * flight.t)
-    generator = np.random.default_rng(0)
-    u_bar[:, 1] = 0.02 * generator.standard_normal(len(flight.t))
-    topic = {
-        "timestamp": microseconds(flight.t + 0.0004),
-        "x": u_bar[:, 0].copy(),
-        "y": u_bar[:, 1].copy(),
-        "name": np.full(len(flight.t), b"MIMO_EXC", "S10"),
-    }
-    found = inspect_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight, debug_vect=topic)))
+def test_the_band_and_the_strength_of_the_excitation_are_given_for_each_axis(tmp_path):
+    def both(t):
+        noise = 0.02 * np.random.default_rng(0).standard_normal(len(t))
+        return np.column_stack([0.1 * np.sin(2 * np.pi * 4 * t), noise])
+
+    flight = make_flight(20.0, inject=both)
+    found = inspect_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight, debug_vect=injected(flight))))
     roll, pitch = found.excitation["u_bar roll"], found.excitation["u_bar pitch"]
     assert roll.rms == pytest.approx(0.0707, rel=0.01)
     assert roll.band_hz == pytest.approx((4, 4), abs=0.2)

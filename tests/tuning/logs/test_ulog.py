@@ -5,7 +5,16 @@ import struct
 import numpy as np
 import pytest
 
-from tests.tuning.logs.flights import attitude, make_flight, microseconds, px4_topics, three, write_ulog
+from tests.tuning.logs.flights import (
+    attitude,
+    injected,
+    make_flight,
+    microseconds,
+    pulses,
+    px4_topics,
+    three,
+    write_ulog,
+)
 from tuning.errors import TuningError
 from tuning.logs.reader import open_log, read_log
 
@@ -95,18 +104,12 @@ def test_where_timestamp_sample_is_zero_the_publication_time_stands_in(tmp_path,
     assert log.u == pytest.approx(flight.u, abs=1e-6)
 
 
-def excitation(flight, publication):
-    """An injected moment, zero in the first second, published so long after the gyro sample."""
-    u_bar = np.where(flight.t < flight.t[0] + 1, 0, np.sign(np.sin(40 * flight.t))).astype(np.float32)
-    name = np.full(len(flight.t), b"MIMO_EXC", "S10")
-    return {"timestamp": microseconds(flight.t + publication), "x": u_bar, "y": -u_bar, "name": name}
-
-
 @pytest.mark.parametrize("publication", [0.0001, 0.0004, 0.0006])
-def test_excitation_belongs_to_the_cycle_that_published_it_beside_its_torque(tmp_path, flight, publication):
-    topic = excitation(flight, publication)
-    log = read_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight, debug_vect=topic)))
-    assert log.u_bar[:, 0] == pytest.approx(topic["x"][250:])
+def test_excitation_belongs_to_the_cycle_that_published_it_beside_its_torque(tmp_path, publication):
+    flight = make_flight(inject=lambda t: pulses(t, begin=t[0] + 1.0))
+    topics = px4_topics(flight, debug_vect=injected(flight, publication))
+    log = read_log(write_ulog(tmp_path / "x.ulg", topics))
+    assert log.u_bar == pytest.approx(flight.u_bar[250:])
     assert log.u == pytest.approx(flight.u[250:], abs=1e-6)
 
 
