@@ -15,6 +15,7 @@ from tests.tuning.literal import literal_cascade
 from tuning.cascade import estimate, tune
 from tuning.certificate import certify
 from tuning.experiment import Experiment
+from tuning.plant_response import measured_plant
 from tuning.spec import load_spec
 from tuning.vrft import vrft
 

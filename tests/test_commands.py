@@ -15,6 +15,7 @@ from pyulog import ULog
 
 from sitl.airframe import FOLDER
 from tests.conftest import assert_one_clear_line
+from tuning.gains import load_gains
 from tuning.logs.ulog_file import open_ulog
 
 COMMANDS = [
@@ -79,9 +80,9 @@ def test_from_a_log_to_a_flight_by_the_commands_alone(mimopilot, log, tmp_path):
 def test_gains_in_doubt_are_not_emitted_unless_asked(mimopilot, log, tmp_path):
     assert mimopilot("tune", log, "--out", "x.gains.toml").returncode == 0
     text = (tmp_path / "x.gains.toml").read_text()
-    assert 'verdict = "certified"' in text or 'verdict = "stable, thin margin"' in text
+    assert 'verdict = "certified"' in text
     line = next(row for row in text.splitlines() if row.startswith("Kp_i = [["))
-    (tmp_path / "x.gains.toml").write_text(text.replace(line, "Kp_i = [[-0.15, 0.0], [0.0, 0.12]]"))
+    (tmp_path / "x.gains.toml").write_text(text.replace(line, "Kp_i = [[2.5, 0.0], [0.0, 0.12]]"))
     assert_one_clear_line(mimopilot("generate", "x.gains.toml", "--out", "cpp"), "void", "edited", "--uncertified")
     assert not (tmp_path / "cpp").exists()
     examined = mimopilot("certify", log, "--gains", "x.gains.toml", "--out", "y.gains.toml", "--json")
@@ -285,9 +286,12 @@ def test_the_demo_does_the_whole_way(mimopilot, tmp_path):
                 "peak_deg",
                 "saturated",
             }
-        # What multivariable tuning is for: the coupling is answered before it is felt.
-        assert methods["mimo"]["offaxis_peak_deg"] < methods["siso"]["offaxis_peak_deg"] / 3
-        assert methods["mimo"]["J_M_o"] < 1.1 * methods["siso"]["J_M_o"]
+        # What multivariable tuning is for: the coupling is answered before it is felt, and following is none the worse.
+        assert methods["mimo"]["offaxis_rms_deg"] < 0.8 * methods["siso"]["offaxis_rms_deg"]
+        assert methods["mimo"]["offaxis_rms_deg"] < 0.4 * methods["default"]["offaxis_rms_deg"]
+        assert methods["mimo"]["J_M_o"] < methods["siso"]["J_M_o"] < methods["default"]["J_M_o"]
+    for method in ("siso", "mimo"):
+        assert load_gains(tmp_path / found["gains"][method]).verdict()[0] == "certified"
     assert found["mavlink"]["samples"] == 729
     page = (tmp_path / found["report"]).read_text()
     assert page.count("<svg") == 3

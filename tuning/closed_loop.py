@@ -164,6 +164,8 @@ def refine_outer(
     target = np.stack([model.frequency_response(plant.omega) for model in models], axis=1)[:, :, None] * np.eye(2)
     where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
     spectrum = plant.omega**-0.5 if doublet_s is None else np.abs(doublet_spectrum(plant.omega, doublet_s))
+    # An integral over frequency: where the response's windows are narrow its values are many.
+    spectrum = spectrum * np.sqrt(np.gradient(plant.omega))
     weight = where * spectrum[:, None, None]
 
     def placed(values: Signal) -> Gains:

@@ -130,7 +130,8 @@ def _fits(spectra: Sequence[_Spectrum], n_w: int, narrowest: float, upper: float
                 for middle in np.arange(centre - half + narrowest, centre + half, 2 * narrowest)
             ]
             if _hides(wide, parts):
-                middles = np.arange(centre - half / 2, centre + half / 2, narrowest)
+                begin = max(centre - half / 2, found[-1].centre + narrowest) if found else centre - half / 2
+                middles = np.arange(begin, centre + half / 2, narrowest)
                 found += [_fit(spectra, middle, narrowest, n_w) for middle in middles if middle < upper]
                 centre += half
                 continue

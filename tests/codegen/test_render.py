@@ -244,7 +244,7 @@ def test_parameter_names_fit_a_vehicle():
 
 
 def test_a_gain_out_of_its_range_is_refused_by_name(gains):
-    with pytest.raises(CodegenError, match=r"MIMO_RP_RR: got 99 s, expected -5 to 5"):
+    with pytest.raises(CodegenError, match=r"MIMO_RP_RR: got 99 s, expected 0.0001 to 5"):
         render(gains.with_elements({"RP_RR": 99.0}))
 
 
