@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.body_shape import fit_shape, shape_response
 from tuning.errors import TuningError
 from tuning.experiment import Experiment, external_signal
 from tuning.frequency import local_response
@@ -20,6 +21,9 @@ GROWTH = 0.08
 KNOWN, UNKNOWN = 0.3, 0.7
 #: Two known frequencies belong to one stretch up to this ratio: the damped body between them is interpolated.
 HOLE = 1.25
+#: Smoothing over frequency: half width (ratio, as a logarithm), least number of values, largest mean square that is
+#: left over their variance, and the relative error that the shape of a body has of its own.
+SMOOTH, ENOUGH, EXPLAINED, SHAPE_ERROR = 0.3, 5, 1.5, 0.03
 #: Angles and rates are compared where the angles' relative error is below this.
 SURE = 0.1
 #: Most that rates may lag behind angles, s: filters of a gyro and an estimator.
@@ -188,12 +192,46 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
         coherence=found.explained[:, 2:4],
         Ts=experiment.Ts,
     )
-    return _angles_from_rates(plant)
+    return _angles_from_rates(_smoothed(plant))
 
 
 def measured_plant(experiment: Experiment) -> PlantResponse:
     """The plant's frequency response from the experiment's external signal; see `plant_response`."""
     return plant_response(experiment, external_signal(experiment)[0])
+
+
+def _smoothed(plant: PlantResponse) -> PlantResponse:
+    """The response to the rates, surer where it is that of a body behind a delay and a lag.
+
+    Divided by that shape it hardly changes with frequency, so each value is taken from a line through those within
+    `SMOOTH` of it; where the line does not explain them, at a mode of the frame, the value stays as it is.
+    """
+    use = plant.known()
+    if np.count_nonzero(use) < MIN_FREQUENCIES:
+        return plant
+    deviation = plant.deviation()
+    size = np.linalg.norm(plant.G_i, axis=(1, 2))[:, None, None]
+    weight = 1 / (deviation[use] ** 2 + (SHAPE_ERROR * size[use]) ** 2)
+    shape = shape_response(plant.omega, fit_shape(plant.omega[use], plant.G_i[use], weight)[0])[:, None, None]
+    ratio, spread = plant.G_i / shape, deviation / np.abs(shape)
+    G_i, reach = plant.G_i.copy(), plant.reach.copy()
+    places = np.log(plant.omega)
+    for k, place in enumerate(places):
+        near = np.flatnonzero(np.abs(places - place) <= SMOOTH)
+        if len(near) < ENOUGH:
+            continue
+        line = np.column_stack([np.ones(len(near)), places[near] - place])
+        certainty = 1 / np.mean(spread[near] ** 2, axis=(1, 2))
+        inverse = np.linalg.inv(line.T @ (certainty[:, None] * line))
+        values = ratio[near].reshape(len(near), -1)
+        found = inverse @ (line.T @ (certainty[:, None] * values))
+        # Windows overlap by half: their errors are those of half as many.
+        misfit = float(np.sum(certainty[:, None] * np.abs(values - line @ found) ** 2)) / (4 * (len(near) - 2))
+        share = np.sqrt(2 * inverse[0, 0] * max(1.0, misfit) * certainty[near == k][0])
+        if misfit < EXPLAINED and share < 1:
+            G_i[k] = shape[k] * found[0].reshape(2, 2)
+            reach[k] *= share
+    return replace(plant, G_i=G_i, reach=reach)
 
 
 def _angles_from_rates(plant: PlantResponse) -> PlantResponse:

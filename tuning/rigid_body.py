@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tuning.body_shape import fit_shape
 from tuning.errors import TuningError
 from tuning.plant_response import PlantResponse
 
@@ -15,10 +15,6 @@ from tuning.plant_response import PlantResponse
 UPPER = 60.0
 #: Known frequencies that the fit needs: as many as a log of some five seconds has.
 MIN_FREQUENCIES = 4
-#: What lies between torque and rate besides the body: delays (s), rotor lags (s) and damping (1/s) that are tried.
-DELAYS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06)
-LAGS = (0.0, 0.015, 0.025, 0.035, 0.05, 0.07, 0.1)
-DAMPINGS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
 #: Relative error that every frequency has besides its noise: no body is exactly of these shapes.
 SHAPE = 0.03
 
@@ -81,17 +77,6 @@ def rigid_body(plant: PlantResponse) -> RigidBody:
     plant = plant.at(use)
     size = np.linalg.norm(plant.G_i, axis=(1, 2))[:, None, None]
     weight = 1 / (plant.deviation() ** 2 + (SHAPE * size) ** 2)
-    s = 1j * plant.omega
-    shapes = np.array(
-        [
-            np.exp(-s * delay) / ((1 + s * lag) * (s + damping))
-            for delay, lag, damping in itertools.product(DELAYS, LAGS, DAMPINGS)
-        ]
-    )
-    # One least squares for each shape and element.
-    power = np.einsum("nk,kij->nij", np.abs(shapes) ** 2, weight)
-    B = np.einsum("nk,kij->nij", shapes.conj(), weight * plant.G_i).real / power
-    misfit = np.sum(weight * np.abs(plant.G_i) ** 2) - np.sum(power * B**2, axis=(1, 2))
-    best = int(np.argmin(misfit))
-    scale = max(1.0, float(misfit[best]) / (4 * len(plant.omega)))
-    return RigidBody(B[best], np.sqrt(scale / power[best]))
+    _, B, power, misfit = fit_shape(plant.omega, plant.G_i, weight)
+    scale = max(1.0, misfit / (4 * len(plant.omega)))
+    return RigidBody(B, np.sqrt(scale / power))

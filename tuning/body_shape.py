@@ -1,0 +1,56 @@
+"""The shape of a vehicle's response: a damped body behind a delay and the lag of its rotors."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: What lies between torque and rate besides the body: delays (s), rotor lags (s) and damping (1/s) that are tried.
+DELAYS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06)
+LAGS = (0.0, 0.015, 0.025, 0.035, 0.05, 0.07, 0.1)
+DAMPINGS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+
+Shape = tuple[float, float, float]
+Complex = NDArray[np.complex128]
+Signal = NDArray[np.float64]
+
+SHAPES: tuple[Shape, ...] = tuple(itertools.product(DELAYS, LAGS, DAMPINGS))
+
+
+def shape_response(omega: Signal, shape: Shape) -> Complex:
+    """exp(-j w delay) / ((1 + j w lag) (j w + damping)) at omega (K,), rad/s."""
+    delay, lag, damping = shape
+    s = 1j * omega
+    response: Complex = np.exp(-s * delay) / ((1 + s * lag) * (s + damping))
+    return response
+
+
+def fit_shape(omega: Signal, G: Complex, weight: Signal) -> tuple[Shape, Signal, Signal, float]:
+    """Least squares of G = B times a shape, with a real B.
+
+    Parameters
+    ----------
+    omega : (K,) array, rad/s
+    G : (K, 2, 2) array
+        Response from torque to rates.
+    weight : (K, 2, 2) array
+        Inverse variances.
+
+    Returns
+    -------
+    shape : Shape
+        The best of `SHAPES`: delay and lag (s), damping (1/s).
+    B : (2, 2) array, rad/s^2
+    power : (2, 2) array
+        Inverse variance of each element of B.
+    misfit : float
+        Weighted sum of squares that is left.
+    """
+    shapes = np.array([shape_response(omega, shape) for shape in SHAPES])
+    power = np.einsum("nk,kij->nij", np.abs(shapes) ** 2, weight)
+    B = np.einsum("nk,kij->nij", shapes.conj(), weight * G).real / power
+    misfit = np.sum(weight * np.abs(G) ** 2) - np.sum(power * B**2, axis=(1, 2))
+    best = int(np.argmin(misfit))
+    return SHAPES[best], B[best], power[best], float(misfit[best])
