@@ -338,8 +338,10 @@ def _told(plant: PlantResponse, gain: Signal, error: Signal) -> NDArray[np.bool_
     """Where the log says something of a loop's gain: it knows the response, the excitation is seen on an axis, or the
     gain is not noise.
     """
-    seen = np.any(plant.coherence > COHERENT, axis=1)
-    return np.asarray(plant.known() | seen | (error < NOT_NOISE * gain))
+    seen = np.any(plant.coherence > COHERENT, axis=1) | (error < NOT_NOISE * gain)
+    # By chance a value may look like one; a mode is seen by its neighbours, too.
+    beside = np.append(seen[1:], False) | np.append(False, seen[:-1])
+    return np.asarray(plant.known() | (seen & beside))
 
 
 def _peak_beyond(gains: Gains, plant: PlantResponse, end: float) -> float:

@@ -21,6 +21,8 @@ GROWTH = 0.08
 KNOWN, UNKNOWN = 0.3, 0.7
 #: Two known frequencies belong to one stretch up to this ratio: the damped body between them is interpolated.
 HOLE = 1.25
+#: Share of the excitation's power below the highest frequency of a response.
+POWER = 0.9999
 #: Smoothing over frequency: half width (ratio, as a logarithm), least number of values, largest mean square that is
 #: left over their variance, and the relative error that the shape of a body has of its own.
 SMOOTH, ENOUGH, EXPLAINED, SHAPE_ERROR = 0.3, 5, 1.5, 0.03
@@ -172,7 +174,7 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
         When the flight is too short, or w does not reach both axes.
     """
     signals = np.hstack([experiment.u, experiment.y_i, experiment.y_o])
-    upper = min(upper, 0.95 * np.pi / experiment.Ts)
+    upper = min(upper, 0.95 * np.pi / experiment.Ts, _reach(experiment, instrument))
     found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper, GROWTH)
     T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
     if np.any(np.linalg.matrix_rank(T_u) < 2):
@@ -198,6 +200,18 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
 def measured_plant(experiment: Experiment) -> PlantResponse:
     """The plant's frequency response from the experiment's external signal; see `plant_response`."""
     return plant_response(experiment, external_signal(experiment)[0])
+
+
+def _reach(experiment: Experiment, instrument: Signal) -> float:
+    """Highest frequency that was excited, rad/s: a chirp ends, and what is above it is told by chance only."""
+    reached = 0.0
+    for start, stop in experiment.segments:
+        part = instrument[start:stop] - instrument[start:stop].mean(axis=0)
+        power = np.cumsum(np.sum(np.abs(np.fft.rfft(part, axis=0)) ** 2, axis=1))
+        if power[-1] > 0:
+            bin_ = int(np.searchsorted(power, POWER * power[-1])) + 1
+            reached = max(reached, 2 * np.pi * bin_ / (len(part) * experiment.Ts))
+    return reached
 
 
 def _smoothed(plant: PlantResponse) -> PlantResponse:
