@@ -255,8 +255,8 @@ def _beyond_the_band(
         omega, gain = again
         return (
             f"at {omega:.0f} rad/s ({omega / (2 * np.pi):.0f} Hz) the loop's gain may reach {gain:.2f} again (at most "
-            f"{HIGH_FREQUENCY_LOOP:g}): a mode of the frame; stiffen it, filter the rates (notch, lower cut-off), or "
-            "lower the derivative filter or the gains"
+            f"{HIGH_FREQUENCY_LOOP:g}): a mode of the frame, or a derivative that grows faster than the vehicle's answer "
+            "falls; stiffen the frame, filter the rates (notch, lower cut-off), or lower the derivative filter or gain"
         )
     if loop + _outer_loop_above(gains, known) >= 1:
         return (

@@ -51,6 +51,13 @@ class LocalResponse:
     explained: Signal
     error: Complex
 
+    def deviation(self) -> Signal:
+        """Standard deviation of each element of the response, (K, n_v, n_w)."""
+        of_v = np.sqrt(np.maximum(np.real(np.diagonal(self.noise, axis1=1, axis2=2)), 0.0))
+        of_w = np.sqrt(np.maximum(np.real(np.diagonal(self.error, axis1=1, axis2=2)), 0.0))
+        deviation: Signal = of_v[:, :, None] * of_w[:, None, :]
+        return deviation
+
 
 def local_response(
     w: Signal,
@@ -120,7 +127,8 @@ class _Fit:
 
 def _fits(spectra: Sequence[_Spectrum], n_w: int, narrowest: float, upper: float, growth: float) -> list[_Fit]:
     """Windows up to `upper`, each up to the centre of the next; wide ones are cut where they would hide something."""
-    found, centre = [], narrowest
+    found: list[_Fit] = []
+    centre = narrowest
     while centre < upper:
         half = max(narrowest, growth * centre)
         wide = _fit(spectra, centre, half, n_w)

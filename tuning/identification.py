@@ -27,9 +27,11 @@ MAX_ORDER = 20
 #: Orders that are compared with a measured response, at most: a body, rotors, a filter and delays on two axes.
 RESPONSE_ORDER = 12
 PAST = 20
-#: Order by response: the lowest whose error is within this factor of the least is taken; one that misses more than
-#: this share of the response is of no use.
-NEARLY, POOR = 1.15, 0.5
+#: Order by response: the lowest whose weighted square error is within this factor of the least is taken; one that fits
+#: by less, percent, is of no use.
+NEARLY, POOR = 1.3, 50.0
+#: Relative error that a response has besides its noise, and the one at which it counts half for a fit.
+SHAPE, SURE = 0.01, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +168,7 @@ def pbsid_by_response(
     Ts: float,
     omega: Signal,
     response: Response,
+    deviation: Signal,
     *,
     past: int = PAST,
     future: int | None = None,
@@ -181,15 +184,17 @@ def pbsid_by_response(
     omega : (K,) array, rad/s
     response : (K, n_y, n_u) array
         From u to y, measured there.
+    deviation : (K, n_y, n_u) array
+        Its standard deviation.
     u, y, Ts, past, future, segments
         See `pbsid`.
 
     Returns
     -------
     model : IdentifiedModel
-        Of the lowest order that fits nearly best, with a stable predictor.
+        Of the lowest order that fits nearly best within the error of the response, with a stable predictor.
     fit : float, percent
-        100 (1 - |G - model| / |G|), each frequency weighed by its own, so that all octaves of an integrator count.
+        See `response_fit`.
 
     Raises
     ------
@@ -197,24 +202,42 @@ def pbsid_by_response(
         As `pbsid`, or when no order has a stable predictor, or fits.
     """
     states = _states(u, y, Ts, past, future, None, segments)
-    weight = omega[:, None, None]
-    size = float(np.linalg.norm(weight * response))
+    size = np.linalg.norm(response, axis=(1, 2))[:, None, None]
+    weight = 1 / (deviation**2 + (SHAPE * size) ** 2)
     found = []
     for order in range(1, min(RESPONSE_ORDER, states.most, len(states.singular_values)) + 1):
         model = states.model(order)
         if model.predictor_stable:
-            error = float(np.linalg.norm(weight * (model.plant.frequency_response(omega) - response)))
-            found.append((error / size, model))
+            error = float(np.sum(weight * np.abs(model.plant.frequency_response(omega) - response) ** 2))
+            found.append((error, model))
     if not found:
         raise TuningError("identification: no order has a stable predictor; record longer, or excite more strongly")
     least = min(error for error, _ in found)
-    if least > POOR:
+    model = next(model for error, model in found if error <= NEARLY * least)
+    fit = response_fit(model.plant, omega, response, deviation)
+    if fit < POOR:
         raise TuningError(
-            f"identification: no model of order 1 to {RESPONSE_ORDER} is near the measured response (the best is off "
-            f"by {least:.0%}, at most {POOR:.0%}); record longer, or excite more strongly"
+            f"identification: no model of order 1 to {RESPONSE_ORDER} is near the measured response (the best fits by "
+            f"{fit:.0f} %, at least {POOR:g} % are needed); record longer, or excite more strongly"
         )
-    error, model = next((error, model) for error, model in found if error <= NEARLY * least)
-    return model, 100 * (1 - error)
+    return model, fit
+
+
+def response_fit(plant: StateSpace, omega: Signal, response: Response, deviation: Signal) -> float:
+    """100 (1 - |G - model| / |G|), percent: each frequency weighed by itself, so that all octaves of an integrator count,
+    and by how surely it is known.
+
+    Parameters
+    ----------
+    plant : StateSpace
+    omega : (K,) array, rad/s
+    response, deviation : (K, n_y, n_u) arrays
+        Measured, and its standard deviation.
+    """
+    size, spread = (np.linalg.norm(part, axis=(1, 2)) for part in (response, deviation))
+    weight = (omega / (1 + (spread / (SURE * size)) ** 2))[:, None, None]
+    off = np.linalg.norm(weight * (plant.frequency_response(omega) - response))
+    return 100 * (1 - float(off / np.linalg.norm(weight * response)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,7 +376,7 @@ def identify_rates(
         raise TuningError(f"{experiment.source}: not excited: the response of the rates is known at no frequency")
     if order is None:
         model, response = pbsid_by_response(
-            u, y, experiment.Ts, known.omega, known.G_i, past=past, future=future, segments=segments
+            u, y, experiment.Ts, known.omega, known.G_i, known.deviation(), past=past, future=future, segments=segments
         )
     else:
         model = pbsid(u, y, experiment.Ts, order=order, past=past, future=future, segments=segments)
@@ -362,8 +385,7 @@ def identify_rates(
                 f"identification: the predictor of order {order} is not stable, its predictions grow without bound; "
                 "ask for another order, or leave it out"
             )
-        off = known.omega[:, None, None] * (model.plant.frequency_response(known.omega) - known.G_i)
-        response = 100 * (1 - float(np.linalg.norm(off) / np.linalg.norm(known.omega[:, None, None] * known.G_i)))
+        response = response_fit(model.plant, known.omega, known.G_i, known.deviation())
     u, y = u - u.mean(axis=0), y - y.mean(axis=0)
     parts = [(y[a:b][past:], model.predict(u[a:b], y[a:b])[past:]) for a, b in segments]
     measured, predicted = (np.vstack(side) for side in zip(*parts, strict=True))

@@ -78,7 +78,13 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
         found = local_response(external, y, experiment.Ts, experiment.segments)
         well = np.all(found.explained > COHERENT, axis=1)
         model, _ = pbsid_by_response(
-            external, y, experiment.Ts, found.omega[well], found.response[well], segments=experiment.segments
+            external,
+            y,
+            experiment.Ts,
+            found.omega[well],
+            found.response[well],
+            found.deviation()[well],
+            segments=experiment.segments,
         )
         simulated = np.zeros_like(y)
         for start, stop in experiment.segments:

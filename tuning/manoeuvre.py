@@ -80,7 +80,7 @@ def refine_cascade(
     TuningError
         When the measured response is known at too few frequencies, or no gains are found that keep the limits.
     """
-    known = response.at(response.known_run())
+    known = response.at(response.coherent_run())
     if len(known.omega) < MIN_FREQUENCIES:
         raise TuningError(f"the excitation reaches only {len(known.omega)} frequencies, fewer than {MIN_FREQUENCIES}")
     wanted = np.zeros((2, 1, len(model.setpoint), 2))

@@ -81,12 +81,18 @@ class PlantResponse:
 
     def known_run(self) -> NDArray[np.intp]:
         """The longest stretch of known frequencies, as indices; gaps up to `HOLE` do not end it."""
-        indices = np.flatnonzero(self.known())
+        return self._longest(self.known())
+
+    def coherent_run(self) -> NDArray[np.intp]:
+        """The longest stretch where the excitation explains both rates: what designs may lean on, as indices."""
+        return self._longest(np.all(self.coherence > COHERENT, axis=1))
+
+    def _longest(self, where: NDArray[np.bool_]) -> NDArray[np.intp]:
+        indices = np.flatnonzero(where)
         if not len(indices):
             return indices
         far = self.omega[indices[1:]] > HOLE * self.omega[indices[:-1]] + 2 * (self.omega[1] - self.omega[0])
-        runs = np.split(indices, np.flatnonzero(far) + 1)
-        return max(runs, key=len)
+        return max(np.split(indices, np.flatnonzero(far) + 1), key=len)
 
     def band(self, axis: int) -> tuple[float, float] | None:
         """Where the excitation explains an axis' rate, rad/s: the first and the last such frequency; None: nowhere."""

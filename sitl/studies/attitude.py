@@ -275,7 +275,7 @@ def optimum(study: Study) -> dict[str, Gains]:
         plant = measured.response
         found.append(tune_all(study, measured, siso_log))
         errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
-        bands.append(plant.omega[plant.known_run()[[0, -1]]])
+        bands.append(plant.omega[plant.coherent_run()[[0, -1]]])
     # Without noise a vehicle in balance needs no hover, and what comes after the doublet does not count.
     doublets = study.doublets(log.Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
     spent = [

@@ -1,6 +1,5 @@
 """upload, restore and params as a user runs them, on real sockets, against a scripted vehicle and against ours."""
 
-import dataclasses
 import json
 import os
 import random
@@ -240,8 +239,7 @@ def test_a_stock_autopilot_gets_the_diagonal(mimopilot, certified, gains, profil
 
 def test_an_uncertified_set_is_refused_before_the_vehicle_is_asked(mimopilot, gains, old, new, tmp_path):
     gains.save(tmp_path / "plain.gains.toml")
-    doubtful = {"verdict": "unstable", "reason": "by this test", "matrices_sha256": gains.matrices_sha256()}
-    dataclasses.replace(gains, certificate=doubtful).save(tmp_path / "bad.gains.toml")
+    gains.with_certificate({"verdict": "unstable", "reason": "by this test"}).save(tmp_path / "bad.gains.toml")
     with UdpVehicle(ScriptedVehicle(old)) as link:
         for name, word in (("plain", "no certificate"), ("bad", "unstable")):
             refused = mimopilot("upload", f"{name}.gains.toml", "--connect", link.url, "--yes")
