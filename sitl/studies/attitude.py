@@ -37,7 +37,7 @@ DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, pertur
 MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same with any effort"
 #: Effort over SISO's that is asked of the refined gains, as predicted: the 10 % of the expectation less what a
 #: prediction may miss.
-EFFORT = 1.05
+EFFORT = 1.04
 #: Seeds whose logs say what refined gains spend and how far a log leaves Ms open.
 TYPICAL = (0, 1, 2)
 #: Figures of a flight in which the vehicle was lost.

@@ -205,7 +205,7 @@ def test_an_experiment_over_mavlink_gives_a_log_to_tune_from(tmp_path, mimopilot
     excited = [np.flatnonzero(flown.u_bar[:, axis]) for axis in (0, 1)]
     assert [len(samples) * flown.Ts for samples in excited] == pytest.approx([12.0, 12.0])
     assert flown.Ts == 0.004
-    tuned = mimopilot("tune", log, "--inner", "20,0.4,0", "--outer", "10,0.7,0", "--out", tmp_path / "g.gains.toml")
+    tuned = mimopilot("tune", log, "--inner", "30,0.7,0", "--outer", "10,0.7,0", "--out", tmp_path / "g.gains.toml")
     assert tuned.returncode == 0, tuned.stderr
     assert "certified" in tuned.stdout
 

@@ -130,7 +130,7 @@ WRONG = {
     "delay:3=0.01@1": ("takes no target",),
     "delay=0.9@1": ("at most 0.504 s",),
     "gain:Kp=2@1": ("matrix",),
-    "gain:Kp_o=8@1": ("MIMO_AP_RR would be 52", "-50 to 50"),
+    "gain:Kp_o=8@1": ("MIMO_AP_RR would be 52", "0.01 to 50"),
     "skip=3@1+1": ("takes no duration",),
     "link@-1": ("at:", "greater than or equal to 0"),
     "link@1+0": ("duration", "greater than 0"),

@@ -186,7 +186,7 @@ def test_the_figures_of_a_perfect_response_are_zero_and_the_others_those_of_thei
 
 
 def test_a_lost_vehicle_is_reported_when_the_crash_rule_is_met(vehicle):
-    unstable = vehicle.default_gains().with_elements({"RP_RR": -0.3})
+    unstable = vehicle.default_gains().with_elements({"RP_RP": 1.0, "RP_PR": 1.0})
     flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, unstable), hover("roll", 6.0, TS), 1)
     assert flight.crashed_at is not None
     tilt = np.abs(flight.truth["attitude"][:, 0])
