@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 #: What lies between torque and rate besides the body: delays (s), rotor lags (s) and damping (1/s) that are tried.
 DELAYS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06)
 LAGS = (0.0, 0.015, 0.025, 0.035, 0.05, 0.07, 0.1)
-DAMPINGS = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)
+DAMPINGS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
 Shape = tuple[float, float, float]
 Complex = NDArray[np.complex128]

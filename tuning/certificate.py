@@ -135,17 +135,20 @@ def certify(
     band = (float(known.omega[0]), float(known.omega[-1]))
     above = loop_bound(gains, known)
     dense, nominal, draws = _loops(gains, known)
-    normal = _Normaliser(inner, outer, dense.omega)
+    normal = _Normaliser(inner, outer, dense.omega, gains.Ki_i)
     windings = [normal.windings(loop) for loop in draws]
     figures = _figures(above, dense, nominal, draws, inner)
     figures["Ms"] = max(figures["Ms"], _peak_beyond(gains, plant, band[1]))
     doubtful = sum(any(w) for w in windings)
+    beyond = _beyond_the_band(gains, known, above)
+    if beyond:
+        return verdict(NOT_CERTIFIED, beyond, figures, band)
     if any(normal.windings(nominal)) and doubtful > DRAWS / 2:
         where = "the rate loop alone" if normal.windings(nominal)[0] else "the whole cascade"
         return verdict(UNSTABLE, f"the determinant goes round 0: {where} is unstable", {}, band)
-    beyond = _beyond_the_band(gains, plant, known, body, above)
-    if beyond:
-        return verdict(NOT_CERTIFIED, beyond, figures, band)
+    doubt = _doubt(gains, plant, known, body)
+    if doubt:
+        return verdict(NOT_CERTIFIED, doubt, figures, band)
     if doubtful:
         reason = f"too close to the limit to tell: {doubtful} of {DRAWS} plants that the log allows are unstable"
         return verdict(NOT_CERTIFIED, reason, figures, band)
@@ -200,20 +203,27 @@ def _loops(gains: Gains, plant: PlantResponse) -> tuple[PlantResponse, CascadeLo
 
 
 class _Normaliser:
-    """det(n (I + L)) along the band and how often it goes round 0."""
+    """det(n (I + L)) along the band and how often it goes round 0.
+
+    n has a zero at z = 1 for each integrator of the loop: of the rate controller on axes that have an integral gain,
+    and of the angles.
+    """
 
     def __init__(
         self,
         inner: Sequence[ReferenceModel],
         outer: Sequence[ReferenceModel],
         omega: Signal,
+        Ki_i: Signal,
     ) -> None:
         # n is a product of scalars 1 - m: its phase is followed on a fine grid from 0 to Nyquist, once.
         fine = np.linspace(omega[0], np.pi / inner[0].Ts, 4000)
 
         def ones_minus(models: Sequence[ReferenceModel], at: Signal) -> Complex:
-            return np.stack([1 - model.frequency_response(at) for model in models], axis=1)
+            responses = [1 - model.frequency_response(at) for model in models]
+            return np.stack([np.ones(len(at), complex), *responses], axis=1)
 
+        inner = [model for model, row in zip(inner, Ki_i, strict=True) if np.any(row)]
         self.n_i = np.prod(ones_minus(inner, omega), axis=1)
         self.n_o = self.n_i * np.prod(ones_minus(outer, omega), axis=1)
         tail_i = np.prod(ones_minus(inner, fine), axis=1)
@@ -239,24 +249,14 @@ def _turn(f: Complex) -> float:
     return float(np.sum(np.angle(f[1:] / f[:-1])))
 
 
-def _beyond_the_band(
-    gains: Gains, plant: PlantResponse, known: PlantResponse, body: RigidBody, loop: float
-) -> str:
-    """Why nothing can be said outside of the band, where the rate loop's gain may still reach `loop`; empty when the
-    assumptions hold.
+def _beyond_the_band(gains: Gains, known: PlantResponse, loop: float) -> str:
+    """Why nothing can be said outside of the band, where the rate loop's gain may still reach `loop`, and so not of the
+    count within; empty when the assumptions hold.
     """
     if loop > HIGH_FREQUENCY_LOOP:
         return (
             f"excitation ends at {known.omega[-1]:.0f} rad/s, where the loop's gain may still reach {loop:.2f} "
             f"(at most {HIGH_FREQUENCY_LOOP:g}): excite a wider band"
-        )
-    again = large_again(gains, plant)
-    if again is not None:
-        omega, gain = again
-        return (
-            f"at {omega:.0f} rad/s ({omega / (2 * np.pi):.0f} Hz) the loop's gain may reach {gain:.2f} again (at most "
-            f"{HIGH_FREQUENCY_LOOP:g}): a mode of the frame, or a derivative that grows faster than the vehicle's answer "
-            "falls; stiffen the frame, filter the rates (notch, lower cut-off), or lower the derivative filter or gain"
         )
     if loop + _outer_loop_above(gains, known) >= 1:
         return (
@@ -271,11 +271,30 @@ def _beyond_the_band(
             f"{LOW_FREQUENCY_SENSITIVITY:g}), and nothing is known of the loop below: excite lower frequencies, or ask "
             "for a faster attitude loop"
         )
-    if np.any(gains.Ki_i) and body.integral_action(gains.Ki_i) <= 0:
+    return ""
+
+
+def _doubt(gains: Gains, plant: PlantResponse, known: PlantResponse, body: RigidBody) -> str:
+    """Why a loop whose count is right may be unstable all the same; empty when nothing speaks for it."""
+    again = large_again(gains, plant)
+    if again is not None:
+        omega, gain = again
+        return (
+            f"at {omega:.0f} rad/s ({omega / (2 * np.pi):.0f} Hz) the loop's gain may reach {gain:.2f} again (at most "
+            f"{HIGH_FREQUENCY_LOOP:g}): a mode of the frame, or a derivative that grows faster than the vehicle's "
+            "answer falls; stiffen the frame, filter the rates (notch, lower cut-off), or lower the derivative's "
+            "filter or gain"
+        )
+    if np.any(gains.Ki_i) and body.least(gains.Ki_i) <= 0:
         return (
             "Ki_i through the measured plant is not positive in every direction (at least "
-            f"{body.integral_action(gains.Ki_i):.3g} rad/s^2 per rad): the integral terms run away below the "
+            f"{body.least(gains.Ki_i):.3g} rad/s^2 per rad): the integral terms run away below the "
             "excitation; raise the diagonal of Ki_i, or leave the integral out"
+        )
+    if not np.any(gains.Ki_i) and body.least(gains.Kp_i + gains.Kff_i) <= 0:
+        return (
+            "there is no integral, and Kp_i through the measured plant is not positive in every direction (at least "
+            f"{body.least(gains.Kp_i + gains.Kff_i):.3g} rad/s^2 per rad/s)"
         )
     if np.linalg.eigvalsh(gains.Kp_o + gains.Kp_o.T)[0] <= 0:
         return f"below {known.omega[0]:.1f} rad/s the attitude loop's gain is not positive in every direction"

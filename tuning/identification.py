@@ -224,8 +224,8 @@ def pbsid_by_response(
 
 
 def response_fit(plant: StateSpace, omega: Signal, response: Response, deviation: Signal) -> float:
-    """100 (1 - |G - model| / |G|), percent: each frequency weighed by itself, so that all octaves of an integrator count,
-    and by how surely it is known.
+    """100 (1 - |G - model| / |G|), percent: each frequency weighed by itself, so that all octaves of an integrator
+    count, and by how surely it is known.
 
     Parameters
     ----------

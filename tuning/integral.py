@@ -12,7 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.linalg import block_diag
+from scipy.optimize import nnls
 
 from tuning.errors import TuningError
 from tuning.instruments import Stretches
@@ -21,6 +22,8 @@ from tuning.vrft import LoopEstimate
 
 #: The least integral action over the least proportional one, 1/s: an offset is gone within some ten seconds.
 LEAST = 0.1
+#: Cutting planes at most, and how near to the limit is near enough.
+PLANES, CLOSE = 100, 1e-6
 
 Matrix = NDArray[np.float64]
 
@@ -83,27 +86,27 @@ def _columns(loop: LoopEstimate) -> slice:
 
 
 def _nearest(loop: LoopEstimate, B: Matrix, floor: float) -> Matrix:
-    """The integral gains Ki with B Ki = L L' + floor I + skew that are nearest to those estimated."""
+    """The integral gains, nearest to those estimated, whose action is at least `floor` in every direction.
+
+    Cutting planes: the direction v in which the action is least gives one, v' B Ki v >= floor; the nearest point within
+    all of them is a least distance problem (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, chapter 23).
+    """
     Ki, columns = loop.gains["I"], _columns(loop)
-    roots = [np.linalg.cholesky(np.linalg.pinv(C[columns, columns], hermitian=True)) for C in loop.solution.covariance]
-    inverse, n = np.linalg.inv(B), len(Ki)
-    lower, upper = np.tril_indices(n), np.triu_indices(n, 1)
-
-    def matrix(values: NDArray[np.float64]) -> Matrix:
-        L, skew = np.zeros((n, n)), np.zeros((n, n))
-        L[lower] = values[: len(lower[0])]
-        skew[upper] = values[len(lower[0]) :]
-        nearest: Matrix = inverse @ (L @ L.T + floor * np.eye(n) + skew - skew.T)
-        return nearest
-
-    def distance(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.concatenate([root.T @ row for root, row in zip(roots, matrix(values) - Ki, strict=True)])
-
-    action = B @ Ki
-    values, vectors = np.linalg.eigh((action + action.T) / 2)
-    start = np.linalg.cholesky((vectors * np.maximum(values - floor, 0.1 * floor)) @ vectors.T)
-    first = np.concatenate([start[lower], ((action - action.T) / 2)[upper]])
-    return matrix(least_squares(distance, first, x_scale="jac").x)
+    blocks = [np.linalg.cholesky(C[columns, columns]) for C in loop.solution.covariance]
+    root = block_diag(*blocks)  # Ki = estimate + root x has the metric of x
+    found, planes, limits = Ki, np.empty((0, Ki.size)), np.empty(0)
+    for _ in range(PLANES):
+        values, vectors = np.linalg.eigh((B @ found + found.T @ B.T) / 2)
+        if values[0] >= floor * (1 - CLOSE):
+            break
+        plane = np.outer(B.T @ vectors[:, 0], vectors[:, 0]).ravel()
+        planes, limits = np.vstack([planes, plane @ root]), np.append(limits, floor - plane @ Ki.ravel())
+        size = np.linalg.norm(planes, axis=1)
+        system = np.vstack([(planes / size[:, None]).T, limits / size])
+        weights, _ = nnls(system, np.append(np.zeros(Ki.size), 1.0))
+        left = system @ weights - np.append(np.zeros(Ki.size), 1.0)
+        found = Ki + (root @ (-left[:-1] / left[-1])).reshape(Ki.shape)
+    return found
 
 
 def _moved(loop: LoopEstimate, Ki: Matrix) -> LoopEstimate:

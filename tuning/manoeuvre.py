@@ -203,9 +203,9 @@ class _Task:
         differences = np.concatenate(singular_values(np.eye(2, dtype=complex) + loops), axis=-1)
         peaks = np.sum(differences**-SMOOTH, axis=-1) ** (1 / SMOOTH)
         above = loop_above(candidates, self.known)[:, -1] / HIGH_FREQUENCY_LOOP
-        integral, floor = np.ones(len(above)), INTEGRAL * float(self.body.integral_action(self.start.Ki_i))
+        integral, floor = np.ones(len(above)), INTEGRAL * float(self.body.least(self.start.Ki_i))
         if floor > 0:
-            integral = self.body.integral_action(candidates.Ki_i[:, 0]) / floor - 1
+            integral = self.body.least(candidates.Ki_i[:, 0]) / floor - 1
         return np.column_stack([1 - peaks / peak, 1 - above / SHARE, integral])
 
 

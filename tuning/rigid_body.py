@@ -42,18 +42,20 @@ class RigidBody:
         gradient = np.array([[d, -c], [-b, a]])
         return float(a * d - b * c), float(np.linalg.norm(gradient * self.deviation))
 
-    def integral_action(self, Ki_i: Signal) -> Signal:
-        """The least that an integral term does in any direction: smallest eigenvalue of the symmetric part of B Ki.
+    def least(self, gain: Signal) -> Signal:
+        """The least that a term of the rate controller does in any direction: smallest eigenvalue of the symmetric part
+        of B times its gain.
 
         Parameters
         ----------
-        Ki_i : (..., 2, 2) array
+        gain : (..., 2, 2) array
+            Such as Kp_i or Ki_i.
 
         Returns
         -------
-        (...) array, rad/s^2 per rad
+        (...) array, rad/s^2 per unit of the error, or of its integral
         """
-        action = self.B @ Ki_i
+        action = self.B @ gain
         return np.asarray(np.linalg.eigvalsh((action + np.swapaxes(action, -1, -2)) / 2)[..., 0])
 
 

@@ -298,7 +298,7 @@ def optimum(study: Study) -> dict[str, Gains]:
         body,
         DEFAULT_THRESHOLDS.thin_Ms - float(np.median(errors)),
         [float(rms) for rms in np.median(spent, axis=0)],
-        INTEGRAL * float(body.integral_action(found[0][MIMO].Ki_i)),
+        INTEGRAL * float(body.least(found[0][MIMO].Ki_i)),
     )
     best = best_gains(task, [found[0][AUTOTUNE], *(gains[REFINED] for gains in found)])
     return {BEST: best, BOUND: best_gains(replace(task, effort=None), [best])}

@@ -58,7 +58,7 @@ class Task:
     effort : sequence of 2 float or None
         RMS of the moments allowed in each doublet; None: as much as it takes.
     integral : float, 1/s
-        Integral action that is needed, see `tuning.rigid_body.RigidBody.integral_action`: a vehicle must find its trim.
+        Integral action that is needed, see `tuning.rigid_body.RigidBody.least`: a vehicle must find its trim.
     """
 
     airframe: Airframe
@@ -101,7 +101,7 @@ class Task:
             *(1 - flown_effort(flight) / most for flight, most in zip(flights, allowed, strict=True)),
             1 - float((1 / loop).max()) / self.peak,
             1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
-            float(self.body.integral_action(gains.Ki_i)) / self.integral - 1,
+            float(self.body.least(gains.Ki_i)) / self.integral - 1,
         ]
 
 

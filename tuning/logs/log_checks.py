@@ -1,7 +1,8 @@
 """Logs that cannot be true: columns with a wrong sign or unit, or in each other's place.
 
 What is injected must be in the torque, a torque must accelerate its own axis the right way, and rates must be the
-derivatives of the angles. Each relation is measured as a 2x2 matrix; which of them are broken tells which column is wrong.
+derivatives of the angles. Each relation is measured as a 2x2 matrix; which of them are broken tells which column is
+wrong.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ OVER = 0.1
 #: Each second of a flight counts alike, so that a tumble does not outweigh the rest.
 WINDOW = 1.0
 #: An axis that moves less over `OVER` (RMS, rad) is not judged.
-STILL = 2e-3
+#: So much more an angle must move than a rate's integral to be told from its noise.
+STILL, NOISE = 2e-3, 5.0
 #: Share of the angles' movement that the rates must explain.
 EXPLAINED = 0.5
 #: Factors between angles and integrated rates that are no unit: kinematics of banked flight.
 SAME_UNIT = (0.4, 2.5)
 DEGREE = 180 / math.pi
-#: Angular acceleration of a unit of torque that multirotors have, rad/s^2: a heavy lifter, and above the smallest racers.
+#: Angular acceleration of a unit of torque that multirotors have, rad/s^2: a heavy lifter, the smallest racers.
 ACCELERATION = (3.0, 5000.0)
 #: Roll and pitch of one vehicle accelerate alike but for this ratio.
 UNLIKE = 20.0
@@ -81,29 +83,33 @@ def check_log(experiment: Experiment, recording: Recording) -> None:
     try:
         external, name = external_signal(experiment)
         excited_stretches(experiment, external, "mimo")
-    except TuningError:
-        # Without excitation only rates and angles can contradict each other.
-        _blame(names, None, None, angles, kinematics.matrix, None)
-        _check_units(kinematics.matrix, None, names)
-        if np.any(experiment.u_bar):
-            raise
-        return
-    injected = _injected(experiment) if name == "u_bar" else None
-    if injected is not None and np.linalg.norm(injected, axis=1).min() < CONTAINED:
-        axis = AXES[int(np.argmin(np.linalg.norm(injected, axis=1)))]
-        raise TuningError(
-            f"{names.path}: {names.of('u')} does not contain what was injected on {axis} "
-            f"({np.linalg.norm(injected, axis=1).min():.2f} of it, expected 1): log the torque after the injection, at the "
-            "same rate"
-        )
-    try:
+        injected = _injected(experiment) if name == "u_bar" else None
+        _check_contained(injected, names)
         body = rigid_body(measured_plant(experiment))
     except TuningError as error:
-        raise TuningError(f"{names.path}: {str(error).removeprefix(f'{experiment.source}: ')}") from error
+        # Without enough excitation only rates and angles can contradict each other.
+        _blame(names, None, None, angles, kinematics.matrix, None)
+        _check_units(kinematics.matrix, None, names)
+        if experiment.u_bar is None and str(error).startswith(f"{experiment.source}: no excitation"):
+            return  # there are other uses of such a log; tuning says what it lacks
+        cause = str(error).removeprefix(f"{names.path}: ").removeprefix(f"{experiment.source}: ")
+        raise TuningError(f"{names.path}: {cause}") from error
     torque = _relation(body.B)
     _blame(names, injected, torque, angles, kinematics.matrix, body)
     _check_units(kinematics.matrix, body, names)
     _check_clear(body, names)
+
+
+def _check_contained(injected: Matrix | None, names: _Names) -> None:
+    """Refuse torque that was logged before the injection."""
+    if injected is None:
+        return
+    shares = np.linalg.norm(injected, axis=1)
+    if shares.min() < CONTAINED:
+        raise TuningError(
+            f"{names.path}: {names.of('u')} does not contain what was injected on {AXES[int(np.argmin(shares))]} "
+            f"({shares.min():.2f} of it, expected 1): log the torque after the injection, at the same rate"
+        )
 
 
 def check_angles(recording: Recording) -> None:
@@ -157,7 +163,7 @@ def _kinematics(experiment: Experiment) -> _Kinematics:
             outer += y.T @ x / scale
             inner += x.T @ x / scale
             moved += np.sum(y**2, axis=0) / scale
-            energy.append(np.mean(x**2, axis=0))
+            energy.append(np.maximum(np.mean(x**2, axis=0), np.mean(y**2, axis=0) / NOISE**2))
     if not energy:
         return _Kinematics(np.eye(2), np.ones(2), np.zeros(2, bool))
     moves = np.sqrt(np.median(energy, axis=0)) > STILL
@@ -260,9 +266,9 @@ def _check_derivative(kinematics: _Kinematics, names: _Names) -> None:
     for axis, name in enumerate(AXES):
         if kinematics.moves.all() and kinematics.explained[axis] < EXPLAINED:
             raise TuningError(
-                f"{names.path}: the rates in {names.of('y_i')} explain {max(kinematics.explained[axis], 0):.0%} of how {name} "
-                f"in {names.of('y_o')} moves, expected nearly all: they are not of one vehicle, not of one time, or not rates "
-                "and angles"
+                f"{names.path}: the rates in {names.of('y_i')} explain {max(kinematics.explained[axis], 0):.0%} of "
+                f"how {name} in {names.of('y_o')} moves, expected nearly all: they are not of one vehicle, not of one "
+                "time, or not rates and angles"
             )
 
 
@@ -276,10 +282,11 @@ def _check_units(kinematics: Matrix, body: RigidBody | None, names: _Names) -> N
             if not extreme:
                 continue
             assert body is not None
-            unit = "in degrees" if extreme > 0 else "told in degrees but are in radians, or torque is not a share of the full one"
+            unit = "told in degrees but are in radians, or the torque is no share of the full one"
             wrong.append(
-                f"a unit of torque accelerates {name} by {body.B[axis, axis]:.3g} rad/s^2, too {SIZES[extreme]} for a multirotor "
-                f"({ACCELERATION[0]:g} to {ACCELERATION[1]:g}) or beside the other axis: its rates and angles are {unit}"
+                f"a unit of torque accelerates {name} by {body.B[axis, axis]:.3g} rad/s^2, too {SIZES[extreme]} for "
+                f"a multirotor ({ACCELERATION[0]:g} to {ACCELERATION[1]:g}) or beside the other axis: its rates and angles "
+                f"are {'in degrees' if extreme > 0 else unit}"
             )
             lines.append((("y_i", "y_o"), axis))
             continue
@@ -318,13 +325,13 @@ def _check_clear(body: RigidBody, names: _Names) -> None:
         value, error = body.B[axis, axis], body.deviation[axis, axis]
         if value < CLEAR * error:
             raise TuningError(
-                f"{names.path}: a unit of torque accelerates {name} by {value:.3g} +- {error:.2g} rad/s^2: too uncertain to "
-                "know its sign; inject a stronger or longer torque"
+                f"{names.path}: a unit of torque accelerates {name} by {value:.3g} +- {error:.2g} rad/s^2: too "
+                "uncertain to know its sign; inject a stronger or longer torque"
             )
     if determinant < CLEAR * deviation:
         raise TuningError(
-            f"{names.path}: roll and pitch cannot be told apart in the response to torque (determinant {determinant:.3g} +- "
-            f"{deviation:.2g}): inject a stronger or longer torque on each axis by itself"
+            f"{names.path}: roll and pitch cannot be told apart in the response to torque (determinant "
+            f"{determinant:.3g} +- {deviation:.2g}): inject a stronger or longer torque on each axis by itself"
         )
 
 
@@ -351,8 +358,8 @@ class _Names:
         return " and ".join(columns.name(SIGNALS[signal][axis]) for signal in signals)
 
     def lines(self, signals: Sequence[str], axes: Sequence[int], what: str) -> list[str]:
-        """The lines of a column file for some axes of signals: another ``sign`` or ``unit``, or the ``other`` column; none
-        where the log names its signals itself.
+        """The lines of a column file for some axes of signals: another ``sign`` or ``unit``, or the ``other`` column;
+        none where the log names its signals itself.
         """
         columns = self.recording.columns
         if columns is None:
@@ -370,4 +377,5 @@ class _Names:
 
     def mend(self, signals: Sequence[str], axes: Sequence[int], what: str) -> str:
         """What to do about some axes of signals."""
-        return self.tell(self.lines(signals, axes, what)) or f"{self.all(signals)} in this log is not what its name says"
+        told = self.tell(self.lines(signals, axes, what))
+        return told or f"{self.all(signals)} in this log is not what its name says"

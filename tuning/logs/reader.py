@@ -110,7 +110,7 @@ def experiment_of(recording: Recording) -> Experiment:
 
 
 def unchecked_experiment(recording: Recording) -> Experiment:
-    """The experiment in a log whose signals may contradict each other, `tuning.logs.log_checks`; see `experiment_of`."""
+    """The experiment in a log whose signals may contradict each other; see `experiment_of`."""
     said = [*recording.warnings]
     try:
         return _experiment(recording, said)
