@@ -285,8 +285,8 @@ def _check_units(kinematics: Matrix, body: RigidBody | None, names: _Names) -> N
             unit = "told in degrees but are in radians, or the torque is no share of the full one"
             wrong.append(
                 f"a unit of torque accelerates {name} by {body.B[axis, axis]:.3g} rad/s^2, too {SIZES[extreme]} for "
-                f"a multirotor ({ACCELERATION[0]:g} to {ACCELERATION[1]:g}) or beside the other axis: its rates and angles "
-                f"are {'in degrees' if extreme > 0 else unit}"
+                f"a multirotor ({ACCELERATION[0]:g} to {ACCELERATION[1]:g}) or beside the other axis: its rates and "
+                f"angles are {'in degrees' if extreme > 0 else unit}"
             )
             lines.append((("y_i", "y_o"), axis))
             continue
