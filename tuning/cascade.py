@@ -70,6 +70,15 @@ class CascadeEstimate:
         """`deviations` of the rate loop alone."""
         return {TERMS[term]: self._assembled(self.inner, term) for term in self.inner[0].gains}
 
+    def draw_inner(self, gains: Gains, generator: np.random.Generator) -> Gains:
+        """The set with rate gains that are as likely as its own, from their covariance."""
+        moved = {TERMS[term]: getattr(gains, TERMS[term]).copy() for term in self.inner[0].gains}
+        for (axes, _), loop in zip(self.stretches, self.inner, strict=True):
+            rows = np.array([generator.multivariate_normal(np.zeros(len(C)), C) for C in loop.solution.covariance])
+            for term, part in zip(loop.gains, np.split(rows, len(loop.gains), axis=1), strict=True):
+                moved[TERMS[term]][axes, axes] += part
+        return replace(gains, **moved)  # type: ignore[arg-type]
+
     def outer_deviation(self) -> NDArray[np.float64]:
         """That of Kp_o: costs as much as all others, and is not needed where a refinement brings its own."""
         return self._assembled(self.outer, "P")
@@ -257,7 +266,9 @@ def tune(
     if spec.refine:
         try:
             full = spec.method == "mimo"
-            gains, deviations["Kp_o"] = refine_outer(gains, plant, outer_models, full, spec.doublet_s)
+            gains, deviations["Kp_o"] = refine_outer(
+                gains, plant, outer_models, full, spec.doublet_s, found.draw_inner
+            )
         except TuningError as error:
             warnings.append(f"the attitude gains are left as VRFT gives them: {error}")
     if spec.manoeuvre:

@@ -6,7 +6,7 @@ about the flown difference equation follows there: C_e = Kp + Ts Ki z/(z-1), C_d
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -124,7 +124,12 @@ def doublet_spectrum(omega: Signal, seconds: float) -> Complex:
 
 
 def refine_outer(
-    gains: Gains, plant: PlantResponse, models: Sequence[ReferenceModel], full: bool, doublet_s: float | None = None
+    gains: Gains,
+    plant: PlantResponse,
+    models: Sequence[ReferenceModel],
+    full: bool,
+    doublet_s: float | None = None,
+    draw_inner: Callable[[Gains, np.random.Generator], Gains] = lambda gains, generator: gains,
 ) -> tuple[Gains, Signal]:
     """Kp_o that brings the measured closed loop closest to the outer reference model.
 
@@ -144,13 +149,15 @@ def refine_outer(
         False: the diagonal only (SISO).
     doublet_s : float, s, optional
         Length of the doublet whose spectrum weighs the error.
+    draw_inner : callable, optional
+        Gives the set with rate gains that the log's noise could have given as well.
 
     Returns
     -------
     gains : Gains
         With the new Kp_o.
     deviations : (2, 2) array, 1/s
-        Standard deviation of its elements, from the error of the measured response.
+        Standard deviation of its elements, from the errors of the measured response and of the rate gains.
 
     Raises
     ------
@@ -168,18 +175,20 @@ def refine_outer(
     spectrum = spectrum * np.sqrt(np.gradient(plant.omega))
     weight = where * spectrum[:, None, None]
 
-    def placed(values: Signal) -> Gains:
+    def placed(values: Signal, around: Gains = gains) -> Gains:
         Kp_o = np.zeros((2, 2))
         Kp_o[where] = values
-        return replace(gains, Kp_o=Kp_o)
+        return replace(around, Kp_o=Kp_o)
 
-    def distance(values: Signal, of: PlantResponse = plant) -> Signal:
-        error = (cascade_loop(placed(values), of).T_o - target) * weight
+    def distance(values: Signal, of: PlantResponse = plant, around: Gains = gains) -> Signal:
+        error = (cascade_loop(placed(values, around), of).T_o - target) * weight
         return np.concatenate([error.real.ravel(), error.imag.ravel()])
 
     found = least_squares(distance, gains.Kp_o[where], x_scale="jac")
     generator = np.random.default_rng(0)
-    shifts = np.array([distance(found.x, plant.draw(generator)) - found.fun for _ in range(DRAWS)])
+    shifts = np.array(
+        [distance(found.x, plant.draw(generator), draw_inner(gains, generator)) - found.fun for _ in range(DRAWS)]
+    )
     deviations = np.zeros((2, 2))
     deviations[where] = np.std(shifts @ np.linalg.pinv(found.jac).T, axis=0)
     return placed(found.x), deviations
