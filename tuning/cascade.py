@@ -13,7 +13,7 @@ from tuning.closed_loop import refine_outer
 from tuning.controller import rebuild_rate_setpoint
 from tuning.doublet import doublet_model
 from tuning.errors import NotMinimumPhaseError, TuningError
-from tuning.experiment import Experiment
+from tuning.experiment import Experiment, external_signal
 from tuning.gains import Gains, Limits, YawGains
 from tuning.gates import examine_band, examine_estimates, examine_saturation
 from tuning.instruments import Instruments, Stretches, align, excited_stretches, instruments
@@ -252,6 +252,7 @@ def tune(
     """
     spec = spec or TuningSpec()
     measured = measured or Measured(experiment)
+    excited_stretches(experiment, external_signal(experiment)[0], spec.method)
     found = estimate(experiment, spec, repeat, measured.body)
     plant = measured.response
     warnings = [

@@ -337,7 +337,7 @@ def large_again(gains: Gains, plant: PlantResponse) -> tuple[float, float] | Non
     Returns
     -------
     tuple of 2 float or None
-        Frequency (rad/s) and the gain with its error, where that is largest; None: nowhere.
+        Frequency (rad/s) where it is surest, and the gain with its error there; None: nowhere.
     """
     gain, error = _rate_loop_gain(gains, plant)
     known = np.flatnonzero(plant.known())
@@ -349,8 +349,8 @@ def large_again(gains: Gains, plant: PlantResponse) -> tuple[float, float] | Non
     counts = _told(plant, gain, error) & (plant.omega > ABOUT * plant.omega[small[0]]) & (upper > HIGH_FREQUENCY_LOOP)
     if not counts.any():
         return None
-    worst = int(np.argmax(np.where(counts, upper, 0)))
-    return float(plant.omega[worst]), float(upper[worst])
+    surest = int(np.argmax(np.where(counts, gain - error, -np.inf)))
+    return float(plant.omega[surest]), float(upper[surest])
 
 
 def _told(plant: PlantResponse, gain: Signal, error: Signal) -> NDArray[np.bool_]:

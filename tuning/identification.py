@@ -173,6 +173,7 @@ def pbsid_by_response(
     past: int = PAST,
     future: int | None = None,
     segments: Sequence[tuple[int, int]] | None = None,
+    least_fit: float = POOR,
 ) -> tuple[IdentifiedModel, float]:
     """`pbsid` with the order whose frequency response is nearest to the measured one.
 
@@ -188,6 +189,8 @@ def pbsid_by_response(
         Its standard deviation.
     u, y, Ts, past, future, segments
         See `pbsid`.
+    least_fit : float, percent
+        What fits by less is refused.
 
     Returns
     -------
@@ -215,10 +218,10 @@ def pbsid_by_response(
     least = min(error for error, _ in found)
     model = next(model for error, model in found if error <= NEARLY * least)
     fit = response_fit(model.plant, omega, response, deviation)
-    if fit < POOR:
+    if fit < least_fit:
         raise TuningError(
             f"identification: no model of order 1 to {RESPONSE_ORDER} is near the measured response (the best fits by "
-            f"{fit:.0f} %, at least {POOR:g} % are needed); record longer, or excite more strongly"
+            f"{fit:.0f} %, at least {least_fit:g} % are needed); record longer, or excite more strongly"
         )
     return model, fit
 

@@ -14,7 +14,7 @@ from tuning.errors import TuningError
 from tuning.experiment import Experiment, external_signal
 from tuning.frequency import local_response
 from tuning.identification import pbsid_by_response
-from tuning.plant_response import COHERENT
+from tuning.plant_response import MIN_FREQUENCIES
 
 AXES = ("roll", "pitch")
 #: Two flights count as one experiment flown twice when their excitations agree to this correlation.
@@ -76,7 +76,13 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
     if kind == "model":
         y = np.hstack([experiment.y_i, experiment.y_o])
         found = local_response(external, y, experiment.Ts, experiment.segments)
-        well = np.all(found.explained > COHERENT, axis=1)
+        spread, size = (np.linalg.norm(part, axis=(1, 2)) for part in (found.deviation(), found.response))
+        well = spread < size  # what is worse tells nothing of a model
+        if np.count_nonzero(well) < MIN_FREQUENCIES:
+            raise TuningError(
+                f"{experiment.source}: not excited: the outputs' response is known at {np.count_nonzero(well)} "
+                "frequencies; inject a stronger or longer torque, or leave --instrument model out"
+            )
         model, _ = pbsid_by_response(
             external,
             y,
@@ -85,6 +91,7 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
             found.response[well],
             found.deviation()[well],
             segments=experiment.segments,
+            least_fit=-np.inf,  # an instrument need only resemble the outputs; its strength is judged later
         )
         simulated = np.zeros_like(y)
         for start, stop in experiment.segments:

@@ -76,12 +76,22 @@ class PlantResponse:
 
     def known(self) -> NDArray[np.bool_]:
         """Where G_i is known: the excitation explains both rates, or its error is small all the same, (K,)."""
-        error = np.linalg.norm(self.deviation(), axis=(1, 2)) / np.linalg.norm(self.G_i, axis=(1, 2))
+        error = self.rate_error()
         return np.asarray(np.all(self.coherence > COHERENT, axis=1) & (error < UNKNOWN) | (error < KNOWN))
 
+    def rate_error(self) -> Signal:
+        """Standard deviation of G_i over its size, (K,), Frobenius norms."""
+        error: Signal = np.linalg.norm(self.deviation(), axis=(1, 2)) / np.linalg.norm(self.G_i, axis=(1, 2))
+        return error
+
     def known_run(self) -> NDArray[np.intp]:
-        """The longest stretch of known frequencies, as indices; gaps up to `HOLE` do not end it."""
-        return self._longest(self.known())
+        """The longest stretch of known frequencies, as indices; gaps up to `HOLE` do not end it.
+
+        It begins where the error is small. Below, the flying loop leaves the torque little of the excitation: the rates
+        are coherent all the same, and what the vehicle does beside its linear response decides.
+        """
+        sure = np.logical_or.accumulate(self.rate_error() < KNOWN)
+        return self._longest(self.known() & sure)
 
     def coherent_run(self) -> NDArray[np.intp]:
         """The longest stretch where the excitation explains both rates: what designs may lean on, as indices."""

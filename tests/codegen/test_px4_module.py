@@ -221,7 +221,7 @@ def test_gains_out_of_their_range_are_refused_by_name_and_the_old_ones_fly_on(pr
     inputs = np.zeros(300, INPUT)
     inputs["rates"], inputs["armed"] = 0.1, 1
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
-    assert any("MIMO_RP_RR is not within -5 to 5" in line for line in result.log)
+    assert any("MIMO_RP_RR is not within 0.0001 to 5" in line for line in result.log)
 
 
 def test_a_reset_heading_turns_the_setpoint_with_it(program):

@@ -149,7 +149,7 @@ LINE = "1\t1\t{}\t{}\t9\n"
         ("1\t1\tMIMO_RP_RR\t0.1", "line 1"),
         (LINE.format("MIMO_RP_RR", "nan"), "MIMO_RP_RR.*finite"),
         (LINE.format("MIMO_NOPE", "1"), "MIMO_NOPE: this vehicle has no such parameter"),
-        (LINE.format("MIMO_RP_RR", "99"), "MIMO_RP_RR: got 99.0, expected -5 to 5"),
+        (LINE.format("MIMO_RP_RR", "99"), "MIMO_RP_RR: got 99.0, expected 0.0001 to 5"),
         (LINE.format("MIMO_EX_SEED", "1.5"), "MIMO_EX_SEED: got 1.5, expected a whole number"),
         (LINE.format("MIMO_TS", "0.002"), "MIMO_TS is 0.002, the gains are for 0.004"),
         (LINE.format("MIMO_SCALE_R", "1"), "kept for another vehicle"),

@@ -48,7 +48,7 @@ def test_what_a_ground_station_sets_outlives_a_kill_and_outranks_the_gains(tmp_p
         pilot.close()
     kept.write_text(kept.read_text().replace("0.125", "1e9"))
     refused = mimopilot("sitl", "adam0", "--parameters", kept, "--tcp-port", 0, "--vehicle-port", 0)
-    assert_one_clear_line(refused, str(kept), "MIMO_RP_RR", "expected -5 to 5")
+    assert_one_clear_line(refused, str(kept), "MIMO_RP_RR", "expected 0.0001 to 5")
 
 
 def test_two_stations_by_udp_and_tcp_see_each_others_changes_and_only_their_own_answers():

@@ -7,6 +7,7 @@ from sitl.autopilot import Autopilot
 from sitl.loop import fly
 from sitl.scenario import doublet
 from tests.tuning.test_certificate import experiment
+from tests.tuning.truth import thesis
 from tuning.advisor import Doublet, advise, predict
 from tuning.cascade import tune
 from tuning.certificate import CERTIFIED
@@ -29,8 +30,8 @@ def rms(signal):
 def test_the_predicted_doublet_is_the_flown_one(log):
     airframe = load_airframe("adam0").airframe
     plant = plant_response(log, log.u_bar, 300.0)
-    spec = TuningSpec()
-    for gains in (log.flown, tune(log)):
+    spec = thesis()
+    for gains in (log.flown, tune(log, thesis())):
         follow, offaxis, effort = predict(gains, plant, spec, Doublet(amplitude_deg=10.0, period_s=0.8))
         for column, axis in enumerate(("roll", "pitch")):
             task = doublet(axis, np.radians(10.0), 0.8, TS, tail=0.8)

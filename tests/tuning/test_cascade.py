@@ -11,11 +11,11 @@ from sitl.loop import fly
 from sitl.metrics import performance
 from sitl.scenario import doublet
 from tests.tuning.test_certificate import experiment
-from tuning.cascade import tune
+from tests.tuning.truth import thesis
+from tuning.cascade import estimate, tune
 from tuning.errors import TuningError
-from tuning.gates import examine_saturation
+from tuning.gates import examine_estimates, examine_saturation
 from tuning.reference import second_order
-from tuning.spec import load_spec
 
 TS = 0.004
 
@@ -27,7 +27,7 @@ def log():
 
 @pytest.fixture(scope="module")
 def tuned(log):
-    return {method: tune(log, load_spec(method=method)) for method in ("mimo", "siso")}
+    return {method: tune(log, thesis(method=method)) for method in ("mimo", "siso")}
 
 
 def test_the_rate_gains_have_the_structure_of_the_inertia(tuned):
@@ -49,7 +49,7 @@ def test_siso_gains_are_diagonal(tuned):
 
 def test_refined_attitude_gains_follow_the_outer_model_better(log, tuned):
     airframe = load_airframe("adam0").airframe
-    plain = tune(log, load_spec(refine=False))
+    plain = tune(log, thesis(refine=False))
     inner, outer = second_order(20, 0.4, 0, TS), second_order(10, 0.7, 0, TS)
     for axis in ("roll", "pitch"):
         task = doublet(axis, np.radians(22.5), 0.42, TS)
@@ -63,38 +63,41 @@ def test_refined_attitude_gains_follow_the_outer_model_better(log, tuned):
 
 def test_the_pull_goes_from_the_estimate_to_the_flying_gains(log, tuned):
     flown = log.flown.Kp_i
-    near = tune(log, load_spec(pull=1e4))
+    near = tune(log, thesis(pull=1e4))
     assert near.Kp_i == pytest.approx(flown, abs=1e-3)
-    slight = tune(log, load_spec(pull=1e-9))
+    slight = tune(log, thesis(pull=1e-9))
     assert slight.Kp_i == pytest.approx(tuned["mimo"].Kp_i, rel=1e-3)
 
 
 def test_a_log_that_does_not_say_what_flew_needs_a_specification(log):
     unknown = dataclasses.replace(log, flown=None)
     with pytest.raises(TuningError, match="yaw gains"):
-        tune(unknown)
+        tune(unknown, thesis())
     yaw = {"Kp_o": 1.5, "Kp_i": 0.5, "Ki_i": 0.1, "Kd_i": 0.0}
     with pytest.raises(TuningError, match="derivative_cutoff_hz"):
-        tune(unknown, load_spec(yaw=yaw))
-    gains = tune(unknown, load_spec(yaw=yaw, derivative_cutoff_hz=30.0, moment_scale=(2.5, 2.5, 0.3)))
+        tune(unknown, thesis(yaw=yaw))
+    gains = tune(unknown, thesis(yaw=yaw, derivative_cutoff_hz=30.0, moment_scale=(2.5, 2.5, 0.3)))
     assert gains.yaw.Kp_i == 0.5
     assert gains.moment_scale == (2.5, 2.5, 0.3)
 
 
 def test_a_flight_without_excitation_or_on_one_axis_only_is_refused(log):
     with pytest.raises(TuningError, match="no excitation"):
-        tune(dataclasses.replace(log, u_bar=None, r_o=None))
+        tune(dataclasses.replace(log, u_bar=None, r_o=None), thesis())
     one_axis = log.u_bar * [1.0, 0.0]
     for method in ("mimo", "siso"):
         with pytest.raises(TuningError, match="not excited on pitch"):
-            tune(dataclasses.replace(log, u_bar=one_axis), load_spec(method=method))
+            tune(dataclasses.replace(log, u_bar=one_axis), thesis(method=method))
 
 
 def test_noise_in_place_of_flight_is_refused_by_the_gates(log):
     rng = np.random.default_rng(0)
     noise = dataclasses.replace(log, u=0.1 * rng.standard_normal(log.u.shape), y_i=rng.standard_normal(log.u.shape))
+    with pytest.raises(TuningError, match="not excited: the response from torque to rates is known at 0 frequencies"):
+        tune(noise, thesis())
+    found = estimate(noise, thesis())
     with pytest.raises(TuningError, match=r"the excitation explains .* of what the roll gains are found from"):
-        tune(noise)
+        examine_estimates("log", found.stretches, found.inner)
 
 
 def test_a_saturated_flight_is_refused_and_an_occasional_limit_warned_about(log):

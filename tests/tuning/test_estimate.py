@@ -11,13 +11,14 @@ from sitl.loop import fly
 from sitl.scenario import excitation_flight
 from tests.tuning.literal import literal_cascade
 from tests.tuning.test_certificate import experiment
+from tests.tuning.truth import thesis
 from tuning.cascade import estimate, tune
 from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.gates import examine_band, examine_estimates
 from tuning.instruments import align, instruments
+from tuning.measured import Measured
 from tuning.reference import second_order
-from tuning.spec import load_spec
 
 TS = 0.004
 MATRICES = ("Kp_i", "Ki_i", "Kd_i", "Kp_o")
@@ -31,7 +32,7 @@ def log():
 def test_the_fast_estimator_is_the_pseudo_code_of_the_thesis(log):
     models = second_order(20, 0.4, 0, TS), second_order(10, 0.7, 0, TS)
     oracle = literal_cascade(log.u, log.y_i, log.y_o, *models, TS, log.flown.derivative_cutoff_hz, 50)
-    spec = load_spec(weight="identity", instrument="u", trim=False, window=50)
+    spec = thesis(weight="identity", instrument="u", trim=False, window=50)
     found = estimate(log, spec).gains
     for name, matrix in zip(MATRICES, oracle, strict=True):
         assert getattr(found, name) == pytest.approx(matrix, rel=1e-9, abs=1e-9 * np.abs(matrix).max())
@@ -58,7 +59,7 @@ def noisy():
 def test_noise_moves_what_every_instrument_gives_by_no_more_than_its_error(noisy, method):
     still, second = noisy_flight(0, times=0.01), noisy_flight(2)
     for name in ("external", "model", "repeated"):
-        spec = load_spec(method=method, instrument=name, weight="identity")
+        spec = thesis(method=method, instrument=name, weight="identity")
         exact = estimate(still, spec, still if name == "repeated" else None).gains.Kp_i
         found = estimate(noisy, spec, second if name == "repeated" else None)
         error = np.diag(found.gains.Kp_i - exact)
@@ -68,7 +69,7 @@ def test_noise_moves_what_every_instrument_gives_by_no_more_than_its_error(noisy
 def test_a_stretch_without_excitation_does_no_harm_to_an_identified_models_instrument(log):
     segments = ((0, 5000), (5050, 9950))
     quiet = dataclasses.replace(log, segments=segments, u_bar=log.u_bar * (np.arange(len(log.u)) < 5000)[:, None])
-    spec = load_spec(instrument="model", structure="P")
+    spec = thesis(instrument="model", structure="P")
     both_axes = dataclasses.replace(
         quiet, u_bar=quiet.u_bar + log.u_bar[::-1] * (np.arange(len(log.u)) < 5000)[:, None]
     )
@@ -77,15 +78,15 @@ def test_a_stretch_without_excitation_does_no_harm_to_an_identified_models_instr
 
 def test_the_constant_takes_a_trim_moment_off_and_without_it_the_gains_are_wrong(log):
     trimmed = dataclasses.replace(log, u=log.u + np.array([0.05, -0.03]))
-    clean = estimate(log, load_spec()).gains
-    assert estimate(trimmed, load_spec()).gains.Ki_i == pytest.approx(clean.Ki_i, abs=1e-9)
-    without = estimate(trimmed, load_spec(trim=False)).gains
+    clean = estimate(log, thesis()).gains
+    assert estimate(trimmed, thesis()).gains.Ki_i == pytest.approx(clean.Ki_i, abs=1e-9)
+    without = estimate(trimmed, thesis(trim=False)).gains
     assert np.abs(without.Ki_i - clean.Ki_i).max() > 0.05 * clean.Ki_i[0, 0]
 
 
 @pytest.mark.parametrize("structure", ["P", "PD", "PI", "PIDF"])
 def test_only_the_terms_that_are_asked_for_are_not_zero(log, structure):
-    found = estimate(log, load_spec(structure=structure))
+    found = estimate(log, thesis(structure=structure))
     present = {"P": "Kp_i", "I": "Ki_i", "D": "Kd_i", "F": "Kff_i"}
     for term, matrix in present.items():
         assert (term in structure) == bool(getattr(found.gains, matrix).any())
@@ -124,22 +125,27 @@ def negatively_damped(log):
 
 
 def test_an_inner_controller_that_cannot_be_inverted_falls_back_loudly(log):
-    found = tune(negatively_damped(log), load_spec(refine=False))
-    assert np.linalg.eigvalsh(found.Ki_i + found.Ki_i.T)[0] < 0
-    warning = found.provenance["warnings"][0]
+    found = estimate(negatively_damped(log), thesis(refine=False))
+    assert np.linalg.eigvalsh(found.gains.Ki_i + found.gains.Ki_i.T)[0] < 0
+    (warning,) = found.warnings
     for words in ("not minimum phase: eigenvalues", "r_i = M_i^-1 y_i", "--structure PD"):
         assert words in warning
     # The rate loop that the outer gain sees is its reference model: closed form s Kp_o M_i = M_o at low frequency.
-    assert np.diag(found.Kp_o) == pytest.approx(4.5, rel=0.15)
+    assert np.diag(found.gains.Kp_o) == pytest.approx(4.5, rel=0.15)
+    tuned = tune(negatively_damped(log), thesis(refine=False))
+    assert Measured(log).body.least(tuned.Ki_i) > 0
+    kept, slow = tuned.provenance["warnings"][:2]
+    assert "the log asks for integral gains that run away" in kept
+    assert "to forget where it began" in slow
 
 
 def test_the_fall_back_needs_an_outer_model_that_is_no_faster(log):
     with pytest.raises(TuningError, match="not a proper, stable filter"):
-        estimate(negatively_damped(log), load_spec(inner=(20.0, 0.4, 3)))
+        estimate(negatively_damped(log), thesis(inner=(20.0, 0.4, 3)))
 
 
 def test_gains_that_cannot_be_told_apart_are_refused_and_hardly_warned_about(log):
-    found = estimate(log, load_spec())
+    found = estimate(log, thesis())
     for condition, refused in ((2e3, False), (2e4, True)):
         solution = dataclasses.replace(found.inner[0].solution, condition=condition)
         loops = [dataclasses.replace(found.inner[0], solution=solution)]

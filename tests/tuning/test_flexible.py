@@ -8,6 +8,7 @@ from scipy.signal import cont2discrete, lfilter
 
 import tuning.advisor as advisor
 from tests.tuning.test_certificate import experiment
+from tests.tuning.truth import thesis
 from tuning.advisor import advise
 from tuning.errors import TuningError
 from tuning.excitation import prbs
@@ -56,8 +57,8 @@ def test_data_that_are_short_or_dead_are_refused():
 
 def test_the_advisor_asks_for_nothing_faster_than_half_of_the_zero(monkeypatch):
     monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 40.0))
-    monkeypatch.setattr(advisor, "DAMPINGS", (0.55,))
-    monkeypatch.setattr(advisor, "DELAYS", (2,))
+    monkeypatch.setattr(advisor, "DAMPINGS", (1.0,))
+    monkeypatch.setattr(advisor, "DELAYS", (0,))
     log = experiment("adam0")
     spec = TuningSpec(derivative_cutoff_hz=30.0)
     assert [c.inner[0] for c in advise(log, spec).candidates] == [20.0, 40.0]
@@ -72,12 +73,12 @@ def test_the_advisor_asks_for_nothing_faster_than_half_of_the_zero(monkeypatch):
 
 def test_the_advisor_tries_lower_derivative_filters_than_the_flown_one_unless_told(monkeypatch):
     monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0,))
-    monkeypatch.setattr(advisor, "DAMPINGS", (0.55,))
-    monkeypatch.setattr(advisor, "DELAYS", (2,))
+    monkeypatch.setattr(advisor, "DAMPINGS", (1.0,))
+    monkeypatch.setattr(advisor, "DELAYS", (0,))
     log = experiment("adam0")
-    assert [c.cutoff_hz for c in advise(log, TuningSpec()).candidates] == [30.0, 10.0, 5.0]
+    assert [c.cutoff_hz for c in advise(log, thesis()).candidates] == [30.0, 10.0, 5.0]
     eight = dataclasses.replace(log, flown=dataclasses.replace(log.flown, derivative_cutoff_hz=8.0))
-    found = advise(eight, TuningSpec())
+    found = advise(eight, thesis())
     assert [c.cutoff_hz for c in found.candidates] == [8.0, 5.0]
     for c in found.candidates:
         assert c.gains.derivative_cutoff_hz == c.cutoff_hz

@@ -81,3 +81,82 @@ def test_matrices_cannot_be_changed_in_place(gains):
 def test_no_cutoff_means_no_filter(gains):
     assert dataclasses.replace(gains, derivative_cutoff_hz=0.0).derivative_pole == 0.0
     assert gains.derivative_pole == math.exp(-2 * math.pi * 30 * 0.004)
+
+
+CERTIFICATE = {
+    "verdict": "unstable",
+    "reason": "the determinant goes round 0: the rate loop alone is unstable",
+    "figures": {"Ms": 1.4, "phase_margin_deg": {"roll": 45.0, "pitch": 46.0}, "gain_margin": {"roll": "at least"}},
+    "band": [1.3, 100.0],
+    "thresholds": {"Ms": 1.8, "phase_deg": 40.0, "thin_Ms": 2.5, "thin_phase_deg": 25.0},
+    "log_sha256": "0123456789abcdef",
+}
+
+
+def test_a_seal_survives_its_file_to_the_bit(gains):
+    sealed = gains.with_certificate(CERTIFICATE)
+    read = gains_from_toml(gains_to_toml(sealed), "test")
+    assert read.verdict() == sealed.verdict() == (CERTIFICATE["verdict"], CERTIFICATE["reason"])
+    assert gains.verdict()[0] == "none"
+    assert sealed.with_certificate(None).verdict()[0] == "none"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('verdict = "unstable"', 'verdict = "certified"'),
+        ("alone is unstable", "alone is well damped"),
+        ("Ms = 1.4", "Ms = 1.3"),
+        ("pitch = 46.0", "pitch = 46.5"),
+        ('roll = "at least"', 'roll = "exact"'),
+        ("band = [1.3, 100.0]", "band = [1.3, 200.0]"),
+        ("thin_Ms = 2.5", "thin_Ms = 9.5"),
+        ("phase_deg = 40.0", "phase_deg = 4.0"),
+        ("0123456789abcdef", "0123456789abcdee"),
+    ],
+)
+def test_a_word_or_a_figure_that_is_edited_voids_the_certificate(gains, old, new):
+    text = gains_to_toml(gains.with_certificate(CERTIFICATE))
+    assert text.count(old) >= 1
+    head, tail = text.split("[certificate", 1)
+    assert old in tail
+    edited = gains_from_toml(f"{head}[certificate{tail.replace(old, new, 1)}", "test")
+    assert edited.verdict() == ("void", "the gains or the certificate were edited after it was made")
+
+
+def test_any_number_of_the_controller_that_is_edited_voids_the_certificate(gains):
+    """Every gain, limit, the period, the cut-off and the scale; in the last bit too."""
+    sealed = gains.with_certificate(CERTIFICATE)
+    for code, value in gains.elements().items():
+        changed = sealed.with_elements({code: math.nextafter(value, math.inf)})
+        assert changed.verdict()[0] == "void", code
+    assert dataclasses.replace(sealed, derivative_cutoff_hz=30.5).verdict()[0] == "void"
+    assert dataclasses.replace(sealed, moment_scale=(2.6, 2.54592, 0.2736)).verdict()[0] == "void"
+    assert dataclasses.replace(sealed, moment_scale=None).verdict()[0] == "void"
+    assert dataclasses.replace(sealed, provenance={"note": "mine"}).verdict()[0] == "unstable"
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("Kp_o = [[6.0, 0.3]", "Kp_o = [[6.0, 0.4]"),
+        ("Kff_i = [[0.02, 0.001]", "Kff_i = [[0.02, 0.002]"),
+        ("Ts = 0.004", "Ts = 0.005"),
+        ("derivative_cutoff_hz = 30.0", "derivative_cutoff_hz = 40.0"),
+        ("moment_scale = [2.54592", "moment_scale = [3.54592"),
+        ("rate_max = [5.0", "rate_max = [6.0"),
+        ("Ki_i = 0.1", "Ki_i = 0.2"),
+    ],
+)
+def test_a_number_that_is_edited_in_the_file_voids_the_certificate(gains, old, new):
+    text = gains_to_toml(gains.with_certificate(CERTIFICATE))
+    assert old in text
+    assert gains_from_toml(text.replace(old, new, 1), "test").verdict()[0] == "void"
+
+
+def test_a_certificate_without_a_seal_or_with_one_of_another_is_void(gains):
+    plain = dataclasses.replace(gains, certificate=CERTIFICATE)
+    assert plain.verdict() == ("void", "the certificate is of an earlier version, or was written by hand")
+    other = gains.with_elements({"AP_RR": 7.0}).with_certificate(CERTIFICATE)
+    borrowed = dataclasses.replace(gains, certificate=other.certificate)
+    assert borrowed.verdict()[0] == "void"

@@ -1,11 +1,18 @@
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tuning.errors import TuningError
-from tuning.identification import fit, pbsid
+from tuning.identification import fit, identify_rates, pbsid, pbsid_by_response
+from tuning.logs.reader import read_log
 from tuning.loop import LoopController, closed_loop
+from tuning.plant_response import measured_plant
 from tuning.statespace import StateSpace
 
+DATA = Path(__file__).parent.parent / "data"
 TS = 0.1
 #: Two coupled outputs; one pole outside the unit circle, so that it can only be identified in closed loop.
 PLANT = StateSpace(
@@ -110,3 +117,63 @@ def test_windows_orders_and_data_that_cannot_work_are_refused():
         pbsid(u[:200], y[:200], TS)
     with pytest.raises(TuningError, match="not excited"):
         pbsid(0 * u, y, TS)
+
+
+@pytest.fixture(scope="module", params=["coupled", "symmetric"])
+def genuine(request):
+    """A flight of the genuine PX4 and its response."""
+    log = read_log(DATA / f"px4_sih_{request.param}.mat")
+    return log, measured_plant(log)
+
+
+def test_a_genuine_flight_gets_an_order_that_fits_its_response(genuine):
+    log, plant = genuine
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = identify_rates(log, plant)
+    assert found.model.predictor_stable
+    assert found.response_percent > 80
+    sure = plant.at(plant.known() & (plant.rate_error() < 0.05))
+    modelled = found.model.plant.frequency_response(sure.omega)
+    off = np.linalg.norm(sure.omega[:, None, None] * (modelled - sure.G_i))
+    assert off < 0.1 * np.linalg.norm(sure.omega[:, None, None] * sure.G_i)
+    assert (found.one_step_percent > 50).all()
+
+
+def test_a_diverging_order_that_is_asked_for_is_refused(genuine):
+    """Whatever the order: its predictor is stable, or it is refused, and nothing overflows."""
+    log, plant = genuine
+    refused = 0
+    for order in (1, 2, 3, 30):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            try:
+                assert identify_rates(log, plant, order=order).model.predictor_stable
+            except TuningError as error:
+                assert f"the predictor of order {order} is not stable" in str(error)
+                refused += 1
+    assert refused >= 1
+
+
+def test_the_order_by_response_is_that_of_the_plant():
+    u, y, _ = closed_loop_data(20000)
+    omega = np.linspace(0.3, np.pi / TS, 100)
+    true = PLANT.frequency_response(omega)
+    model, percent = pbsid_by_response(u, y, TS, omega, true, 0.01 * np.abs(true))
+    assert model.order == 3
+    assert percent > 97
+    assert response_error(model.plant) < 0.02
+
+
+def test_a_model_that_is_not_near_the_response_is_refused():
+    u, y, _ = closed_loop_data(4000)
+    omega = np.linspace(0.3, np.pi / TS, 100)
+    with pytest.raises(TuningError, match=r"no model of order 1 to 12 is near .* \(the best fits by -\d+ %"):
+        pbsid_by_response(u, y, TS, omega, -PLANT.frequency_response(omega), np.full((len(omega), 2, 2), 1e-3))
+
+
+def test_a_log_without_any_known_frequency_is_refused(genuine):
+    log, plant = genuine
+    unknown = replace(plant, root=plant.root * 1e6, coherence=0 * plant.coherence)
+    with pytest.raises(TuningError, match="not excited: the response of the rates is known at no frequency"):
+        identify_rates(log, unknown)

@@ -14,6 +14,7 @@ from sitl.loop import fly
 from sitl.recorder import save_flight
 from sitl.scenario import doublet, excitation_flight
 from tests.tuning.logs.flights import make_flight, microseconds, px4_topics, write_ulog
+from tests.tuning.truth import thesis
 from tuning.cascade import NO_MOTORS, tune
 from tuning.compiled_doublet import allocated
 from tuning.doublet import doublet_model
@@ -21,7 +22,7 @@ from tuning.gain_stack import GainStack
 from tuning.logs.reader import read_log
 from tuning.measured import Measured
 from tuning.motors import fit_motors, rotor_lag
-from tuning.spec import Manoeuvre, load_spec
+from tuning.spec import Manoeuvre
 
 TS = 0.004
 UNIT = st.floats(-1, 1)
@@ -98,7 +99,7 @@ def test_commands_are_those_of_the_flown_allocator(roll, pitch, collective):
 @pytest.mark.parametrize("axis", [0, 1])
 def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axis):
     log, vehicle = logs["adam0_nominal"], load_airframe("adam0_nominal")
-    gains = dataclasses.replace(tune(log, load_spec(method="siso")), certificate=None)
+    gains = dataclasses.replace(tune(log, thesis(method="siso")), certificate=None)
     gains = dataclasses.replace(gains, Kp_i=1.6 * gains.Kp_i, Kd_i=2.0 * gains.Kd_i)
     task = doublet(("roll", "pitch")[axis], np.radians(40.0), 0.45, TS)
     flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), task, 0, noise=False)
@@ -118,7 +119,7 @@ def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axi
 def test_the_drawn_out_switch_of_the_integral_hardly_changes_a_doublet(logs):
     log = logs["adam0_nominal"]
     model = doublet_model(Measured(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
-    stack = GainStack.of(tune(log))
+    stack = GainStack.of(tune(log, thesis()))
     sharp, soft = model.fly(stack)[0], model.fly(stack, 0.05)[0]
     assert 0 < np.degrees(np.abs(soft - sharp).max()) < 0.5
 
@@ -143,6 +144,6 @@ def test_commands_are_read_at_any_rate_and_only_where_they_are_thrust_fractions(
 
 
 def test_a_tuning_says_that_it_does_not_know_the_motors(logs):
-    log, spec = logs["adam0_nominal"], load_spec(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
+    log, spec = logs["adam0_nominal"], thesis(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
     assert NO_MOTORS in tune(dataclasses.replace(log, motors=None), spec).provenance["warnings"]
     assert NO_MOTORS not in tune(log, spec).provenance["warnings"]

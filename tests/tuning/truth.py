@@ -15,11 +15,17 @@ from sitl.loop import fly
 from sitl.scenario import excitation_flight
 from sitl.sensors import frame_mode, low_pass
 from tuning.experiment import Experiment
+from tuning.spec import load_spec
 from tuning.statespace import StateSpace
 
 TS = 0.004
 #: As its own command has it.
 BANDWIDTH = 50.0
+
+
+def thesis(**options):
+    """A specification with the thesis' model of the rate loop, unless another is given: its figures are known."""
+    return load_spec(**{"inner": (20.0, 0.4, 0), **options})
 
 
 def series(first, second):
