@@ -141,11 +141,15 @@ def certify(
     figures["Ms"] = max(figures["Ms"], _peak_beyond(gains, plant, band[1]))
     doubtful = sum(any(w) for w in windings)
     beyond = _beyond_the_band(gains, known, above)
-    if beyond:
+    # The count is one where the loop is below 1 at the band's end and in charge at its beginning: else it may turn on.
+    closed = above + _outer_loop_above(gains, known) < 1 and _left_at_the_beginning(gains, known) < 1
+    if beyond and not closed:
         return verdict(NOT_CERTIFIED, beyond, figures, band)
     if any(normal.windings(nominal)) and doubtful > DRAWS / 2:
         where = "the rate loop alone" if normal.windings(nominal)[0] else "the whole cascade"
         return verdict(UNSTABLE, f"the determinant goes round 0: {where} is unstable", {}, band)
+    if beyond:
+        return verdict(NOT_CERTIFIED, beyond, figures, band)
     doubt = _doubt(gains, plant, known, body)
     if doubt:
         return verdict(NOT_CERTIFIED, doubt, figures, band)
@@ -263,8 +267,7 @@ def _beyond_the_band(gains: Gains, known: PlantResponse, loop: float) -> str:
             f"excitation ends at {known.omega[-1]:.0f} rad/s, where the whole cascade's gain may still reach 1: "
             "excite a wider band"
         )
-    S = margins.sensitivity(cascade_loop(gains, known.at(np.array([0]))))
-    remaining = margins.peak(S)
+    remaining = _left_at_the_beginning(gains, known)
     if remaining > LOW_FREQUENCY_SENSITIVITY:
         return (
             f"excitation begins at {known.omega[0]:.1f} rad/s, where the sensitivity is still {remaining:.2f} (at most "
@@ -272,6 +275,11 @@ def _beyond_the_band(gains: Gains, known: PlantResponse, loop: float) -> str:
             "for a faster attitude loop"
         )
     return ""
+
+
+def _left_at_the_beginning(gains: Gains, known: PlantResponse) -> float:
+    """The sensitivity where the band begins."""
+    return margins.peak(margins.sensitivity(cascade_loop(gains, known.at(np.array([0])))))
 
 
 def _doubt(gains: Gains, plant: PlantResponse, known: PlantResponse, body: RigidBody) -> str:
