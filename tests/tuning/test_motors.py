@@ -21,7 +21,7 @@ from tuning.doublet import doublet_model
 from tuning.gain_stack import GainStack
 from tuning.logs.reader import read_log
 from tuning.measured import Measured
-from tuning.motors import fit_motors, rotor_lag
+from tuning.motors import fit_motors, rotor_lag, saturation_warnings
 from tuning.spec import Manoeuvre
 
 TS = 0.004
@@ -147,3 +147,25 @@ def test_a_tuning_says_that_it_does_not_know_the_motors(logs):
     log, spec = logs["adam0_nominal"], thesis(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
     assert NO_MOTORS in tune(dataclasses.replace(log, motors=None), spec).provenance["warnings"]
     assert NO_MOTORS not in tune(log, spec).provenance["warnings"]
+
+
+def test_motors_at_their_ends_are_told_with_the_amplitude_that_avoids_it():
+    """Two motors that move by half of the torque about 0.2: a torque of 0.4 and what is on top of it is the most."""
+    rng = np.random.default_rng(0)
+    u = 0.1 * rng.choice([-1.0, 0.0, 1.0], (4000, 2))
+    u[:200, 0] = 0.5 * rng.choice([-1.0, 1.0], 200)
+    mixer, hover = np.array([[0.5, 0.5], [-0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]]), 0.2
+    commands = np.clip(hover + u @ mixer.T, 0.0, 1.0)
+    motors = fit_motors(u, commands)
+    (text,) = saturation_warnings(u, commands, motors, 0.5)
+    assert text.startswith("a motor is at an end of its range in 5% of the samples")
+    # The farthest any motor is moved is (0.5 + 0.1) / 2 below a hover of 0.2.
+    assert text.endswith(f"inject a torque of {0.5 * 0.2 / 0.3:.2g} in place of 0.5")
+    assert saturation_warnings(0.1 * u, np.clip(hover + 0.1 * u @ mixer.T, 0, 1), motors, 0.05) == []
+
+
+def test_the_amplitude_that_is_proposed_leaves_the_motors_of_each_airframe_room():
+    from sitl.experiments import default_amplitude
+
+    found = {name: default_amplitude(load_airframe(name).airframe) for name in ("adam0", "antr", "px4_sih")}
+    assert found == {"adam0": 0.15, "antr": pytest.approx(0.056), "px4_sih": 0.15}
