@@ -259,7 +259,7 @@ def tune(
         *experiment.warnings,
         *found.warnings,
         *examine_saturation(experiment),
-        *examine_estimates(experiment.source, found.stretches, found.inner),
+        *examine_estimates(experiment.source, found.stretches, found.inner, experiment.Ts),
         *examine_band(experiment.source, plant, [omega for omega, _, _ in spec.inner]),
     ]
     gains, deviations = found.gains, found.inner_deviations()

@@ -15,17 +15,22 @@ from tuning.errors import TuningError
 from tuning.experiment import Experiment
 from tuning.instruments import AXES, Stretches
 from tuning.plant_response import PlantResponse
+from tuning.regression import Solution
 from tuning.vrft import LoopEstimate
 
 WEAK, DOUBTFUL = 0.3, 0.5
 POOR_FIT, MODEST_FIT = 0.5, 0.84
 SATURATED, OFTEN_SATURATED = 0.02, 0.2
+#: What is above is no motion that a controller answers, Hz: motors turn at 50 Hz and more.
+VIBRATION = 40.0
 #: Least squares and instruments may differ by this share of the gain's size.
 DIFFERENCE = 0.5
 ILL_CONDITIONED, BADLY_CONDITIONED = 1e4, 1e3
 
 
-def examine_estimates(source: str, stretches: Stretches, loops: Sequence[LoopEstimate]) -> list[str]:
+def examine_estimates(
+    source: str, stretches: Stretches, loops: Sequence[LoopEstimate], Ts: float = 0.004
+) -> list[str]:
     """Warnings about a rate loop's estimates; empty for a good log.
 
     Parameters
@@ -35,6 +40,8 @@ def examine_estimates(source: str, stretches: Stretches, loops: Sequence[LoopEst
     stretches : list of (axes, segments)
         The axes that each estimate is about.
     loops : sequence of LoopEstimate
+    Ts : float, s
+        Sampling period of the log.
 
     Raises
     ------
@@ -56,20 +63,40 @@ def examine_estimates(source: str, stretches: Stretches, loops: Sequence[LoopEst
             raise TuningError(f"{source}: {text}; inject more frequencies, or ask for a simpler structure")
         if solution.condition > BADLY_CONDITIONED:
             warnings.append(text)
-        for name, value in zip(names, solution.r_squared, strict=True):
+        for i, (name, value) in enumerate(zip(names, solution.r_squared, strict=True)):
             text = f"the {name} controller explains {value:.0%} of the moment that flew"
-            if value < POOR_FIT:
+            calm = _explained_below(solution, Ts, i) if value < POOR_FIT else value
+            if value < POOR_FIT <= calm:
+                warnings.append(
+                    f"{text}, and {calm:.0%} of what is below {VIBRATION:g} Hz: a vibration; find its source, or filter "
+                    "it on the vehicle (notch or low-pass)"
+                )
+            elif value < POOR_FIT:
                 raise TuningError(
                     f"{source}: {text}; the wanted rate loop is out of reach: ask for a slower one or for more delay, "
                     "or check that torque and rates are of the same vehicle and unit"
                 )
-            if value < MODEST_FIT:
+            elif value < MODEST_FIT:
                 warnings.append(text)
         proportional, plain = estimate.gain("P"), solution.least_squares[:, : len(names)]
         apart = np.linalg.norm(proportional - plain) / np.linalg.norm(proportional)
         if apart > DIFFERENCE:
             warnings.append(f"with and without instruments the proportional gains differ by {apart:.0%}: a noisy log")
     return warnings
+
+
+def _explained_below(solution: Solution, Ts: float, row: int) -> float:
+    """Share of a moment's power below `VIBRATION` that the controller explains."""
+    from scipy.signal import butter, sosfiltfilt
+
+    if 2 * VIBRATION * Ts >= 1:
+        return float(solution.r_squared[row])
+    low_pass = butter(4, 2 * VIBRATION * Ts, output="sos")
+    power = left = 0.0
+    for u, x in zip(solution.problem.u, solution.problem.x, strict=True):
+        moment, rest = (sosfiltfilt(low_pass, part) for part in (u[:, row], u[:, row] - x @ solution.B[row]))
+        power, left = power + float(moment @ moment), left + float(rest @ rest)
+    return 1 - left / power
 
 
 def examine_band(source: str, plant: PlantResponse, bandwidths: Sequence[float]) -> list[str]:

@@ -109,3 +109,13 @@ def test_a_saturated_flight_is_refused_and_an_occasional_limit_warned_about(log)
         examine_saturation(dataclasses.replace(log, u=often))
     assert len(examine_saturation(dataclasses.replace(log, u=sometimes))) == 2
     assert examine_saturation(log) == []
+
+
+def test_a_vibration_is_no_reason_to_refuse_and_is_told(log):
+    """A tone of 110 Hz on the gyro: what is below it is explained as before."""
+    t = np.arange(len(log.u)) * log.Ts
+    tone = 3.0 * np.sin(2 * np.pi * 110 * t)[:, None] * np.ones(2)
+    gains = tune(dataclasses.replace(log, y_i=log.y_i + tone), thesis())
+    told = [text for text in gains.provenance["warnings"] if "a vibration" in text]
+    assert told
+    assert "of what is below 40 Hz" in told[0]
