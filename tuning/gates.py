@@ -68,8 +68,8 @@ def examine_estimates(
             calm = _explained_below(solution, Ts, i) if value < POOR_FIT else value
             if value < POOR_FIT <= calm:
                 warnings.append(
-                    f"{text}, and {calm:.0%} of what is below {VIBRATION:g} Hz: a vibration; find its source, or filter "
-                    "it on the vehicle (notch or low-pass)"
+                    f"{text}, and {calm:.0%} of what is below {VIBRATION:g} Hz: a vibration; find its source, or "
+                    "filter it on the vehicle (notch or low-pass)"
                 )
             elif value < POOR_FIT:
                 raise TuningError(
