@@ -60,7 +60,7 @@ class ExperimentPlan:
 
 
 def default_amplitude(airframe: Airframe) -> float:
-    """Amplitude of the injected torque that leaves the motors room: 0.15, or less for who hovers near an end.
+    """Amplitude of the injected torque that leaves the motors room: 0.15, or less near an end of theirs.
 
     The loop's own answer and the other axes' add to what is injected, so only a share of the room is taken.
     """

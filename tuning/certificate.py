@@ -133,7 +133,7 @@ def certify(
         reason = f"the excitation reaches fewer than {MIN_FREQUENCIES} frequencies in a row"
         return verdict(NOT_CERTIFIED, reason, {}, (0.0, 0.0))
     band = (float(known.omega[0]), float(known.omega[-1]))
-    above = loop_bound(gains, known)
+    above = float(loop_above(gains, known)[-1])
     dense, nominal, draws = _loops(gains, known)
     normal = _Normaliser(inner, outer, dense.omega, gains.Ki_i)
     windings = [normal.windings(loop) for loop in draws]
@@ -326,11 +326,6 @@ def loop_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
     gain[top:] = isotonic_regression(gain[top:], increasing=False).x
     reached: Signal = gain * highest
     return reached
-
-
-def loop_bound(gains: Gains, plant: PlantResponse) -> float:
-    """What the rate loop's gain may still reach above the plant's band."""
-    return float(loop_above(gains, plant)[-1])
 
 
 def large_again(gains: Gains, plant: PlantResponse) -> tuple[float, float] | None:

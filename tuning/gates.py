@@ -28,9 +28,7 @@ DIFFERENCE = 0.5
 ILL_CONDITIONED, BADLY_CONDITIONED = 1e4, 1e3
 
 
-def examine_estimates(
-    source: str, stretches: Stretches, loops: Sequence[LoopEstimate], Ts: float = 0.004
-) -> list[str]:
+def examine_estimates(source: str, stretches: Stretches, loops: Sequence[LoopEstimate], Ts: float) -> list[str]:
     """Warnings about a rate loop's estimates; empty for a good log.
 
     Parameters

@@ -97,7 +97,7 @@ def test_noise_in_place_of_flight_is_refused_by_the_gates(log):
         tune(noise, thesis())
     found = estimate(noise, thesis())
     with pytest.raises(TuningError, match=r"the excitation explains .* of what the roll gains are found from"):
-        examine_estimates("log", found.stretches, found.inner)
+        examine_estimates("log", found.stretches, found.inner, noise.Ts)
 
 
 def test_a_saturated_flight_is_refused_and_an_occasional_limit_warned_about(log):

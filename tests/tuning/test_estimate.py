@@ -151,9 +151,9 @@ def test_gains_that_cannot_be_told_apart_are_refused_and_hardly_warned_about(log
         loops = [dataclasses.replace(found.inner[0], solution=solution)]
         if refused:
             with pytest.raises(TuningError, match="hardly be told apart"):
-                examine_estimates("log", found.stretches, loops)
+                examine_estimates("log", found.stretches, loops, TS)
         else:
-            assert any("told apart" in text for text in examine_estimates("log", found.stretches, loops))
+            assert any("told apart" in text for text in examine_estimates("log", found.stretches, loops, TS))
 
 
 def test_the_band_of_the_excitation_is_named_by_axis(log):

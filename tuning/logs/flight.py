@@ -102,7 +102,7 @@ def _before_tumble(recording: Recording, parts: tuple[Interval, ...]) -> tuple[t
     if times >= AGAIN:
         raise TuningError(
             f"{source}: {angles.topic}: a tilt beyond {np.degrees(TUMBLE):.0f} degrees {times} times where the "
-            "experiment is; no multirotor flies like that: are the angles in degrees (then tell their unit), or was it "
+            "experiment is; no multirotor flies like that: are the angles in degrees (then give their unit), or was it "
             "aerobatics? Excite in hover"
         )
     at = float(angles.time[beyond[0]])

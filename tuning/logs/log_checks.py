@@ -373,7 +373,7 @@ class _Names:
 
     def tell(self, lines: Sequence[str]) -> str:
         """How to give the lines to the program."""
-        return f"tell it with --columns: {', '.join(lines)}" if lines else ""
+        return f"put into the --columns file: {', '.join(lines)}" if lines else ""
 
     def mend(self, signals: Sequence[str], axes: Sequence[int], what: str) -> str:
         """What to do about some axes of signals."""

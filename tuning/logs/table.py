@@ -182,7 +182,7 @@ def _record(
         lacking = [f for f in REQUIRED_COLUMNS if f in lost and getattr(columns, f).column is None]
         wrong += [f"no column {', '.join(lacking)}"] if lacking else []
         raise TuningError(
-            f"{path}: {'; '.join(wrong)}; this file has {listed(contents)}. Tell the names with --columns FILE.toml"
+            f"{path}: {'; '.join(wrong)}; this file has {listed(contents)}. Give the names in a --columns FILE.toml"
         )
     wanted = {signal: f"column {' and '.join(columns.name(f) for f in fields)}" for signal, fields in SIGNALS.items()}
     given = table["t"]
@@ -227,4 +227,4 @@ def _clock_faults(path: Path, given: NDArray[np.float64], columns: Columns) -> t
 
 
 def _unit_line(name: str, unit: str) -> str:
-    return f'tell its unit with --columns: t = {{ column = {json.dumps(name)}, unit = "{unit}" }}'
+    return f'put its unit into the --columns file: t = {{ column = {json.dumps(name)}, unit = "{unit}" }}'

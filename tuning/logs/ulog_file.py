@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tuning.errors import TuningError
 from tuning.logs.recording import listed
 
-MAGIC = b"ULog\x01\x12\x35"
 FIRST = 16  # bytes of the file header
 KINDS = b"ABCDFILMOPQRS"
 SYNC = b"\x2f\x73\x13\x20\x25\x0c\xbb\x12"

@@ -45,12 +45,12 @@ def refusal(path):
 
 def told(message):
     """The lines of a column file in a refusal."""
-    return message.split("tell it with --columns: ")[1].split("; ")[0].replace(" }, ", " }\n")
+    return message.split("put into the --columns file: ")[1].split("; ")[0].replace(" }, ", " }\n")
 
 
 def mended(path, message, acceleration):
     """The log under the lines of its refusal is that of the vehicle."""
-    lines = message.split("tell it with --columns: ")[1].split("; ")[0].replace(" }, ", " }\n")
+    lines = message.split("put into the --columns file: ")[1].split("; ")[0].replace(" }, ", " }\n")
     log = read_log(path, Columns.model_validate(tomllib.loads(lines)))
     assert pytest.approx(acceleration, rel=0.15, abs=10) == rigid_body(measured_plant(log)).B
     return log

@@ -183,7 +183,7 @@ def test_a_time_in_another_unit_is_refused_with_the_line_that_mends_it(tmp_path,
     line = f't = {{ column = "t", unit = "{unit}" }}'
     with pytest.raises(TuningError, match=r"column t: steps of .* s are a rate of") as caught:
         read_log(path)
-    assert str(caught.value).endswith(f"tell its unit with --columns: {line}")
+    assert str(caught.value).endswith(f"put its unit into the --columns file: {line}")
     assert_is(read_log(path, columns(tmp_path, line)), flight)
 
 
