@@ -18,7 +18,13 @@ cross:
 	&& apt-get update -qq && apt-get install -qq -y --no-install-recommends $(CROSS); } \
 	|| { echo "the tests need a cross compiler and QEMU; on Debian, as root: apt-get install $(CROSS)"; exit 1; }
 
-lint: $(VENV)/.installed-test
+# The packages under the names that they import by, for the type checker.
+AS_IMPORTED := build/as-imported/mimopilot
+as-imported:
+	@rm -rf $(AS_IMPORTED) && mkdir -p $(AS_IMPORTED) && ln -s $(CURDIR)/mimopilot/* $(AS_IMPORTED) \
+	&& ln -s $(CURDIR)/tuning $(CURDIR)/codegen $(CURDIR)/sitl $(AS_IMPORTED)
+
+lint: $(VENV)/.installed-test as-imported
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 
@@ -40,4 +46,4 @@ $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 clean:
 	rm -rf $(VENV) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-.PHONY: demo test lint bench clean cross
+.PHONY: demo test lint bench clean cross as-imported

@@ -38,14 +38,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.codegen.cortex_m4 import EmulatedController, Image, build_image, run_in_qemu
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.codegen.toolchain import CXX_FLAGS, cross_tool, run_tool
+from mimopilot.codegen.vectors import random_inputs
+from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
-
-from codegen.cortex_m4 import EmulatedController, Image, build_image, run_in_qemu
-from codegen.errors import CodegenError
-from codegen.native import NativeController, load_native
-from codegen.toolchain import CXX_FLAGS, cross_tool, run_tool
-from codegen.vectors import random_inputs
-from tuning.gains import Gains
 
 CLOCK = 168e6
 PERIOD = 4e-3

@@ -17,13 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
+from mimopilot.codegen.render import render, write_tree
+from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS, cross_tool, find_tool, run_tool
+from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
-
-from codegen.errors import CodegenError
-from codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
-from codegen.render import render, write_tree
-from codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS, cross_tool, find_tool, run_tool
-from tuning.gains import Gains
 
 FLASH, FLASH_SIZE = 0x0800_0000, 1 << 20
 RAM, RAM_SIZE = 0x2000_0000, 1 << 16

@@ -9,11 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameters import PARAMETERS, to_array
 from numpy.typing import NDArray
-
-from codegen.errors import CodegenError
-from codegen.parameters import PARAMETERS, to_array
-from tuning.gains import Gains
 
 GAINS = np.dtype(("<f4", (len(PARAMETERS),)))
 

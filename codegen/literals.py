@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-
-from codegen.errors import CodegenError
+from mimopilot.codegen.errors import CodegenError
 
 
 def float_literal(value: float) -> str:

@@ -10,16 +10,16 @@ from typing import Any
 
 import cffi
 import numpy as np
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
+from mimopilot.codegen.render import TEMPLATES, interface_hash, render, write_tree
+from mimopilot.codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameters import to_array
 from numpy.typing import NDArray
 
-from codegen.errors import CodegenError
-from codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
-from codegen.parameters import to_array
-from codegen.render import TEMPLATES, interface_hash, render, write_tree
-from codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
-from tuning.cache import cache_folder
-from tuning.files import inside, seal, sha256, unseal, write_atomically
-from tuning.gains import Gains
+from mimopilot.common.cache import cache_folder
+from mimopilot.common.files import inside, seal, sha256, unseal, write_atomically
 
 HEADER = TEMPLATES / "native" / "mimo_pid_native.h"
 SOURCES = ("core/mimo_pid.cpp", "native/mimo_pid_native.cpp")

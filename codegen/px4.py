@@ -6,9 +6,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-
-from codegen.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Parameter, Setting, identity_parameters
-from tuning.gains import Gains
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameters import (
+    ENABLE,
+    EXCITATION,
+    IDENTITY,
+    PARAMETERS,
+    Parameter,
+    Setting,
+    identity_parameters,
+)
 
 APIS = ("crtp", "descriptor")
 

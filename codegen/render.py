@@ -10,16 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE
+from mimopilot.codegen.literals import float_literal
+from mimopilot.codegen.px4 import APIS, entries
+from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
+from mimopilot.codegen.vectors import emitted_vectors
+from mimopilot.tuning.gains import Gains, gains_to_toml
+from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, check_names, check_ranges, identity_parameters
 
-from codegen.errors import CodegenError
-from codegen.layout import GAINS, INPUT, OUTPUT, STATE
-from codegen.literals import float_literal
-from codegen.parameters import EXCITATION, PARAMETERS, check_names, check_ranges, identity_parameters
-from codegen.px4 import APIS, entries
-from codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
-from codegen.vectors import emitted_vectors
-from tuning.files import inside, read_text, sha256, write_atomically
-from tuning.gains import Gains, gains_to_toml
+from mimopilot.common.files import inside, read_text, sha256, write_atomically
 
 TEMPLATES = Path(__file__).resolve().parent.parent / "firmware_templates"
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")

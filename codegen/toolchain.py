@@ -8,7 +8,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-from codegen.errors import CodegenError
+from mimopilot.codegen.errors import CodegenError
 
 #: Flags of every build; the Makefiles that are emitted use the same.
 CXX_FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fno-exceptions", "-fno-rtti")

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from mimopilot.codegen.layout import INPUT, OUTPUT
+from mimopilot.tuning.controller import Controller
+from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
-
-from codegen.layout import INPUT, OUTPUT
-from tuning.controller import Controller
-from tuning.gains import Gains
 
 ROWS = 256
 

@@ -10,33 +10,33 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from mimopilot.codegen.budget import processor_in_the_loop
+from mimopilot.codegen.cortex_m4 import load_emulated
+from mimopilot.codegen.native import NativeController, build_native, load_native
+from mimopilot.codegen.vectors import random_inputs, reference_outputs
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.flight.scenario import doublet, excitation_flight
+from mimopilot.sitl.flight.simulator import fly
+from mimopilot.sitl.mavlink.ground_station.connection import Connection
+from mimopilot.sitl.mavlink.ground_station.events import drive, single
+from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, Conversation
+from mimopilot.sitl.mavlink.ground_station.upload import apply, read
+from mimopilot.sitl.mavlink.simulator_api import lockstep
+from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
+from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import ARMED, SimulatedVehicle
+from mimopilot.sitl.mavlink.wire.fast_codec import SENSOR, LeanCodec
+from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.physics.airframe import Airframe, load_airframe
+from mimopilot.sitl.physics.rigid_body import GRAVITY
+from mimopilot.sitl.studies.faults import standard_faults
+from mimopilot.tuning.controller import Controller
+from mimopilot.tuning.logs.reader import read_log
 
-from codegen.budget import processor_in_the_loop
-from codegen.cortex_m4 import load_emulated
-from codegen.native import NativeController, build_native, load_native
-from codegen.vectors import random_inputs, reference_outputs
-from sitl.airframe import Airframe, load_airframe
-from sitl.autopilot import Autopilot
-from sitl.loop import fly
-from sitl.mavlink import lockstep
-from sitl.mavlink.connection import Connection
-from sitl.mavlink.exchange import AUTOSAVE_S, Conversation
-from sitl.mavlink.lean import SENSOR, LeanCodec
-from sitl.mavlink.link import Codec
-from sitl.mavlink.plant_process import plant_process
-from sitl.mavlink.simulator import ARMED, SimulatedVehicle
-from sitl.mavlink.upload import apply, read
-from sitl.mavlink.words import drive, single
-from sitl.plant import GRAVITY
-from sitl.scenario import doublet, excitation_flight
-from sitl.studies.faults import standard_faults
+from mimopilot.common.console import print_table
 from tests.bench_campaign import campaign_rows, rotorpy_rows
 from tests.bench_tuning import best, tuning_rows
-from tests.sitl import flood
-from tests.sitl.scripted_vehicle import ScriptedVehicle, UdpVehicle
-from tuning.controller import Controller
-from tuning.logs.reader import read_log
-from tuning.output import print_table
+from tests.sitl.mavlink import flood
+from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, UdpVehicle
 
 TS = 0.004
 

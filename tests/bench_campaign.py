@@ -9,11 +9,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from mimopilot.sitl.campaign.flights import Stand
+from mimopilot.sitl.campaign.plan import plan_from_files, read_files
 
-from sitl.campaign.flights import Stand
-from sitl.campaign.plan import plan_from_files, read_files
+from mimopilot.common.parallel import cores
 from tests.bench_tuning import best
-from tuning.parallel import cores
 
 RUNS, FLIGHT_S = 10_000, 4.0
 #: What the campaign varies: a dozen quantities.

@@ -14,8 +14,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = os.environ[
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
-
-from tuning.gains import Gains, Limits, YawGains
+from mimopilot.tuning.gains import Gains, Limits, YawGains
 
 #: How fast the machine is decides nothing.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])

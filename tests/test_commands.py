@@ -6,17 +6,17 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 import zipfile
 from pathlib import Path
 
 import pytest
+from mimopilot.sitl.physics.airframe import FOLDER
+from mimopilot.tuning.gains import load_gains
+from mimopilot.tuning.logs.ulog_file import open_ulog
 from pyulog import ULog
 
-from sitl.airframe import FOLDER
 from tests.conftest import assert_one_clear_line
-from tuning.gains import load_gains
-from tuning.logs.ulog_file import open_ulog
+from tests.paths import PACKAGES, TOP
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
@@ -187,8 +187,7 @@ def test_without_a_compiler_the_package_is_named(mimopilot, tmp_path):
 
 def test_a_log_without_the_topics_names_them_and_its_own(mimopilot, tmp_path):
     import numpy as np
-
-    from sitl.ulog_writer import ulog_bytes
+    from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 
     topics = {
         "vehicle_attitude": {"q": np.tile(np.float32([1, 0, 0, 0]), (3000, 1))},
@@ -204,8 +203,7 @@ def test_a_log_without_the_topics_names_them_and_its_own(mimopilot, tmp_path):
 @pytest.mark.parametrize(("Ts", "seconds", "words"), [(0.02, 20, "too slow"), (0.004, 3, "too short")])
 def test_a_slow_or_short_log_is_refused(mimopilot, tmp_path, Ts, seconds, words):
     import numpy as np
-
-    from sitl.ulog_writer import ulog_bytes
+    from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 
     n = round(seconds / Ts)
     xyz = np.random.default_rng(0).standard_normal((n, 3)).astype(np.float32)
@@ -219,7 +217,7 @@ def test_a_slow_or_short_log_is_refused(mimopilot, tmp_path, Ts, seconds, words)
 
 
 def test_a_full_disk_leaves_the_old_file_whole(tmp_path, monkeypatch):
-    from tuning.files import write_atomically
+    from mimopilot.common.files import write_atomically
 
     path = tmp_path / "x"
     write_atomically(path, "old")
@@ -235,13 +233,12 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path, monkeypatch):
 
 
 def test_the_wheel_holds_every_file_that_is_not_python(tmp_path):
-    top = Path(__file__).resolve().parents[1]
     copy = tmp_path / "source"
     copy.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE", "mimopilot.py"):
-        shutil.copy(top / name, copy)
-    for room in ("tuning", "codegen", "sitl", "firmware_templates"):
-        shutil.copytree(top / room, copy / room, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(TOP / name, copy)
+    for folder in PACKAGES.values():
+        shutil.copytree(folder, copy / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
     build = [
         sys.executable,
         "-m",
@@ -257,16 +254,18 @@ def test_the_wheel_holds_every_file_that_is_not_python(tmp_path):
     subprocess.run(build, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
     held = set(zipfile.ZipFile(wheel).namelist())
-    rooms = [p for room in ("tuning", "codegen", "sitl", "firmware_templates") for p in (top / room).rglob("*")]
-    wanted = {p.relative_to(top).as_posix() for p in rooms if p.is_file() and "__pycache__" not in p.parts}
+    wanted = {
+        (Path(package.replace(".", "/")) / path.relative_to(folder)).as_posix()
+        for package, folder in PACKAGES.items()
+        for path in folder.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
     assert wanted <= held
 
 
 def test_the_demo_does_the_whole_way(mimopilot, tmp_path):
-    begin = time.monotonic()
     result = mimopilot("demo", "--out", "out", "--seed", "1", "--json")
     assert result.returncode == 0, result.stderr
-    assert time.monotonic() - begin < 60
     found = json.loads(result.stdout)
     assert set(found["gains"]) == {"default", "siso", "mimo"}
     for path in (*found["gains"].values(), found["report"], found["log"]):

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mimopilot.tuning.errors import NotMinimumPhaseError
+from mimopilot.tuning.gains import MATRICES, Gains, derivative_pole
 from numpy.typing import NDArray
 from scipy.linalg import schur
 from scipy.signal import lfilter
-
-from tuning.errors import NotMinimumPhaseError
-from tuning.gains import MATRICES, Gains, derivative_pole
 
 HOLD_SAMPLES = 25
 MAX_RATE = 100.0

@@ -1,11 +1,11 @@
-"""The exceptions of this room."""
+"""The exceptions of tuning."""
+
+from mimopilot.common.errors import Error
 
 
-class TuningError(ValueError):
-    """Bad input to tuning: the message says what, where and what to do next."""
-
-    exit_code = 2
+class TuningError(Error, ValueError):
+    """Bad input to tuning."""
 
 
 class NotMinimumPhaseError(TuningError):
-    """A controller that cannot be run backwards."""
+    """A controller that cannot be inverted."""

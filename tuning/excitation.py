@@ -6,9 +6,8 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
-
-from tuning.errors import TuningError
 
 
 def hold_from_bandwidth(bandwidth: float, Ts: float) -> tuple[int, int]:

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.motors import Motors
 from numpy.typing import NDArray
-
-from tuning.errors import TuningError
-from tuning.gains import Gains
-from tuning.motors import Motors
 
 Signal = NDArray[np.float64]
 

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from mimopilot.tuning.gains import MATRICES, Gains
 from numpy.typing import NDArray
-
-from tuning.gains import MATRICES, Gains
 
 Signal = NDArray[np.float64]
 

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
 
-from tuning.errors import TuningError
-from tuning.files import sha256, write_atomically
-from tuning.toml import parse_toml, read_toml, shown, shown_text, toml_entries, toml_value
+from mimopilot.common.files import sha256, write_atomically
+from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text, toml_entries, toml_value
 
 SCHEMA = 1
 PARAMETER_PREFIX = "MIMO_"
@@ -87,8 +87,8 @@ class Gains:
     moment_scale : tuple of 3 float or None, N m
         Moment that one unit of u stands for on roll, pitch and yaw. None: the log did not say.
     certificate : mapping or None
-        What `tuning.certificate` found: verdict, reason, figures, band, thresholds, the hash of the log, and a seal. It
-        counts only while neither it nor the gains are edited; see `verdict`. None: never examined.
+        What `tuning.analysis.certificate` found: verdict, reason, figures, band, thresholds, the hash of the log, and
+        a seal. It counts only while neither it nor the gains are edited; see `verdict`. None: never examined.
     provenance : mapping
         Where the gains come from: method, log, reference models, standard deviations. Plain TOML values.
 

@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-
-from tuning.errors import TuningError
-from tuning.gains import derivative_pole
-from tuning.statespace import Response, Signal, StateSpace
-from tuning.vrft import TERMS
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.estimation.vrft import TERMS
+from mimopilot.tuning.gains import derivative_pole
+from mimopilot.tuning.statespace import Response, Signal, StateSpace
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mimopilot.tuning.statespace import StateSpace
 from numpy.typing import NDArray
-
-from tuning.statespace import StateSpace
 
 #: Share of the moment's variance that the mixer must give back: else the commands are not those of this moment.
 EXPLAINED = 0.95

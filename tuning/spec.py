@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.reference_model import ReferenceModel, second_order
+from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from tuning.errors import TuningError
-from tuning.reference import ReferenceModel, second_order
-from tuning.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from tuning.toml import checked, read_toml
+from mimopilot.common.toml import checked, read_toml
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -41,7 +41,7 @@ class LimitsSpec(_Table):
 
 
 class Manoeuvre(_Table):
-    """A doublet that all gains are refined for, `tuning.manoeuvre`.
+    """A doublet that all gains are refined for, `tuning.design.refine_manoeuvre`.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class TuningSpec(_Table):
         Terms of the rate controller: letters of ``PIDF`` in that order, P among them. The attitude controller is P.
     instrument : str
         ``external``: lags of the injected moment, or of the set-point. ``u``: lags of the moment that acted, the
-        thesis' choice. ``model``, ``repeated``: see `tuning.instruments.instruments`.
+        thesis' choice. ``model``, ``repeated``: see `tuning.estimation.instrumental_variables.instruments`.
     trim : bool
         Estimate a constant (trim, initial integrator) on each stretch; the thesis does not.
     window : int or None, samples
@@ -84,7 +84,7 @@ class TuningSpec(_Table):
         Pull of the rate gains towards the flying ones, the safe choice on a short log: 1 goes half of the way for a
         gain that stands alone; 0 none.
     refine : bool
-        Refine the attitude gains on the measured frequency response, `tuning.closed_loop.refine_outer`; False
+        Refine the attitude gains on the measured frequency response, `tuning.analysis.closed_loop.refine_outer`; False
         leaves them as VRFT gives them.
     doublet_s : float or None, s
         Length of the doublet that the refinement weighs errors by; None: 1/omega, for set-points of all kinds.

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
-
-from tuning.errors import TuningError
 
 Signal = NDArray[np.float64]
 Response = NDArray[np.complex128]

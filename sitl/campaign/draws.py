@@ -8,16 +8,15 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from mimopilot.sitl.campaign.variation import Distribution, FaultVariation, Variation
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.faults.inject_plant import check_fault
+from mimopilot.sitl.faults.kinds import Fault, make_fault
+from mimopilot.sitl.flight.flight_log import quaternions
+from mimopilot.sitl.flight.scenario import MAX_ANGLE, Scenario
+from mimopilot.sitl.physics.airframe import MAX_HOVER, Airframe
+from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, hover_state, is_of_a_body
 from numpy.typing import NDArray
-
-from sitl.airframe import MAX_HOVER, Airframe
-from sitl.campaign.variation import Distribution, FaultVariation, Variation
-from sitl.errors import SitlError
-from sitl.faults import Fault, make_fault
-from sitl.injection import check_fault
-from sitl.plant import GRAVITY, PlantParameters, hover_state, is_of_a_body
-from sitl.recorder import quaternions
-from sitl.scenario import MAX_ANGLE, Scenario
 
 ATTEMPTS = 1000  # draws for one run before the specification is refused
 MAX_DELAY = 100  # samples
@@ -57,7 +56,7 @@ class Draw:
         Column -> what was drawn, in the specification's unit.
     plant : PlantParameters
     state : (13 + n,) array
-        At the start, see `sitl.plant`.
+        At the start, see `sitl.physics.rigid_body`.
     delay : int, samples
     angle_deviation, rate_deviation : float, rad, rad/s
         Of the noise.

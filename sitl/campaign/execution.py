@@ -16,13 +16,13 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from mimopilot.sitl.campaign.flights import CHUNK, chunks, fly_chunk, label, stand_of
+from mimopilot.sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, Plan, settle
+from mimopilot.sitl.errors import SitlError
 
-from sitl.campaign.flights import CHUNK, chunks, fly_chunk, label, stand_of
-from sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, Plan, settle
-from sitl.errors import SitlError
-from tuning.files import inside, unseal, write_atomically
-from tuning.output import progress_console
-from tuning.parallel import processes, run_all
+from mimopilot.common.console import progress_console
+from mimopilot.common.files import inside, unseal, write_atomically
+from mimopilot.common.parallel import processes, run_all
 
 ROW_GROUP = 1 << 14  # rows: what is in memory at a time
 SHOWN = 3  # parts that one message names

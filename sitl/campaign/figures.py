@@ -8,19 +8,19 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from mimopilot.sitl.campaign.draws import Variator
+from mimopilot.sitl.campaign.flights import Stand
+from mimopilot.sitl.campaign.plan import Plan
+from mimopilot.sitl.campaign.summary import Results
+from mimopilot.sitl.campaign.variation import UNITS
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.faults.kinds import KINDS
+from mimopilot.sitl.flight.figures import SETPOINT, STYLES
+from mimopilot.sitl.flight.scenario import AXES
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from sitl.campaign.draws import Variator
-from sitl.campaign.flights import Stand
-from sitl.campaign.plan import Plan
-from sitl.campaign.summary import Results
-from sitl.campaign.variation import UNITS
-from sitl.commands import UNITS as FIGURES
-from sitl.errors import SitlError
-from sitl.faults import KINDS
-from sitl.figures import SETPOINT, STYLES
-from sitl.scenario import AXES
+from mimopilot.cli.bench import UNITS as FIGURES
 
 ENVELOPE_RUNS = 400  # flown again for the envelopes: the first ones, which are as random as any
 CELLS, A_CELL = 16, 8  # of the map: at most so many on each side, with so many flights in each on average

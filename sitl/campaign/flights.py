@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from mimopilot.codegen.render import generator_version
+from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot
+from mimopilot.sitl.campaign.draws import Draw, Variator
+from mimopilot.sitl.campaign.plan import Plan, plan_from_files
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.faults.inject_plant import Injection
+from mimopilot.sitl.flight.metrics import Performance, performance
+from mimopilot.sitl.flight.models import reference_models
+from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, first_loss
 
-from codegen.render import generator_version
-from sitl.autopilot import RECORD, Autopilot
-from sitl.campaign.draws import Draw, Variator
-from sitl.campaign.plan import Plan, plan_from_files
-from sitl.errors import SitlError
-from sitl.injection import Injection
-from sitl.loop import TRUTH, Flight, Simulator, first_loss
-from sitl.metrics import Performance, performance
-from sitl.models import reference_models
-from tuning.files import seal
+from mimopilot.common.files import seal
 
 CHUNK = 64  # runs: what is lost of a worker that dies
 FIGURES = tuple(field.name for field in fields(Performance))

@@ -11,17 +11,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import pyarrow as pa
+from mimopilot.codegen.render import generator_version
+from mimopilot.sitl.campaign.variation import Variation
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.faults.kinds import parse_fault
+from mimopilot.sitl.flight.scenario import Scenario, make_scenario
+from mimopilot.sitl.physics.airframe import Airframe, Vehicle, airframe_from_toml
+from mimopilot.tuning.gains import Gains, gains_from_toml, gains_to_toml
 from pydantic import BaseModel, ConfigDict, Field
 
-from codegen.render import generator_version
-from sitl.airframe import Airframe, Vehicle, airframe_from_toml
-from sitl.campaign.variation import Variation
-from sitl.errors import SitlError
-from sitl.faults import parse_fault
-from sitl.scenario import Scenario, make_scenario
-from tuning.files import inside, read_text, sha256, write_atomically
-from tuning.gains import Gains, gains_from_toml, gains_to_toml
-from tuning.toml import checked, parse_toml, shown, toml_entries
+from mimopilot.common.files import inside, read_text, sha256, write_atomically
+from mimopilot.common.toml import checked, parse_toml, shown, toml_entries
 
 SPEC, AIRFRAME = "spec.toml", "airframe.toml"
 RESULTS, PARTS, LOCK = "results.parquet", "parts", "campaign.lock"
@@ -41,13 +41,13 @@ class Description(BaseModel):
     gains : tuple of str
         Names of the gain sets; each has a file.
     manoeuvre : str
-        See `sitl.scenario.make_scenario`.
+        See `sitl.flight.scenario.make_scenario`.
     axes : tuple of str
         Each run flies the manoeuvre on each.
     amplitude_deg, period_s, tail_s : float
         Of the manoeuvre.
     faults : tuple of str
-        Of every flight, as `sitl.faults.parse_fault` reads them.
+        Of every flight, as `sitl.faults.kinds.parse_fault` reads them.
     vary : Variation
     """
 

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-
-from sitl.campaign.flights import Stand
-from sitl.campaign.plan import RESULTS, SPEC, Plan, plan_from_files, read_files, reading
-from sitl.errors import SitlError
-from sitl.loop import Flight
+from mimopilot.sitl.campaign.flights import Stand
+from mimopilot.sitl.campaign.plan import RESULTS, SPEC, Plan, plan_from_files, read_files, reading
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.flight.simulator import Flight
 
 
 @dataclass(frozen=True, eq=False)

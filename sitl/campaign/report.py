@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sitl.campaign import figures
-from sitl.campaign.flights import stand_of
-from sitl.campaign.plan import REPORT, SPEC
-from sitl.campaign.summary import (
+from mimopilot.sitl.campaign import figures
+from mimopilot.sitl.campaign.flights import stand_of
+from mimopilot.sitl.campaign.plan import REPORT, SPEC
+from mimopilot.sitl.campaign.summary import (
     FIGURE_COLUMNS,
     SURVIVAL_COLUMNS,
     WORST_COLUMNS,
@@ -17,9 +17,10 @@ from sitl.campaign.summary import (
     survival_rows,
     worst_rows,
 )
-from sitl.figures import svg
-from sitl.report import Section, Table, write_report
-from tuning.files import inside
+from mimopilot.sitl.flight.figures import svg
+
+from mimopilot.common.files import inside
+from mimopilot.common.html_report import Section, Table, write_report
 
 INTERVALS = (
     "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
+from mimopilot.sitl.campaign.plan import Plan, reading
 from numpy.typing import NDArray
 
-from sitl.campaign.plan import Plan, reading
-from sitl.commands import UNITS
-from sitl.intervals import quantile, wilson
+from mimopilot.cli.bench import UNITS
+from mimopilot.common.intervals import quantile, wilson
 
 #: Figures that are summed up.
 SHOWN = ("J_M_o", "peak_deg", "offaxis_peak_deg", "effort_rms", "saturated")

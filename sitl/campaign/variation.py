@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from mimopilot.sitl.physics.airframe import Vector
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sitl.airframe import Vector
-from tuning.toml import checked, parse_toml, read_toml
+from mimopilot.common.toml import checked, parse_toml, read_toml
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pair = tuple[Finite, Finite]
@@ -136,7 +136,7 @@ class AngleVariation(_AbsoluteTable):
 
 
 class FaultVariation(_Table):
-    """A fault, see `sitl.faults.Fault`, whose numbers may be distributions; a drawn motor is a whole number."""
+    """A fault, see `sitl.faults.kinds.Fault`, whose numbers may be distributions; a drawn motor is a whole number."""
 
     kind: str
     at: Number

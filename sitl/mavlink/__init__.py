@@ -1,1 +1,1 @@
-"""The MAVLink side of the bench: PX4's simulator API, the autopilot host and its ground link."""
+"""MAVLink: the wire, the simulated vehicle, the ground station, PX4's simulator API."""

@@ -8,30 +8,29 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-
-from codegen.native import NativeController, NativeLibrary, load_native
-from sitl.airframe import Vehicle, load_airframe
-from sitl.autopilot import Autopilot
-from sitl.errors import SitlError
-from sitl.loop import Flight, fly
-from sitl.metrics import Performance, performance
-from sitl.scenario import AXES, Scenario, doublet, excitation_flight
-from sitl.studies.autotune import autotune
-from sitl.studies.benchmarks import TABLES
-from sitl.studies.optimum import Task, best_gains, flown_effort
-from tuning.cascade import tune
-from tuning.certificate import DENSE, certify, sensitivity_peak
-from tuning.doublet import doublet_model, effort
-from tuning.experiment import Experiment
-from tuning.gains import Gains
-from tuning.manoeuvre import INTEGRAL
-from tuning.measured import Measured
-from tuning.motors import fit_motors
-from tuning.plant_response import measured_plant
-from tuning.reference import ReferenceModel, second_order
-from tuning.rigid_body import rigid_body
-from tuning.spec import Manoeuvre, TuningSpec
-from tuning.thresholds import DEFAULT_THRESHOLDS
+from mimopilot.codegen.native import NativeController, NativeLibrary, load_native
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.flight.metrics import Performance, performance
+from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet, excitation_flight
+from mimopilot.sitl.flight.simulator import Flight, fly
+from mimopilot.sitl.physics.airframe import Vehicle, load_airframe
+from mimopilot.sitl.studies.autotune import autotune
+from mimopilot.sitl.studies.benchmarks import TABLES
+from mimopilot.sitl.studies.optimum import Task, best_gains, flown_effort
+from mimopilot.tuning.analysis.certificate import DENSE, certify, sensitivity_peak
+from mimopilot.tuning.analysis.doublet_prediction import doublet_model, effort
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.refine_manoeuvre import INTEGRAL
+from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.motors import fit_motors
+from mimopilot.tuning.plant.frequency_response import measured_plant
+from mimopilot.tuning.plant.inertia import rigid_body
+from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.reference_model import ReferenceModel, second_order
+from mimopilot.tuning.spec import Manoeuvre, TuningSpec
+from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS
 
 DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, perturbed log"
 MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same with any effort"

@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from mimopilot.sitl.flight.figures import STYLES
+from mimopilot.sitl.flight.metrics import reference_responses
+from mimopilot.sitl.flight.scenario import AXES
+from mimopilot.sitl.flight.simulator import Flight
+from mimopilot.sitl.studies.attitude import MIMO, REFINED, SISO, Run, Study
+from mimopilot.sitl.studies.attitude_runs import Statistics
 from numpy.typing import NDArray
-
-from sitl.figures import STYLES
-from sitl.loop import Flight
-from sitl.metrics import reference_responses
-from sitl.scenario import AXES
-from sitl.studies.attitude import MIMO, REFINED, SISO, Run, Study
-from sitl.studies.attitude_runs import Statistics
 
 #: A colour, a line and a marker of its own for each method that is compared everywhere.
 LOOK = dict(zip((SISO, MIMO, REFINED), zip(STYLES, "so^", strict=False), strict=False))

@@ -6,13 +6,11 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
-
-from sitl.airframe import load_airframe
-from sitl.figures import experiment_figure, manoeuvre_figure, svg
-from sitl.report import Section, Table
-from sitl.scenario import AXES
-from sitl.studies.attitude import AUTOTUNE, BEST, BOUND, DEFAULT, EFFORT, MIMO, REFINED, SISO, SISO_OWN, Study
-from sitl.studies.attitude_figures import (
+from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
+from mimopilot.sitl.flight.scenario import AXES
+from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.sitl.studies.attitude import AUTOTUNE, BEST, BOUND, DEFAULT, EFFORT, MIMO, REFINED, SISO, SISO_OWN, Study
+from mimopilot.sitl.studies.attitude_figures import (
     COSTS,
     ELEMENTS,
     HIGH,
@@ -23,7 +21,9 @@ from sitl.studies.attitude_figures import (
     motors_figure,
     tracking_figure,
 )
-from sitl.studies.attitude_runs import Statistics
+from mimopilot.sitl.studies.attitude_runs import Statistics
+
+from mimopilot.common.html_report import Section, Table
 
 IN_KIND = (
     "The thesis' figures of real flights can only be compared in kind: its vehicles' inertias, motors and winds are "

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mimopilot.sitl.studies.attitude import Run, Study, numbers, optimum, run
+from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
-from sitl.studies.attitude import Run, Study, numbers, optimum, run
-from tuning.gains import Gains
-from tuning.output import progress_console
-from tuning.parallel import cores, processes, run_all
+from mimopilot.common.console import progress_console
+from mimopilot.common.parallel import cores, processes, run_all
 
 
 @dataclass(frozen=True, eq=False)

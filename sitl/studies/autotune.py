@@ -20,12 +20,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
+from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
-
-from tuning.experiment import Experiment, external_signal
-from tuning.gains import Gains
-from tuning.instruments import excited_stretches
 
 BAND_HZ = (0.5, 30.0)
 PERIOD = 0.010  # s, at most

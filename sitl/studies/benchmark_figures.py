@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-
-from sitl.figures import MODEL, STYLES
-from sitl.studies.benchmarks import Benchmark
-from tuning.loop import LoopController, closed_loop, complementary_sensitivity
+from mimopilot.sitl.flight.figures import MODEL, STYLES
+from mimopilot.sitl.studies.benchmarks import Benchmark
+from mimopilot.tuning.loop import LoopController, closed_loop, complementary_sensitivity
 
 #: Okabe-Ito, and a style of its own each.
 LINES = (*STYLES, ("#E69F00", (0, (5, 1, 1, 1, 1, 1))))

@@ -10,18 +10,18 @@ from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
+from mimopilot.sitl.flight.figures import svg
+from mimopilot.sitl.studies.benchmark_figures import sensitivity_figure, step_figure
+from mimopilot.sitl.studies.benchmarks import Benchmark, Signal, excitation, lv100, numerical_example
+from mimopilot.sitl.studies.part import Part
+from mimopilot.tuning.design.refine import refine
+from mimopilot.tuning.estimation.cbt_ift import Comparison, correlation_based_tuning, iterative_feedback_tuning
+from mimopilot.tuning.estimation.siso import siso_vrft
+from mimopilot.tuning.estimation.vrft import vrft
+from mimopilot.tuning.loop import LoopController
+from mimopilot.tuning.plant.pbsid import pbsid
 
-from sitl.figures import svg
-from sitl.report import Section, Table
-from sitl.studies.benchmark_figures import sensitivity_figure, step_figure
-from sitl.studies.benchmarks import Benchmark, Signal, excitation, lv100, numerical_example
-from sitl.studies.part import Part
-from tuning.comparators import Comparison, correlation_based_tuning, iterative_feedback_tuning
-from tuning.identification import pbsid
-from tuning.loop import LoopController
-from tuning.refine import refine
-from tuning.siso import siso_vrft
-from tuning.vrft import vrft
+from mimopilot.common.html_report import Section, Table
 
 SAMPLES = 5000
 IFT_SAMPLES = 1000

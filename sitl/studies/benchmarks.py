@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.tuning.design.refine import model_reference_cost
+from mimopilot.tuning.loop import LoopController, closed_loop
+from mimopilot.tuning.reference_model import ReferenceModel
+from mimopilot.tuning.statespace import StateSpace
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete
-
-from tuning.loop import LoopController, closed_loop
-from tuning.reference import ReferenceModel
-from tuning.refine import model_reference_cost
-from tuning.statespace import StateSpace
 
 TABLES = Path(__file__).with_name("thesis_tables.json")
 #: Frequencies of J_MR, (3.1).

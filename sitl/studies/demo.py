@@ -12,26 +12,26 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
+from mimopilot.sitl.flight.flight_log import save_flight
+from mimopilot.sitl.flight.metrics import Performance, performance
+from mimopilot.sitl.flight.models import reference_models
+from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet, excitation_flight
+from mimopilot.sitl.flight.simulator import Flight, fly
+from mimopilot.sitl.mavlink.simulator_api import lockstep
+from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
+from mimopilot.sitl.physics.airframe import Airframe, load_airframe
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.gains import MATRICES, Gains
+from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.spec import load_spec
 
-from codegen.native import NativeController, load_native
-from sitl.airframe import Airframe, load_airframe
-from sitl.autopilot import Autopilot
-from sitl.errors import SitlError
-from sitl.figures import experiment_figure, manoeuvre_figure, svg
-from sitl.loop import Flight, fly
-from sitl.mavlink import lockstep
-from sitl.mavlink.plant_process import plant_process
-from sitl.metrics import Performance, performance
-from sitl.models import reference_models
-from sitl.recorder import save_flight
-from sitl.report import Section, Table, write_report
-from sitl.scenario import AXES, Scenario, doublet, excitation_flight
-from tuning.cascade import tune
-from tuning.files import inside
-from tuning.gains import MATRICES, Gains
-from tuning.logs.reader import read_log
-from tuning.output import print_table
-from tuning.spec import load_spec
+from mimopilot.common.console import print_table
+from mimopilot.common.files import inside
+from mimopilot.common.html_report import Section, Table, write_report
 
 AIRFRAME = "adam0"
 METHODS = ("default", "siso", "mimo")

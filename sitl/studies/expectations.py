@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sitl.report import Table
-from sitl.scenario import AXES
-from sitl.studies.attitude import BEST, MIMO, REFINED, SISO
-from sitl.studies.attitude_runs import Statistics
+from mimopilot.sitl.flight.scenario import AXES
+from mimopilot.sitl.studies.attitude import BEST, MIMO, REFINED, SISO
+from mimopilot.sitl.studies.attitude_runs import Statistics
+
+from mimopilot.common.html_report import Table
 
 #: J_M,o over that of the best on the true plant, effort over SISO's, and how equal "no worse" is.
 NEAR_BEST, EFFORT, NO_WORSE = 1.15, 1.10, 1.0
@@ -22,7 +23,7 @@ class Expectation:
     Attributes
     ----------
     study, axis, figure : str
-        Of `sitl.metrics.Performance`.
+        Of `sitl.flight.metrics.Performance`.
     over : str
         Method whose figure it is compared with.
     text : str

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.codegen.native import NativeController, NativeLibrary, load_native
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.faults.kinds import Fault, parse_fault
+from mimopilot.sitl.flight.fault_recovery import Recovery, recovery
+from mimopilot.sitl.flight.scenario import Scenario, make_scenario
+from mimopilot.sitl.flight.simulator import Flight, fly
+from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 
-from codegen.native import NativeController, NativeLibrary, load_native
-from sitl.airframe import Airframe, load_airframe
-from sitl.autopilot import Autopilot
-from sitl.faults import Fault, parse_fault
-from sitl.intervals import wilson
-from sitl.loop import Flight, fly
-from sitl.recovery import Recovery, recovery
-from sitl.scenario import Scenario, make_scenario
-from tuning.output import print_table, progress_console
-from tuning.parallel import processes, run_all
+from mimopilot.common.console import print_table, progress_console
+from mimopilot.common.intervals import wilson
+from mimopilot.common.parallel import processes, run_all
 
 AT = 1.1  # s: a tenth of a second into the manoeuvre
 TAIL_S = 5.0  # of level flight after it: what is lost in the end shall be lost in the flight
@@ -39,7 +39,7 @@ class Request:
     airframe : str
         Name or path.
     gains : tuple of Path
-        See `sitl.airframe.Vehicle.gain_sets`.
+        See `sitl.physics.airframe.Vehicle.gain_sets`.
     axis : str
     amplitude_deg, period_s : float
         Of the doublet.
@@ -66,7 +66,7 @@ class Row:
     survival_interval : (low, high)
         Wilson's, 95 %.
     peak_deg, worst_peak_deg, rms_deg : float, deg
-        From the flight without faults, see `sitl.recovery.Recovery`; the worst is that of `worst_seed`.
+        From the flight without faults, see `sitl.flight.fault_recovery.Recovery`; the worst is that of `worst_seed`.
     recovered : int
     recovery_s : float or None, s
         Of those that recovered.

@@ -10,23 +10,22 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.native import NativeController, NativeLibrary
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.flight.scenario import Scenario
+from mimopilot.sitl.flight.simulator import Flight, fly
+from mimopilot.sitl.physics.airframe import Airframe
+from mimopilot.tuning.analysis.certificate import HIGH_FREQUENCY_LOOP, loop_above
+from mimopilot.tuning.analysis.closed_loop import cascade_loop
+from mimopilot.tuning.analysis.doublet_prediction import moment_rms
+from mimopilot.tuning.design.constrained_least_squares import MISSED, descend
+from mimopilot.tuning.design.refine_manoeuvre import OTHER_AXIS, typical_sizes
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.plant.frequency_response import PlantResponse
+from mimopilot.tuning.plant.inertia import RigidBody
+from mimopilot.tuning.reference_model import ReferenceModel
 from numpy.typing import NDArray
-
-from codegen.errors import CodegenError
-from codegen.native import NativeController, NativeLibrary
-from sitl.airframe import Airframe
-from sitl.autopilot import Autopilot
-from sitl.loop import Flight, fly
-from sitl.scenario import Scenario
-from tuning.certificate import HIGH_FREQUENCY_LOOP, loop_above
-from tuning.closed_loop import cascade_loop
-from tuning.descent import MISSED, descend
-from tuning.doublet import moment_rms
-from tuning.gains import Gains
-from tuning.manoeuvre import OTHER_AXIS, typical_sizes
-from tuning.plant_response import PlantResponse
-from tuning.reference import ReferenceModel
-from tuning.rigid_body import RigidBody
 
 #: Every gain of the structure that the thesis' tables have.
 FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
@@ -58,7 +57,7 @@ class Task:
     effort : sequence of 2 float or None
         RMS of the moments allowed in each doublet; None: as much as it takes.
     integral : float, 1/s
-        Integral action that is needed, see `tuning.rigid_body.RigidBody.least`: a vehicle must find its trim.
+        Integral action that is needed, see `tuning.plant.inertia.RigidBody.least`: a vehicle must find its trim.
     """
 
     airframe: Airframe

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sitl.report import Section, Table
+from mimopilot.common.html_report import Section, Table
 
 
 @dataclass(frozen=True)

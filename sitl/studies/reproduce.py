@@ -7,15 +7,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sitl.report import Section, Table, write_report
-from sitl.studies.attitude import studies
-from sitl.studies.attitude_report import IN_KIND, study_figures, study_sections
-from sitl.studies.attitude_runs import Statistics, run_studies
-from sitl.studies.benchmark_studies import study_lv100, study_numerical_example
-from sitl.studies.expectations import expectations, expectations_table
-from sitl.studies.part import Part
-from tuning.files import inside
-from tuning.output import print_table
+from mimopilot.sitl.studies.attitude import studies
+from mimopilot.sitl.studies.attitude_report import IN_KIND, study_figures, study_sections
+from mimopilot.sitl.studies.attitude_runs import Statistics, run_studies
+from mimopilot.sitl.studies.benchmark_studies import study_lv100, study_numerical_example
+from mimopilot.sitl.studies.expectations import expectations, expectations_table
+from mimopilot.sitl.studies.part import Part
+
+from mimopilot.common.console import print_table
+from mimopilot.common.files import inside
+from mimopilot.common.html_report import Section, Table, write_report
 
 #: Noise seeds of the attitude studies: what is expected is expected of their medians.
 SEEDS = 50

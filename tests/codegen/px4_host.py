@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-
-from codegen.render import render, write_tree
-from codegen.toolchain import WARNINGS, find_compiler
+from mimopilot.codegen.render import render, write_tree
+from mimopilot.codegen.toolchain import WARNINGS, find_compiler
 
 STAND_INS = Path(__file__).parent / "px4_stand_ins"
 STANDARD = {"crtp": "-std=gnu++14", "descriptor": "-std=gnu++17"}

@@ -7,18 +7,18 @@ import subprocess
 import numpy as np
 import pytest
 import unicorn
+from mimopilot.codegen import budget
+from mimopilot.codegen.budget import Figure, cycles, different_rows, processor_in_the_loop, stack_bytes, step_costs
+from mimopilot.codegen.cortex_m4 import RAM, RAM_SIZE, EmulatedController, build_image, load_emulated, run_in_qemu
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.codegen.toolchain import CXX_FLAGS
+from mimopilot.codegen.vectors import random_inputs
+from mimopilot.sitl.physics.airframe import FOLDER
+from mimopilot.tuning.gains import load_gains
+from mimopilot.tuning.parameters import to_array
 
-from codegen import budget
-from codegen.budget import Figure, cycles, different_rows, processor_in_the_loop, stack_bytes, step_costs
-from codegen.cortex_m4 import RAM, RAM_SIZE, EmulatedController, build_image, load_emulated, run_in_qemu
-from codegen.errors import CodegenError
-from codegen.native import NativeController, load_native
-from codegen.parameters import to_array
-from codegen.toolchain import CXX_FLAGS
-from codegen.vectors import random_inputs
-from sitl.airframe import FOLDER
 from tests.conftest import assert_one_clear_line
-from tuning.gains import load_gains
 
 #: What PX4 gives every file, as far as it concerns code, and -fno-fast-math, which the controller asks for.
 PX4_FLAGS = (
@@ -206,7 +206,7 @@ def test_pil_prints_one_json_object_with_the_figures(mimopilot):
 
 
 def test_a_figure_over_its_budget_fails_the_command(monkeypatch, capsys):
-    from codegen.commands import pil
+    from mimopilot.cli.codegen import pil
 
     figures = [Figure("rows_different", "rows that differ", 3, 0), Figure("text_bytes", "code", 2048, 2048)]
     monkeypatch.setattr(budget, "processor_in_the_loop", lambda *_: figures)

@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from codegen.errors import CodegenError
-from codegen.layout import INPUT
-from codegen.native import NativeController, NativeLibrary, build_native, load_native
-from codegen.parameters import to_array
-from codegen.vectors import random_inputs, reference_outputs
-from tuning.controller import Controller
-from tuning.gains import MATRICES, Limits
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.layout import INPUT
+from mimopilot.codegen.native import NativeController, NativeLibrary, build_native, load_native
+from mimopilot.codegen.vectors import random_inputs, reference_outputs
+from mimopilot.tuning.controller import Controller
+from mimopilot.tuning.gains import MATRICES, Limits
+from mimopilot.tuning.parameters import to_array
 
 TS = 0.004
 HOLD = 25

@@ -12,12 +12,12 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.px4 import APIS, yaml_number
+from mimopilot.codegen.render import TEMPLATES, render
+from mimopilot.codegen.toolchain import find_compiler
+from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 
-from codegen.errors import CodegenError
-from codegen.parameters import EXCITATION, IDENTITY, PARAMETERS
-from codegen.px4 import APIS, yaml_number
-from codegen.render import TEMPLATES, render
-from codegen.toolchain import find_compiler
 from tests.codegen.px4_host import PX4_FLAGS, definitions
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from mimopilot.codegen.layout import INPUT
+from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.tuning.excitation import prbs
 from scipy.spatial.transform import Rotation
 from scipy.stats import ks_2samp
 
-from codegen.layout import INPUT
-from codegen.native import NativeController, load_native
 from tests.codegen.px4_host import PX4_PARAMETERS, STANDARD, build, drive
-from tuning.excitation import prbs
 
 HOLD_MODE = 4
 LEVEL = "attitude 1 0 0 0 0 1 0 0 0"

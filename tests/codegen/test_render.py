@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.literals import float_literal
+from mimopilot.codegen.render import TARGETS, TEMPLATES, render, write_tree
+from mimopilot.codegen.toolchain import find_compiler
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS
 
-from codegen.errors import CodegenError
-from codegen.literals import float_literal
-from codegen.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS
-from codegen.render import TARGETS, TEMPLATES, render, write_tree
-from codegen.toolchain import find_compiler
-from tuning.files import sha256
+from mimopilot.common.files import sha256
 
 
 def read_tree(folder):
@@ -109,7 +109,7 @@ def test_nothing_is_written_when_a_place_is_taken(gains, tmp_path, taken):
 
 def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_is_written(gains, tmp_path, monkeypatch):
     # Root may write everywhere, so the answer of the operating system is made up.
-    monkeypatch.setattr("codegen.render.os.access", lambda path, mode: Path(path).name != "core")
+    monkeypatch.setattr("mimopilot.codegen.render.os.access", lambda path, mode: Path(path).name != "core")
     (tmp_path / "x" / "core").mkdir(parents=True)
     with pytest.raises(CodegenError, match="core: cannot be written to; give --out"):
         write_tree(render(gains), tmp_path / "x", force=True)
@@ -259,7 +259,7 @@ def test_a_gain_out_of_its_range_is_refused_by_name(gains):
 )
 def test_a_name_that_a_vehicle_would_garble_is_refused(gains, monkeypatch, name, reason):
     odd = dataclasses.replace(EXCITATION[0], name=name)
-    monkeypatch.setattr("codegen.parameters.EXCITATION", (odd,))
+    monkeypatch.setattr("mimopilot.tuning.parameters.EXCITATION", (odd,))
     with pytest.raises(CodegenError, match=f"{name}: {reason}"):
         render(gains)
 

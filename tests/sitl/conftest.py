@@ -5,12 +5,12 @@ import subprocess
 import sys
 
 import pytest
+from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+from mimopilot.tuning.parameters import IDENTITY
 
-import mimopilot as front_door
-from codegen.parameters import IDENTITY
-from sitl.mavlink.profiles import make_plan
-from tests.sitl.running import WAITS
-from tests.sitl.scripted_vehicle import float32
+import mimopilot.cli.main as front_door
+from tests.sitl.mavlink.running import WAITS
+from tests.sitl.mavlink.scripted_vehicle import float32
 
 
 @pytest.fixture

@@ -4,11 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-
-from tuning.controller import Controller, filtered_derivative, inverse_eigenvalues, rebuild_rate_setpoint
-from tuning.errors import TuningError
-from tuning.gains import Limits
-from tuning.vrft import regressors
+from mimopilot.tuning.controller import Controller, filtered_derivative, inverse_eigenvalues, rebuild_rate_setpoint
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.estimation.vrft import regressors
+from mimopilot.tuning.gains import Limits
 
 N = 400
 

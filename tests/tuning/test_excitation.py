@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from tuning.errors import TuningError
-from tuning.excitation import hold_from_bandwidth, prbs
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.excitation import hold_from_bandwidth, prbs
 
 
 def test_fifty_rad_per_s_at_250_hz_holds_16_to_64_samples():

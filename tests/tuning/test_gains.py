@@ -5,16 +5,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
-from tuning.errors import TuningError
-from tuning.gains import MATRICES, Gains, gains_from_toml, gains_to_toml, load_gains
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.gains import MATRICES, Gains, gains_from_toml, gains_to_toml, load_gains
 
 FINITE = st.floats(-1e6, 1e6, allow_nan=False)
 
 
 @given(values=st.lists(FINITE, min_size=25, max_size=25), text=st.text(max_size=30))
 def test_a_gains_file_reads_back_to_the_same_bits(values, text):
-    from tuning.gains import YawGains
+    from mimopilot.tuning.gains import YawGains
 
     matrices = {name: np.reshape(values[4 * i : 4 * i + 4], (2, 2)) for i, name in enumerate(MATRICES)}
     written = Gains(

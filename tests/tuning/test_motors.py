@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.flight.flight_log import save_flight
+from mimopilot.sitl.flight.scenario import doublet, excitation_flight
+from mimopilot.sitl.flight.simulator import fly
+from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.sitl.physics.mixer import allocate
+from mimopilot.tuning.analysis.compiled_doublet import allocated
+from mimopilot.tuning.analysis.doublet_prediction import doublet_model
+from mimopilot.tuning.design.cascade import NO_MOTORS, tune
+from mimopilot.tuning.gain_stack import GainStack
+from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.motors import fit_motors, rotor_lag, saturation_warnings
+from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.spec import Manoeuvre
 
-from sitl.airframe import load_airframe
-from sitl.allocation import allocate
-from sitl.autopilot import Autopilot
-from sitl.loop import fly
-from sitl.recorder import save_flight
-from sitl.scenario import doublet, excitation_flight
 from tests.tuning.logs.flights import make_flight, microseconds, px4_topics, write_ulog
 from tests.tuning.truth import thesis
-from tuning.cascade import NO_MOTORS, tune
-from tuning.compiled_doublet import allocated
-from tuning.doublet import doublet_model
-from tuning.gain_stack import GainStack
-from tuning.logs.reader import read_log
-from tuning.measured import Measured
-from tuning.motors import fit_motors, rotor_lag, saturation_warnings
-from tuning.spec import Manoeuvre
 
 TS = 0.004
 UNIT = st.floats(-1, 1)
@@ -165,7 +165,7 @@ def test_motors_at_their_ends_are_told_with_the_amplitude_that_avoids_it():
 
 
 def test_the_amplitude_that_is_proposed_leaves_the_motors_of_each_airframe_room():
-    from sitl.experiments import default_amplitude
+    from mimopilot.sitl.flight.excitation_flight import default_amplitude
 
     found = {name: default_amplitude(load_airframe(name).airframe) for name in ("adam0", "antr", "px4_sih")}
     assert found == {"adam0": 0.15, "antr": pytest.approx(0.056), "px4_sih": 0.15}

@@ -7,16 +7,15 @@ frame's mode as they fly; the controller is written out state by state.
 from dataclasses import dataclass
 
 import numpy as np
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.flight.scenario import excitation_flight
+from mimopilot.sitl.flight.simulator import fly
+from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.sitl.physics.state_estimate import frame_mode, low_pass
+from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.spec import load_spec
+from mimopilot.tuning.statespace import StateSpace
 from scipy.linalg import block_diag, expm
-
-from sitl.airframe import load_airframe
-from sitl.autopilot import Autopilot
-from sitl.loop import fly
-from sitl.scenario import excitation_flight
-from sitl.sensors import frame_mode, low_pass
-from tuning.experiment import Experiment
-from tuning.spec import load_spec
-from tuning.statespace import StateSpace
 
 TS = 0.004
 #: As its own command has it.

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.tuning.logs.recording import listed
 from numpy.typing import NDArray
-
-from tuning.logs.recording import listed
 
 HEAD = b"\xa3\x95"
 FMT, FMT_LENGTH = 0x80, 89  # the message that defines the others, itself as AP_Logger's LogStructure.h defines it

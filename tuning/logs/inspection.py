@@ -6,18 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
+from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.logs.columns import Columns
+from mimopilot.tuning.logs.flight_phase import flying_parts, intersection
+from mimopilot.tuning.logs.log_checks import check_log
+from mimopilot.tuning.logs.reader import open_log, unchecked_experiment
+from mimopilot.tuning.logs.recording import Recording
+from mimopilot.tuning.logs.resample import MAX_GAP, Interval, Series, held_samples, sampling_period
 from numpy.typing import NDArray
-
-from tuning.errors import TuningError
-from tuning.experiment import Experiment, external_signal
-from tuning.gains import Gains
-from tuning.instruments import excited_stretches
-from tuning.logs.columns import Columns
-from tuning.logs.flight import flying_parts, intersection
-from tuning.logs.log_checks import check_log
-from tuning.logs.reader import open_log, unchecked_experiment
-from tuning.logs.recording import Recording
-from tuning.logs.resample import MAX_GAP, Interval, Series, held_samples, sampling_period
 
 AXES = ("roll", "pitch")
 BAND_POWER = (0.05, 0.95)  # the band of a signal is where this share of its power lies

@@ -6,9 +6,10 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from tuning.gains import MATRICES
-from tuning.logs.inspection import Inspection
-from tuning.output import print_table
+from mimopilot.tuning.gains import MATRICES
+from mimopilot.tuning.logs.inspection import Inspection
+
+from mimopilot.common.console import print_table
 
 #: Signal -> its name, unit for people, and what an SI value is multiplied by for it.
 _NAMES = {
@@ -22,7 +23,7 @@ _NAMES = {
 
 
 def as_mapping(found: Inspection) -> dict[str, Any]:
-    """An inspection as plain values, in SI units, for `tuning.output.print_json`."""
+    """An inspection as plain values, in SI units, for `mimopilot.common.console.print_json`."""
     recording, experiment = found.recording, found.experiment
     return {
         "log": str(recording.path),

@@ -12,15 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.estimation.instrumental_variables import AXES, excited_stretches
+from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.logs.columns import SIGNALS
+from mimopilot.tuning.logs.recording import Recording
+from mimopilot.tuning.plant.frequency_response import measured_plant
+from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
 from numpy.typing import NDArray
-
-from tuning.errors import TuningError
-from tuning.experiment import Experiment, external_signal
-from tuning.instruments import AXES, excited_stretches
-from tuning.logs.columns import SIGNALS
-from tuning.logs.recording import Recording
-from tuning.plant_response import measured_plant
-from tuning.rigid_body import RigidBody, rigid_body
 
 #: Angles are compared with integrated rates over this time, s: noise of the angles divided by it is small.
 OVER = 0.1

@@ -11,7 +11,7 @@ import struct
 import zlib
 from pathlib import Path
 
-from tuning.errors import TuningError
+from mimopilot.tuning.errors import TuningError
 
 HEADER, ORDER_AT = 128, 126  # bytes of the file header; where it says the byte order
 COMPRESSED, MATRIX = 15, 14

@@ -6,17 +6,17 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.logs.columns import Columns
+from mimopilot.tuning.logs.flight_phase import flying_parts
+from mimopilot.tuning.logs.flown_gains import flown_gains
+from mimopilot.tuning.logs.log_checks import check_angles, check_log
+from mimopilot.tuning.logs.recording import Recording
+from mimopilot.tuning.logs.resample import Interval, on_common_grid
+from mimopilot.tuning.motors import Motors, fit_motors, saturation_warnings
 
-from tuning.errors import TuningError
-from tuning.experiment import Experiment
-from tuning.files import sha256
-from tuning.flown import flown_gains
-from tuning.logs.columns import Columns
-from tuning.logs.flight import flying_parts
-from tuning.logs.log_checks import check_angles, check_log
-from tuning.logs.recording import Recording
-from tuning.logs.resample import Interval, on_common_grid
-from tuning.motors import Motors, fit_motors, saturation_warnings
+from mimopilot.common.files import sha256
 
 ULOG = b"ULog\x01\x12\x35"
 DATAFLASH = b"\xa3\x95"
@@ -69,22 +69,22 @@ def open_log(path: Path, columns: Columns | None = None) -> Recording:
     if columns is not None and head.startswith((ULOG, DATAFLASH)):
         raise TuningError(f"{path}: a column file is for CSV and MATLAB files, this log names its signals itself")
     if head.startswith(ULOG):
-        from tuning.logs.ulog import record_ulog
+        from mimopilot.tuning.logs.ulog import record_ulog
 
         return record_ulog(path)
     if head.startswith(DATAFLASH):
-        from tuning.logs.dataflash import record_dataflash
+        from mimopilot.tuning.logs.dataflash import record_dataflash
 
         return record_dataflash(path)
     for beginning, advice in REFUSED.items():
         if head.startswith(beginning):
             raise TuningError(f"{path}: {advice}")
     if head.startswith(MATLAB):
-        from tuning.logs.table import record_matlab
+        from mimopilot.tuning.logs.tables import record_matlab
 
         return record_matlab(path, columns or Columns())
     if b"\0" not in head and any(mark in head.partition(b"\n")[0] for mark in (b",", b";", b"\t")):
-        from tuning.logs.table import record_csv
+        from mimopilot.tuning.logs.tables import record_csv
 
         return record_csv(path, columns or Columns())
     raise TuningError(

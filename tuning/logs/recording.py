@@ -8,11 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.columns import Columns
+from mimopilot.tuning.logs.resample import REQUIRED, Interval, Series, monotone
 from numpy.typing import NDArray
-
-from tuning.errors import TuningError
-from tuning.logs.columns import Columns
-from tuning.logs.resample import REQUIRED, Interval, Series, monotone
 
 #: Largest believable value of a signal: normalised moment, rad/s, rad.
 RANGES = {"u": 5.0, "u_bar": 5.0, "y_i": 100.0, "r_i": 100.0, "y_o": 400.0, "r_o": 2 * np.pi}

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
-
-from tuning.errors import TuningError
 
 MIN_RATE = 100.0  # Hz, of torque, rates and angles: below it gains come out wrong
 MAX_GAP = 5  # samples

@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.tuning.logs.flight_phase import bridged, intersection, intervals
+from mimopilot.tuning.logs.recording import Recording
+from mimopilot.tuning.logs.resample import Interval, Series, sampling_period
+from mimopilot.tuning.logs.ulog_file import UlogFile, open_ulog
+from mimopilot.tuning.logs.vehicle_type import px4_vehicle
 from numpy.typing import NDArray
-
-from tuning.logs.flight import bridged, intersection, intervals
-from tuning.logs.recording import Recording
-from tuning.logs.resample import Interval, Series, sampling_period
-from tuning.logs.ulog_file import UlogFile, open_ulog
-from tuning.logs.vehicle_type import px4_vehicle
 
 #: Signal -> the (topic, fields) that hold it, newest PX4 first.
 LAYOUTS = {

@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.recording import listed
 from numpy.typing import NDArray
-
-from tuning.errors import TuningError
-from tuning.logs.recording import listed
 
 FIRST = 16  # bytes of the file header
 KINDS = b"ABCDFILMOPQRS"

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from mimopilot.tuning.logs.flight_phase import intersection, intervals
+from mimopilot.tuning.logs.resample import Interval
 from numpy.typing import NDArray
-
-from tuning.logs.flight import intersection, intervals
-from tuning.logs.resample import Interval
 
 #: MAV_TYPE of MAVLink's common.xml that are no multirotors, and those of VTOLs.
 OTHERS = {

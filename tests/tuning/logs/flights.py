@@ -4,9 +4,8 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
-
-from sitl.recorder import quaternions
-from sitl.ulog_writer import HEADER, _declare, _keyed, _message
+from mimopilot.sitl.flight.flight_log import quaternions
+from mimopilot.sitl.flight.ulog_writer import HEADER, _declare, _keyed, _message
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.inspection import inspect_log
+from mimopilot.tuning.logs.reader import read_log
 from scipy.io import savemat
 
 from tests.tuning.logs.flights import (
@@ -13,9 +16,6 @@ from tests.tuning.logs.flights import (
     write_csv,
     write_ulog,
 )
-from tuning.errors import TuningError
-from tuning.logs.inspection import inspect_log
-from tuning.logs.reader import read_log
 
 
 @pytest.fixture(scope="module", params=["ulg", "bin", "csv", "mat"])

@@ -5,9 +5,14 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from mimopilot.sitl.flight.ulog_writer import HEADER, _message
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.dataflash_file import open_dataflash
+from mimopilot.tuning.logs.inspection import inspect_log
+from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.logs.ulog_file import open_ulog
 from pyulog import ULog
 
-from sitl.ulog_writer import HEADER, _message
 from tests.tuning.logs.flights import (
     ardupilot_messages,
     dataflash_bytes,
@@ -15,11 +20,6 @@ from tests.tuning.logs.flights import (
     px4_topics,
     write_ulog,
 )
-from tuning.errors import TuningError
-from tuning.logs.dataflash_file import open_dataflash
-from tuning.logs.inspection import inspect_log
-from tuning.logs.reader import read_log
-from tuning.logs.ulog_file import open_ulog
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,9 @@
 
 import numpy as np
 import pytest
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.dataflash_file import open_dataflash
+from mimopilot.tuning.logs.reader import open_log, read_log
 
 from tests.tuning.logs.flights import (
     ardupilot_messages,
@@ -10,9 +13,6 @@ from tests.tuning.logs.flights import (
     microseconds,
     old_ardupilot_messages,
 )
-from tuning.errors import TuningError
-from tuning.logs.dataflash_file import open_dataflash
-from tuning.logs.reader import open_log, read_log
 
 
 @pytest.fixture(scope="module")

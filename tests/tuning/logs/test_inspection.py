@@ -2,6 +2,7 @@ import json
 
 import numpy as np
 import pytest
+from mimopilot.tuning.logs.inspection import inspect_log
 
 from tests.conftest import assert_one_clear_line
 from tests.tuning.logs.flights import (
@@ -15,7 +16,6 @@ from tests.tuning.logs.flights import (
     write_csv,
     write_ulog,
 )
-from tuning.logs.inspection import inspect_log
 
 
 @pytest.fixture(scope="module")

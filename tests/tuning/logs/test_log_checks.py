@@ -5,14 +5,14 @@ import tomllib
 
 import numpy as np
 import pytest
+from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.columns import SIGNALS, Columns
+from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.plant.frequency_response import measured_plant
+from mimopilot.tuning.plant.inertia import rigid_body
 
-from sitl.airframe import load_airframe
 from tests.tuning.truth import experiment
-from tuning.errors import TuningError
-from tuning.logs.columns import SIGNALS, Columns
-from tuning.logs.reader import read_log
-from tuning.plant_response import measured_plant
-from tuning.rigid_body import rigid_body
 
 NAMES = ("t", *SIGNALS["u"], *SIGNALS["y_i"], *SIGNALS["y_o"], *SIGNALS["u_bar"])
 PLACES = {signal: [NAMES.index(name) for name in names] for signal, names in SIGNALS.items() if names[0] in NAMES}

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mimopilot.tuning.logs.reader import open_log, read_log
 
 from tests.tuning.logs.flights import (
     ardupilot_messages,
@@ -15,8 +16,7 @@ from tests.tuning.logs.flights import (
     px4_topics,
     write_ulog,
 )
-from tests.tuning.test_flown import PX4
-from tuning.logs.reader import open_log, read_log
+from tests.tuning.logs.test_flown_gains import PX4
 
 
 @pytest.fixture(scope="module")

@@ -4,6 +4,8 @@ import struct
 
 import numpy as np
 import pytest
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.reader import open_log, read_log
 
 from tests.tuning.logs.flights import (
     attitude,
@@ -15,8 +17,6 @@ from tests.tuning.logs.flights import (
     three,
     write_ulog,
 )
-from tuning.errors import TuningError
-from tuning.logs.reader import open_log, read_log
 
 PERIOD = 0.004
 

@@ -1,0 +1,1 @@
+"""From one flight log to tuned, tested C++ for a multirotor's attitude controller."""

@@ -1,0 +1,5 @@
+"""``python -m mimopilot``: the command line."""
+
+from mimopilot.cli.main import main
+
+main()

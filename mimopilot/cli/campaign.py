@@ -1,0 +1,150 @@
+"""The commands of campaigns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from mimopilot.cli.bench import (
+    UNITS,
+    AirframeArgument,
+    AmplitudeOption,
+    FaultOption,
+    JsonOption,
+    PeriodOption,
+    SeedOption,
+    TailOption,
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Add the campaigns' commands to the front door."""
+    app.command(
+        epilog="Example: mimopilot campaign adam0 --gains siso.gains.toml mimo.gains.toml --runs 10000 "
+        "--vary vary.toml --out campaign"
+    )(campaign)
+    app.command(epilog="Example: mimopilot replay campaign --run 4711 --out worst.ulg")(replay)
+
+
+def campaign(
+    airframe: AirframeArgument,
+    out: Annotated[Path, typer.Option(help="Folder for the results; holds what is done when it is interrupted.")],
+    more_gains: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
+    gains: Annotated[
+        list[Path] | None, typer.Option(help="Gains files: --gains FILE [FILE...]; by default the airframe's own.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, help="How many; each is flown with every gain set on every axis.")] = 1000,
+    vary: Annotated[Path | None, typer.Option(help="What varies (TOML), see README; by default the noise.")] = None,
+    scenario: Annotated[str, typer.Option(help="doublet, step, hover, or a scenario file (TOML).")] = "doublet",
+    axis: Annotated[str | None, typer.Option(help="roll, pitch or both.", show_default="both")] = None,
+    amplitude_deg: AmplitudeOption = None,
+    period_s: PeriodOption = None,
+    tail_s: TailOption = None,
+    fault: FaultOption = None,
+    seed: SeedOption = 0,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT: its workers fly instead.")
+    ] = None,
+    survival_map: Annotated[
+        str | None, typer.Option("--map", help="The two quantities of the survival map: NAME,NAME.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly a vehicle that varies, thousands of times, and say with which gains it survives and how well it follows."""
+    from mimopilot.common.console import json_text, print_json, print_table
+    from mimopilot.common.files import inside, write_atomically
+    from mimopilot.common.parallel import cores
+    from mimopilot.sitl.campaign.execution import run_campaign
+    from mimopilot.sitl.campaign.figures import parse_map
+    from mimopilot.sitl.campaign.plan import SUMMARY, make_plan
+    from mimopilot.sitl.campaign.report import INTERVALS, write_campaign_report
+    from mimopilot.sitl.campaign.summary import (
+        FIGURE_COLUMNS,
+        SURVIVAL_COLUMNS,
+        WORST_COLUMNS,
+        Results,
+        figure_rows,
+        survival_rows,
+        worst_rows,
+    )
+    from mimopilot.sitl.campaign.variation import read_variation
+    from mimopilot.sitl.physics.airframe import load_airframe
+
+    vehicle = load_airframe(airframe)
+    plan = make_plan(
+        vehicle,
+        vehicle.gain_sets([*(gains or ()), *(more_gains or ())]),
+        runs=runs,
+        seed=seed,
+        **_task(scenario, axis, {"amplitude_deg": amplitude_deg, "period_s": period_s, "tail_s": tail_s}, fault),
+        vary=read_variation(vary) if vary else {},
+    )
+    over = parse_map(plan, survival_map) if survival_map else None
+    results = Results(plan, run_campaign(plan, out, workers or cores(), scheduler))
+    summary = results.summarise()
+    write_atomically(inside(out, SUMMARY), json_text(summary.as_json(".")))
+    report = write_campaign_report(results, summary, over)
+    if as_json:
+        print_json({"results": str(results.path), "report": str(report), **summary.as_json(str(out))})
+        return
+    print(INTERVALS)
+    if summary.rejected:
+        print(f"{summary.rejected} draws of no vehicle that flies were drawn again")
+    print_table("Survived", SURVIVAL_COLUMNS, survival_rows(summary))
+    print_table("Figures", FIGURE_COLUMNS, figure_rows(summary))
+    print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))
+    print(f"results {results.path}\nreport  {report}")
+
+
+def _task(scenario: str, axis: str | None, sizes: dict[str, float | None], faults: list[str] | None) -> dict[str, Any]:
+    """Entries of the plan from the options that say what is flown."""
+    from mimopilot.sitl.errors import SitlError
+    from mimopilot.sitl.faults.kinds import parse_fault
+    from mimopilot.sitl.flight.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, TAIL_S, read_scenario
+
+    named = [str(parse_fault(text)) for text in faults or ()]
+    given = {name: value for name, value in sizes.items() if value is not None}
+    if scenario.endswith(".toml"):
+        if axis or given:
+            raise SitlError(f"--axis, --amplitude-deg, --period-s, --tail-s: {scenario} says them; change them there")
+        task, own = read_scenario(Path(scenario))
+        given = {name: getattr(task, name) for name in sizes}
+        scenario, axis, named = task.manoeuvre, task.axis, [*map(str, own), *named]
+    if axis not in (*AXES, "both", None):
+        raise SitlError(f"--axis: got {axis!r}, expected roll, pitch or both")
+    usual = {"amplitude_deg": AMPLITUDE_DEG, "period_s": PERIOD_S, "tail_s": TAIL_S}
+    axes = [axis] if axis in AXES else list(AXES)
+    return {"manoeuvre": scenario, "axes": axes, **usual, **given, "faults": named}
+
+
+def replay(
+    folder: Annotated[Path, typer.Argument(help="Folder of a campaign.")],
+    run: Annotated[int, typer.Option(min=0, help="Which run.")],
+    gains: Annotated[str | None, typer.Option(help="Name of the gain set; by default the first.")] = None,
+    axis: Annotated[str | None, typer.Option(help="roll or pitch; by default the first.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly one run of a campaign again: the same flight, bit for bit. Exit code 1: it is another one here."""
+    from mimopilot.common.console import print_json, print_table
+    from mimopilot.sitl.campaign.replay import fly_again
+    from mimopilot.sitl.flight.flight_log import save_flight
+
+    again = fly_again(folder, run, gains, axis)
+    if out is not None:
+        save_flight(out, again.flight, again.plan.airframe, again.plan.gains[again.row["gains"]])
+    if as_json:
+        print_json(again.row)
+    else:
+        rows = [[UNITS.get(name, name), _shown(value)] for name, value in again.row.items()]
+        print_table(f"{again.plan.airframe.name}, run {run} of {folder}", ["figure", "value"], rows)
+    again.compare()
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, float):
+        return "-" if value != value else f"{value:.5g}"
+    return str(value)

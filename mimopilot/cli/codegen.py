@@ -1,0 +1,73 @@
+"""The commands of this room."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add this room's commands to the front door."""
+    app.command(epilog="Example: mimopilot generate my.gains.toml --target native --out firmware")(generate)
+    app.command(epilog="Example: mimopilot pil my.gains.toml --rows 10000 --json")(pil)
+
+
+def generate(
+    gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder to write to; changed files are replaced, nothing is deleted, no link followed.")
+    ],
+    target: Annotated[
+        str,
+        typer.Option(
+            help="native: this machine, with a C interface and tests; px4: a PX4 module too; cortex-m4: bare STM32F4."
+        ),
+    ] = "native",
+    px4_api: Annotated[
+        str, typer.Option(help="PX4's module interface: crtp, up to v1.17, or descriptor, later.")
+    ] = "crtp",
+    force: Annotated[bool, typer.Option("--force", help="Write over what mimopilot did not generate, too.")] = False,
+    uncertified: Annotated[bool, typer.Option("--uncertified", help="Emit gains whose stability is in doubt.")] = False,
+) -> None:
+    """Emit the C++ controller with its gains, parameter table, build files and tests."""
+    from mimopilot.codegen.render import render, write_tree
+    from mimopilot.tuning.gains import load_gains
+    from mimopilot.tuning.parameters import check_verdict
+
+    loaded = load_gains(gains)
+    warning = check_verdict(loaded, allow=uncertified)
+    if warning:
+        print(f"mimopilot: warning: {gains}: {warning}", file=sys.stderr)
+    files = render(loaded, target, px4_api)
+    written = write_tree(files, out, force)
+    print(f"{out}: {len(files)} files, {len(written)} written, {len(files) - len(written)} unchanged")
+
+
+def pil(
+    gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
+    rows: Annotated[int, typer.Option(min=1, max=1_000_000, help="Control periods to run.")] = 10_000,
+    emulator: Annotated[str, typer.Option(help="unicorn (the processor) or qemu (a board, from reset).")] = "unicorn",
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Run the controller on an emulated Cortex-M4F beside the host, compare every bit, and print what a step costs."""
+    from mimopilot.codegen.budget import processor_in_the_loop
+    from mimopilot.codegen.errors import CodegenError
+    from mimopilot.common.console import print_json, print_table
+    from mimopilot.tuning.gains import load_gains
+
+    figures = processor_in_the_loop(load_gains(gains), rows, emulator)
+    failed = [figure.name for figure in figures if not figure.passed]
+    if as_json:
+        print_json({figure.name: figure.value for figure in figures} | {"emulator": emulator, "failed": failed})
+    else:
+        lines = []
+        for figure in figures:
+            value = f"{figure.value:.4g}" if isinstance(figure.value, float) else str(figure.value)
+            verdict = ("", "") if figure.limit is None else (f"{figure.limit:g}", "pass" if figure.passed else "FAIL")
+            lines.append([figure.text, value, *verdict])
+        print_table(f"controller on a Cortex-M4F, {emulator}", ["what", "figure", "at most", ""], lines)
+    if failed:
+        raise CodegenError(f"over its budget: {', '.join(failed)}", exit_code=1)

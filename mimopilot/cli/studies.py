@@ -1,0 +1,114 @@
+"""The commands that use every room."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mimopilot.cli.bench import AirframeArgument, AxisOption, FaultOption, JsonOption, SeedOption
+
+
+class Study(StrEnum):
+    """What can be reproduced: Chapter 5's benchmarks, Chapter 6's vehicles, and ours."""
+
+    NUMERICAL_EXAMPLE = "numerical-example"
+    LV100 = "lv100"
+    ADAM0_SIM = "adam0-sim"
+    ADAM0 = "adam0"
+    ADAM0_PERTURBED = "adam0-perturbed"
+    ANTR = "antr"
+    ADAM0_SMALL = "adam0-small"
+    COUPLED = "coupled"
+    ALL = "all"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the studies' commands to the front door."""
+    app.command(epilog="Example: mimopilot demo --out demo --seed 0")(demo)
+    app.command(epilog="Example: mimopilot faults adam0 --gains siso.gains.toml --gains mimo.gains.toml --runs 50")(
+        faults
+    )
+    app.command(epilog="Example: mimopilot reproduce lv100 --out reproduction")(reproduce)
+
+
+def demo(
+    out: Annotated[Path, typer.Option(help="Folder for the log, the gains, the C++ and the report.")] = Path("demo"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """The whole way, once: excitation flight, tuning, generated C++, doublets, report."""
+    from mimopilot.common.console import print_json
+    from mimopilot.sitl.studies.demo import print_summary, run_demo
+
+    summary = run_demo(out, seed)
+    if as_json:
+        print_json(summary.as_json())
+    else:
+        print_summary(summary)
+
+
+def _print_kinds(wanted: bool) -> None:
+    if wanted:
+        from mimopilot.sitl.faults.kinds import fault_help
+
+        print(fault_help())
+        raise typer.Exit
+
+
+def faults(
+    airframe: AirframeArgument,
+    gains: Annotated[
+        list[Path] | None, typer.Option(help="Gains file; may be repeated. By default the airframe's own.")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=1, max=1_000_000, help="Seeds of each fault.")] = 20,
+    fault: FaultOption = None,
+    axis: AxisOption = None,
+    amplitude_deg: Annotated[float, typer.Option(help="Of the doublet, degrees.")] = 15.0,
+    period_s: Annotated[float, typer.Option(help="Length of the whole doublet, s.")] = 0.42,
+    seed: SeedOption = 0,
+    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes; by default all cores.")] = None,
+    kinds: Annotated[
+        bool, typer.Option("--kinds", callback=_print_kinds, is_eager=True, help="List all kinds of faults and end.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Fly a doublet with each of the standard faults (or those given), many seeds, gain sets side by side."""
+    from mimopilot.common.console import print_json
+    from mimopilot.common.parallel import cores
+    from mimopilot.sitl.errors import SitlError
+    from mimopilot.sitl.faults.kinds import parse_fault
+    from mimopilot.sitl.studies.faults import Request, fault_table, print_fault_table
+
+    wanted = tuple(map(parse_fault, fault or ()))
+    request = Request(airframe, tuple(gains or ()), axis or "roll", amplitude_deg, period_s, wanted)
+    table = fault_table(request, range(seed, seed + runs), workers or cores())
+    if as_json:
+        print_json(table.as_json())
+    else:
+        print_fault_table(table)
+    if table.nonfinite:
+        raise SitlError(f"{table.nonfinite} outputs of the controller were not finite", exit_code=1)
+
+
+def reproduce(
+    study: Annotated[Study, typer.Argument(help="Which study, or all of them.")],
+    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("reproduction"),
+    seeds: Annotated[
+        int | None, typer.Option(min=1, help="Experiments of each vehicle, with other noise; 50 by default.")
+    ] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one a core.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Compute the thesis' tables and figures again, beside its own figures."""
+    from mimopilot.common.console import print_json
+    from mimopilot.sitl.studies.reproduce import SEEDS, print_reproduction
+    from mimopilot.sitl.studies.reproduce import reproduce as compute
+
+    found = compute(study.value, out, seeds or SEEDS, workers)
+    if as_json:
+        print_json(found.as_json())
+    else:
+        print_reproduction(found)

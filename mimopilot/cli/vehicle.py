@@ -1,0 +1,151 @@
+"""The commands that speak with a vehicle's parameters."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ConnectOption = Annotated[
+    str, typer.Option("--connect", help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyACM0,57600.")
+]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only read and compare.")]
+YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
+ForceArmedOption = Annotated[
+    bool, typer.Option("--force-armed", help="Write even to a vehicle that is or becomes armed.")
+]
+TimeoutOption = Annotated[
+    float, typer.Option(min=0.5, max=600, help="Silence after which the vehicle counts as gone, s.")
+]
+SnapshotOption = Annotated[
+    Path | None, typer.Option(help="Where the old values go; by default a new file beside the other one.")
+]
+KeyOption = Annotated[Path | None, typer.Option(help="Sign with this key: 32 bytes or 64 hexadecimal digits.")]
+SystemOption = Annotated[int, typer.Option(min=0, max=255, help="The vehicle's system number; 0: the one there is.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add these commands to the front door."""
+    app.command(epilog="Example: mimopilot upload my.gains.toml --connect udpin:127.0.0.1:14550")(upload)
+    app.command(epilog="Example: mimopilot restore my.before-1.params --connect /dev/ttyACM0,57600")(restore)
+    app.command(epilog="Example: mimopilot params my.gains.toml --format qgc --out my.params")(params)
+
+
+def upload(
+    gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
+    connect: ConnectOption,
+    profile: Annotated[
+        str, typer.Option(help="mimo: our module. px4-stock, ardupilot-stock: the diagonal, in their controllers.")
+    ] = "mimo",
+    moment_scale: Annotated[
+        str | None,
+        typer.Option(
+            help="N m of u = 1 on a vehicle that does not publish it: ROLL,PITCH,YAW; or flown: "
+            "the gains come from a log of this very vehicle and allocator."
+        ),
+    ] = None,
+    dry_run: DryRunOption = False,
+    yes: YesOption = False,
+    force_armed: ForceArmedOption = False,
+    uncertified: Annotated[
+        bool, typer.Option("--uncertified", help="Upload gains whose stability is in doubt.")
+    ] = False,
+    drop_off_diagonals: Annotated[
+        bool, typer.Option("--drop-off-diagonals", help="Stock profiles: drop off-diagonals of any size.")
+    ] = False,
+    timeout: TimeoutOption = 12.0,
+    snapshot: SnapshotOption = None,
+    signing_key: KeyOption = None,
+    system: SystemOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Put gains on a vehicle: all of them, each read back, or the old ones again.
+
+    Nothing is written to an armed vehicle, nor under a HEARTBEAT older than 1.5 s: a late one is asked for. After the
+    vehicle has stored its values, 2.5 s after the last write, and after another HEARTBEAT, all of them are read once
+    more. Whatever goes wrong until then (Ctrl-C, a vehicle that arms, a value that it refuses, changes or contradicts,
+    a second vehicle with its system number) puts the old values back, the one thing that is also written to an armed
+    vehicle, and ends in exit code 1; where the link is lost, what may be left is told name by name.
+    """
+    import sys
+
+    from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+    from mimopilot.sitl.mavlink.ground_station.session import Options
+    from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, transact
+    from mimopilot.tuning.gains import load_gains
+    from mimopilot.tuning.parameters import check_verdict
+
+    loaded = load_gains(gains)
+    warning = check_verdict(loaded, allow=uncertified)
+    if warning:
+        print(f"mimopilot: warning: {gains}: {warning}", file=sys.stderr)
+    plan = make_plan(loaded, profile, drop_off_diagonals)
+    scale = parse_scale(moment_scale)
+    stem = gains.name.removesuffix(".toml").removesuffix(".gains")
+    options = Options(
+        connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, gains.with_name(stem)
+    )
+    transact(plan, options, loaded, scale)
+
+
+def restore(
+    parameters: Annotated[Path, typer.Argument(help="Snapshot of an upload, or any parameter file of floats.")],
+    connect: ConnectOption,
+    dry_run: DryRunOption = False,
+    yes: YesOption = False,
+    force_armed: ForceArmedOption = False,
+    timeout: TimeoutOption = 12.0,
+    snapshot: SnapshotOption = None,
+    signing_key: KeyOption = None,
+    system: SystemOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a snapshot's values back to a vehicle, with the same care as an upload.
+
+    A snapshot that is not whole, holds a part of our gains only, or a value out of its range, is refused.
+    """
+    from mimopilot.sitl.mavlink.ground_station.profiles import restoration
+    from mimopilot.sitl.mavlink.ground_station.session import Options
+    from mimopilot.sitl.mavlink.ground_station.upload_console import transact
+    from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
+
+    plan = restoration(read_parameters(parameters), str(parameters))
+    stem = parameters.with_name(
+        re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
+    )  # a snapshot's next one is its sister
+    options = Options(connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, stem)
+    transact(plan, options)
+
+
+def params(
+    gains: Annotated[Path | None, typer.Argument(help="Gains file: FILE.gains.toml.")] = None,
+    connect: Annotated[str | None, typer.Option(help="Vehicle to read from; see upload.")] = None,
+    form: Annotated[
+        str, typer.Option("--format", help="qgc, mavproxy, missionplanner; for a gains file also c-header, px4-yaml.")
+    ] = "qgc",
+    out: Annotated[Path | None, typer.Option(help="File to write; by default standard output.")] = None,
+    uncertified: Annotated[
+        bool, typer.Option("--uncertified", help="Write gains whose stability is in doubt.")
+    ] = False,
+    timeout: TimeoutOption = 12.0,
+    signing_key: KeyOption = None,
+    system: SystemOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Write gains, or what a vehicle holds, as a parameter file; compare the two when both are given."""
+    from mimopilot.sitl.errors import SitlError
+    from mimopilot.sitl.mavlink.ground_station.params_console import compare, export
+    from mimopilot.sitl.mavlink.ground_station.session import Options
+
+    options = Options(connect or "", system, timeout, signing_key, as_json=as_json)
+    if gains is None or connect is None:
+        if as_json:
+            raise SitlError("--json: belongs to the comparison of a gains file with a vehicle")
+        export(gains, options, form, out, uncertified)
+    elif out is not None:
+        raise SitlError("--out: a comparison is printed; give either a gains file or --connect to write a file")
+    else:
+        compare(gains, options)

@@ -1,0 +1,1 @@
+"""What is not about flight: files, tables, processes, charts."""

@@ -1,0 +1,171 @@
+"""Files: read with a bound, written whole or not at all, never through a link that lies in an output folder."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import os
+import stat
+import tempfile
+from pathlib import Path
+
+from mimopilot.common.errors import InputFileError
+
+#: Most bytes of a text file that a user gives. All parameters of a vehicle, the largest there is, are some 60 kB.
+MAX_TEXT_BYTES = 1 << 20
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """Content of a small file that a user names; a device, a pipe or a huge file is refused before it is read.
+
+    Parameters
+    ----------
+    path : Path
+        The file, or a link to it.
+    what : str
+        What it should be, for the message: ``gains file``.
+
+    Raises
+    ------
+    InputFileError
+        When it is missing, no regular file, larger than `MAX_TEXT_BYTES`, or cannot be read.
+    """
+    try:
+        # Without O_NONBLOCK the opening of a pipe waits until someone writes into it.
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
+            status = os.fstat(stream.fileno())
+            if not stat.S_ISREG(status.st_mode):
+                kind = "a pipe" if stat.S_ISFIFO(status.st_mode) else "a device"
+                raise InputFileError(f"{path}: cannot read the {what}: it is {kind}; give a regular file")
+            content = stream.read(MAX_TEXT_BYTES + 1)
+    except OSError as error:
+        raise InputFileError(f"{path}: cannot read the {what}: {error.strerror or error}") from error
+    if len(content) > MAX_TEXT_BYTES:
+        size = max(status.st_size, len(content))
+        raise InputFileError(
+            f"{path}: cannot read the {what}: it has {size} bytes, expected at most {MAX_TEXT_BYTES}; is it the right "
+            "file?"
+        )
+    return content
+
+
+def read_text(path: Path, what: str) -> str:
+    """Text of a small UTF-8 file that a user names, with or without a byte order mark; see `read_bytes`.
+
+    Raises
+    ------
+    InputFileError
+        As `read_bytes`, and when it is not UTF-8.
+    """
+    try:
+        return read_bytes(path, what).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputFileError(
+            f"{path}: cannot read the {what}: byte {error.start} is not UTF-8 text; is it the right file?"
+        ) from error
+
+
+def inside(folder: Path, name: str) -> Path:
+    """Path of a file in an output folder, on which no link lies: what is written there stays in the folder.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder as the user named it; it may be a link itself.
+    name : str
+        Relative path, with ``/``.
+
+    Raises
+    ------
+    OSError
+        When `folder` is something else than a folder, or `name` or a folder on its way is a link.
+    """
+    if os.path.lexists(folder) and not folder.is_dir():
+        kind = "is a link that leads to no folder" if folder.is_symlink() else "is a file"
+        raise NotADirectoryError(errno.ENOTDIR, f"{kind}; give --out a folder", str(folder))
+    path = folder / name
+    for step in (path, *path.parents):
+        if step == folder:
+            break
+        if step.is_symlink():
+            raise _link(step)
+    return path
+
+
+def _link(path: Path) -> OSError:
+    return OSError(
+        errno.ELOOP, "is a link, and nothing is written through it; remove it or give another --out", str(path)
+    )
+
+
+def write_atomically(path: Path, content: str | bytes) -> bool:
+    """Put `content` at `path` in one step, and only when it differs from what is there.
+
+    Parameters
+    ----------
+    path : Path
+        Destination; its folder is created. Text is written as UTF-8.
+    content : str or bytes
+        The whole file.
+
+    Returns
+    -------
+    bool
+        True when the file was written, False when it already held `content`.
+
+    Raises
+    ------
+    OSError
+        When the folder or file cannot be written, or a link, a device or a pipe is there; what was there is then
+        untouched.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    if path.is_symlink():
+        raise _link(path)
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, "is a folder, expected a file", str(path))
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "is a device or a pipe, expected a file or nothing", str(path))
+    if path.is_file() and path.stat().st_size == len(data) and path.read_bytes() == data:
+        return False
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:  # of the file that was asked for, not of the one in between
+        raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(data)
+            stream.flush()
+            os.fsync(stream.fileno())
+        mask = os.umask(0)
+        os.umask(mask)
+        Path(temporary).chmod(0o666 & ~mask)
+        Path(temporary).replace(path)
+    except OSError as error:  # a full disk, say, which names no file
+        Path(temporary).unlink(missing_ok=True)
+        raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return True
+
+
+def seal(content: bytes, label: str) -> bytes:
+    """`content`, a line that says what it is, and the SHA-256 of both in hexadecimal; see `unseal`."""
+    body = content + f"\n{label}\n".encode()
+    return body + sha256(body).encode()
+
+
+def unseal(sealed: bytes) -> tuple[bytes, str] | None:
+    """Content and label that `seal` was given; None when a byte of them is another or is missing."""
+    body, digest = sealed[:-64], sealed[-64:]
+    parts = body.rsplit(b"\n", 2)
+    if len(parts) < 3 or sha256(body).encode() != digest:
+        return None
+    return parts[0], parts[1].decode()
+
+
+def sha256(content: bytes | str) -> str:
+    """SHA-256 of bytes or of UTF-8 text, in hexadecimal."""
+    return hashlib.sha256(content.encode() if isinstance(content, str) else content).hexdigest()

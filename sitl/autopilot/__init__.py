@@ -1,0 +1,1 @@
+"""The autopilot around the generated controller: estimate, altitude, flight modes, control allocation."""

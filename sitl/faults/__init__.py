@@ -1,0 +1,1 @@
+"""Faults: their kinds, and how they act on the plant and on the autopilot."""

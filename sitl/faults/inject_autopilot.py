@@ -1,0 +1,104 @@
+"""Faults that happen in the autopilot: corrupted gains, set-points that stop."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.faults.kinds import Fault
+from mimopilot.tuning.gains import MATRICES
+from mimopilot.tuning.parameters import PARAMETERS
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from mimopilot.sitl.autopilot.autopilot import Autopilot
+
+
+class AutopilotFaults:
+    """Those of one flight; the others of a list are left alone.
+
+    Parameters
+    ----------
+    faults : sequence of Fault
+        They may overlap.
+    Ts : float, s
+        Control period.
+    autopilot : Autopilot, optional
+        Whose gains are corrupted; None: there is no controller in this process.
+
+    Attributes
+    ----------
+    changes : set of int
+        Periods before which `apply` has something to do.
+
+    Raises
+    ------
+    SitlError
+        When a vehicle would refuse the corrupted gains.
+    """
+
+    def __init__(self, faults: Sequence[Fault], Ts: float, autopilot: Autopilot | None) -> None:
+        self.Ts, self.autopilot = Ts, autopilot
+        self._gains = [(fault, *fault.span(Ts)) for fault in faults if fault.kind == "gain"]
+        self._stale = [fault.span(Ts) for fault in faults if fault.kind == "stale"]
+        self._sound: NDArray[np.float32] | None = None  # while others are in the controller
+        for fault, _, _ in self._gains:
+            self._check(fault)
+        self.changes = {k for _, *span in self._gains for k in span}
+
+    def apply(self, k: int) -> None:
+        """Write the gains of period `k` into the controller, as a parameter write does."""
+        if self.autopilot is None or not self._gains:
+            return
+        controller = self.autopilot.controller
+        factors = np.ones(len(PARAMETERS), np.float32)
+        for fault, begin, end in self._gains:
+            if begin <= k < end:
+                factors[_elements(fault)] *= fault.magnitude
+        corrupted = bool((factors != 1).any())
+        if self._sound is None and corrupted:
+            self._sound = controller.state["gains"][0].copy()
+        if self._sound is not None:
+            gains = self._sound * factors
+            if (gains != controller.state["gains"][0]).any():  # each write seats the integrators anew
+                controller.set_gains(gains)
+            self._sound = self._sound if corrupted else None
+
+    def stale(self, k: int) -> bool:
+        """Whether no set-point arrives in period `k`."""
+        return any(begin <= k < end for begin, end in self._stale)
+
+    def setpoints(self, setpoint: NDArray[Any]) -> NDArray[Any]:
+        """What the autopilot flies of the set-points (N, 3), rad, that are sent: level with its heading when stale.
+
+        The rule is that of `sitl.autopilot.flight_modes`.
+        """
+        flown = setpoint.copy()
+        for begin, end in self._stale:
+            fresh = begin + round(STALE_SECONDS / self.Ts)
+            flown[begin:end] = setpoint[max(begin - 1, 0)]
+            flown[min(fresh, end) : end, :2] = 0
+        return flown
+
+    def _check(self, fault: Fault) -> None:
+        if self.autopilot is None:
+            raise SitlError(f"fault {str(fault)!r}: there is no controller in this process")
+        values = self.autopilot.controller.state["gains"][0] * np.float32(fault.magnitude)
+        for i in _elements(fault):
+            parameter = PARAMETERS[i]
+            if not parameter.minimum <= values[i] <= parameter.maximum:
+                raise SitlError(
+                    f"fault {str(fault)!r}: {parameter.name} would be {values[i]:.4g}, expected "
+                    f"{parameter.minimum:g} to {parameter.maximum:g}: a vehicle refuses that write"
+                )
+
+
+def _elements(fault: Fault) -> range:
+    """Places of the gains that a fault changes, in the order of the parameter table."""
+    if fault.matrix is None:
+        return range(4 * len(MATRICES))
+    first = 4 * list(MATRICES).index(fault.matrix)
+    return range(first, first + 4)

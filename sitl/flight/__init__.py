@@ -1,0 +1,1 @@
+"""Flights in process: scenarios, the simulator, logs, figures of merit."""

@@ -1,0 +1,87 @@
+"""What `params` does: gains or a vehicle's parameters as a file, or the two beside each other."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.mavlink.ground_station.events import shortest
+from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+from mimopilot.sitl.mavlink.ground_station.session import Options, session
+from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
+from mimopilot.tuning.gains import Gains, load_gains
+from mimopilot.tuning.parameters import PARAMETERS, check_verdict
+
+from mimopilot.common.console import print_json, print_table
+from mimopilot.common.files import write_atomically
+
+#: Format -> the target of code generation that emits it, and its path there.
+GENERATED = {
+    "c-header": ("native", "core/parameters.h"),
+    "px4-yaml": ("px4", "px4/src/modules/mc_mimo_pid/module.yaml"),
+}
+
+
+def compare(file: Path, options: Options) -> None:
+    """Show a gains file beside what the vehicle holds.
+
+    Raises
+    ------
+    SitlError
+        With exit code 1 when they differ.
+    """
+    plan = make_plan(load_gains(file))
+    wanted = plan.values | plan.fixed
+    with session(options) as vehicle:
+        held = vehicle.read(list(wanted))
+    differ = [name for name, value in wanted.items() if held[name] != value]
+    if options.as_json:
+        both = {name: {"file": value, "vehicle": held[name]} for name, value in wanted.items()}
+        print_json({"equal": not differ, "parameters": both})
+    else:
+        rows = [
+            [name, shortest(value), shortest(held[name]), f"{held[name] - value:+.6g}" if name in differ else ""]
+            for name, value in wanted.items()
+        ]
+        print_table(str(file), ["parameter", "in the file", "on the vehicle", "difference"], rows)
+    if differ:
+        raise SitlError(f"{len(differ)} of {len(wanted)} parameters differ", exit_code=1)
+
+
+def export(file: Path | None, options: Options, form: str, out: Path | None, uncertified: bool = False) -> None:
+    """Write a gains file, or what a vehicle holds, as a parameter file.
+
+    Raises
+    ------
+    SitlError
+        When the format is unknown, or there is nothing to export.
+    """
+    if form not in (*FORMATS, *GENERATED):
+        raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *GENERATED])}")
+    if file is not None:
+        gains = load_gains(file)
+        warning = check_verdict(gains, allow=uncertified)
+        if warning:
+            print(f"mimopilot: warning: {file}: {warning}", file=sys.stderr)
+        text = _generated(gains, form) if form in GENERATED else parameter_text(form, make_plan(gains).values)
+    elif not options.connect:
+        raise SitlError("give a gains file to write, --connect to read from a vehicle, or both to compare them")
+    elif form in GENERATED:
+        raise SitlError(f"--format {form}: is made from a gains file, not from a vehicle")
+    else:
+        with session(options) as vehicle:
+            held = vehicle.read([p.name for p in PARAMETERS if p.writable])
+        text = parameter_text(form, held, vehicle.vehicle.system, vehicle.vehicle.component)
+    if out is None:
+        sys.stdout.write(text)
+    else:
+        write_atomically(out, text)
+        print(f"{out}: {len(text.splitlines())} lines")
+
+
+def _generated(gains: Gains, form: str) -> str:
+    from mimopilot.codegen.render import render
+
+    target, path = GENERATED[form]
+    return render(gains, target)[path]

@@ -1,0 +1,116 @@
+"""Hardware in the loop: the same vehicle for a real board on a serial port, in real time.
+
+A board does not answer frame by frame: the plant steps by the wall clock, under the latest motor commands.
+HIL_STATE_QUATERNION is left out, because PX4 on a board takes it for its own estimate.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from typing import Any
+
+import serial
+from mimopilot.sitl.autopilot.autopilot import MAX_ROTORS
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import FORGET_S, SimulatedVehicle
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS
+from pymavlink.dialects.v20 import common as mavlink
+
+STALE_S = 0.5  # speed controllers stop their motors without commands for so long
+RETRY_S = 0.5  # between tries to open a port that went away
+HEARTBEAT_S = 1.0
+WRITE_S = 1.0
+
+
+class SerialPlant:
+    """Serves a vehicle to a board.
+
+    Parameters
+    ----------
+    vehicle : SimulatedVehicle
+        Put back at its start whenever the board goes away.
+    url : str
+        ``DEVICE,BAUD``.
+
+    Raises
+    ------
+    SitlError
+        When the port cannot be opened.
+    """
+
+    def __init__(self, vehicle: SimulatedVehicle, url: str) -> None:
+        self.vehicle = vehicle
+        self.device, _, baud = url.partition(",")
+        if not self.device or not (baud.isascii() and baud.isdigit()):
+            raise SitlError(f"--serial {url}: expected DEVICE,BAUD such as /dev/ttyACM0,921600")
+        self.baud = int(baud)
+        try:
+            self.port = self._open()
+        except (OSError, ValueError) as error:
+            raise SitlError(f"--serial {url}: cannot be opened: {error}", exit_code=1) from error
+
+    def _open(self) -> Any:
+        return serial.Serial(self.device, self.baud, timeout=0, write_timeout=WRITE_S, exclusive=True)
+
+    def serve(self) -> None:
+        """Fly for ever; a board that goes away (they do when they reboot) may come back."""
+        while True:
+            try:
+                self._fly()
+            except OSError:
+                self.port.close()
+                self.vehicle.restart()
+                self.vehicle.tell(f"{self.device} went away; the vehicle is back at its start until it returns")
+            self._reopen()
+
+    def _reopen(self) -> None:
+        while True:
+            try:
+                self.port = self._open()
+                return
+            except OSError:
+                time.sleep(RETRY_S)
+
+    def _fly(self) -> None:
+        vehicle = self.vehicle
+        controls, mode = (0.0,) * MAX_ROTORS, 0
+        heard, stale = -1.0, False
+        begin, count = time.monotonic(), 0
+        while True:
+            self._write(count)
+            now = time.monotonic()
+            for kind, fields in vehicle.codec.parse(self.port.read(65536)):
+                if kind is ACTUATORS:
+                    controls, mode, heard = fields[2:18], fields[18], now
+            if heard < 0:
+                vehicle.stand()
+            else:
+                if stale != (now - heard > STALE_S):
+                    stale = not stale
+                    self._tell_stale(stale)
+                vehicle.fly(controls, 0 if stale else mode)
+            count += 1
+            ahead = begin + count * vehicle.Ts - time.monotonic()
+            if ahead > 0:
+                time.sleep(ahead)
+            elif ahead < -FORGET_S:
+                vehicle.tell(f"late by {-ahead:.2f} s, which is left out: this machine is too busy for real time")
+                begin, count = time.monotonic(), 0
+
+    def _tell_stale(self, stale: bool) -> None:
+        when = f"at {self.vehicle.seconds:.2f} s of flight"
+        if stale:
+            self.vehicle.tell(f"no motor commands from the board for {STALE_S:g} s, {when}: the motors stop")
+        else:
+            self.vehicle.tell(f"motor commands come again, {when}")
+
+    def _write(self, count: int) -> None:
+        """Send what is due; a board that does not read misses it."""
+        data = self.vehicle.messages(estimate=False)
+        if count % round(HEARTBEAT_S / self.vehicle.Ts) == 0:
+            state = mavlink.MAV_STATE_ACTIVE
+            beat = (0, mavlink.MAV_TYPE_GENERIC, mavlink.MAV_AUTOPILOT_INVALID, 0, state, 3)
+            data = self.vehicle.codec.pack(mavlink.MAVLink_heartbeat_message, *beat) + data
+        if select.select([], [self.port], [], 0)[1]:
+            self.port.write(data * self.vehicle.copies)

@@ -1,0 +1,78 @@
+"""A scenario flown over MAVLink: the plant is another process, the flight the in-process one bit for bit."""
+
+from __future__ import annotations
+
+import select
+import socket
+from typing import Any
+
+import numpy as np
+from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.flight.scenario import Scenario
+from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState, actuator_controls
+from mimopilot.sitl.mavlink.wire.fast_codec import SPIN_S, STATE, LeanCodec, receive
+from mimopilot.sitl.mavlink.wire.link import COMPONENT, LOOPBACK, SYSTEM
+from mimopilot.sitl.physics.state_estimate import SIZE
+from numpy.typing import NDArray
+
+
+def fly(autopilot: Autopilot, scenario: Scenario, port: int) -> NDArray[Any]:
+    """Fly a scenario on a plant of this machine, from its first frame on.
+
+    Parameters
+    ----------
+    autopilot : Autopilot
+        A fresh one.
+    scenario : Scenario
+        Set-points and excitation.
+    port : int
+        TCP port of the plant.
+
+    Returns
+    -------
+    (N,) array of `sitl.autopilot.autopilot.RECORD`
+
+    Raises
+    ------
+    SitlError
+        When there is no plant, or it goes away before the end.
+    """
+    try:
+        plant = socket.create_connection((LOOPBACK, port), timeout=10.0)
+    except OSError as error:
+        raise SitlError(f"no plant on TCP port {port}: {error}", exit_code=1) from error
+    with plant:
+        plant.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        record = np.zeros(len(scenario.setpoint), RECORD)
+        record["setpoint"], record["excitation"] = scenario.setpoint, scenario.excitation
+        count = _exchange(autopilot, plant, record)
+    if count < len(record):
+        raise SitlError(f"the plant went away after {count} of {len(record)} periods", exit_code=1)
+    return record
+
+
+def _exchange(autopilot: Autopilot, plant: socket.socket, record: NDArray[Any]) -> int:
+    """Answer frames until the record is full; how many periods were flown. A repeated frame is answered, not flown."""
+    codec, measurement = LeanCodec(SYSTEM, COMPONENT), np.zeros(SIZE)
+    count, stamp, answer = 0, -1, b""
+    plant.setblocking(False)
+    while count < len(record):
+        data = receive(plant, SPIN_S)
+        if data is None:
+            select.select([plant], [], [])
+            continue
+        if not data:
+            break
+        for kind, fields in codec.parse(data):
+            if kind is not STATE or count == len(record):
+                continue
+            state = PlantState(*fields)
+            if state.stamp > stamp:
+                stamp = state.stamp
+                state.measure(measurement)
+                tick(*autopilot.arguments(), measurement, record[count])
+                answer = actuator_controls(codec, stamp, record[count]["commands"], True)
+                count += 1
+            plant.sendall(answer)
+    return count

@@ -1,0 +1,1 @@
+"""The simulated vehicle as ground stations see it."""

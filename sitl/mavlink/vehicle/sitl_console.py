@@ -1,0 +1,150 @@
+"""The `sitl` command: a vehicle put together from its parts, and run until Ctrl-C."""
+
+from __future__ import annotations
+
+import signal
+import time
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.autopilot.excitation_injector import Injector
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.faults.inject_autopilot import AutopilotFaults
+from mimopilot.sitl.faults.inject_plant import check_fault
+from mimopilot.sitl.faults.kinds import Fault
+from mimopilot.sitl.flight.scenario import Scenario
+from mimopilot.sitl.flight.scripted_pilot import ScriptedPilot
+from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantLink
+from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
+from mimopilot.sitl.mavlink.vehicle.excitation import Excitation
+from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
+from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
+from mimopilot.sitl.mavlink.vehicle.host import Host
+from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
+from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
+from mimopilot.sitl.mavlink.vehicle.stations import Stations
+from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
+from mimopilot.sitl.mavlink.vehicle.vehicle_commands import VehicleCommands
+from mimopilot.sitl.mavlink.wire.signing import Signer, read_key
+from mimopilot.sitl.physics.airframe import Airframe
+from mimopilot.tuning.gains import Gains
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the command line says.
+
+    Attributes
+    ----------
+    name : str
+        Name or file of the airframe.
+    airframe, gains
+        What flies.
+    plant : (host, port) or None
+        Somebody else's plant; None: one is started.
+    port : int
+        TCP port of the started one; 0: any.
+    ground_port, vehicle_port, tcp_port, bind
+        Of `sitl.mavlink.vehicle.stations.Stations`.
+    signing_key : Path or None
+        File of the key.
+    parameters : Path or None
+        Where changed parameters are kept.
+    speed : float or None
+        Times real time; None: as fast as it goes.
+    seed : int
+    log : Path or None
+        Where the first flight is logged.
+    scenario : Scenario or None
+        Flown at once, in place of waiting for a ground station.
+    faults : tuple of Fault
+        In seconds from the first frame of the plant.
+    """
+
+    name: str
+    airframe: Airframe
+    gains: Gains
+    plant: tuple[str, int] | None
+    port: int
+    ground_port: int
+    vehicle_port: int
+    tcp_port: int
+    bind: str
+    signing_key: Path | None
+    parameters: Path | None
+    speed: float | None
+    seed: int
+    log: Path | None
+    scenario: Scenario | None
+    faults: tuple[Fault, ...]
+
+
+def run(options: Options) -> None:
+    """Run the vehicle until Ctrl-C, or until its scenario is flown.
+
+    Raises
+    ------
+    SitlError
+        When a port, a file or the gains cannot be used.
+    """
+    with ExitStack() as leaving:
+        host, ground = _assemble(options, leaving)
+        print(f"{options.airframe.name}: {ground.stations}, plant {host.plant.place}; Ctrl-C ends", flush=True)
+        begin = time.monotonic()
+        try:
+            host.run(ground)
+            pace = host.lateness.periods * options.gains.Ts / (time.monotonic() - begin)
+            print(f"flown at {pace:.3g} times real time")
+        except KeyboardInterrupt:
+            written = host.leave()
+            print(f"ended: {host.lateness}{'; logged: ' if written else ''}{', '.join(map(str, written))}")
+
+
+def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
+    gains, key = options.gains, options.signing_key
+    outside = _faults_of_the_plant(options)
+    signer = Signer(read_key(key)) if key else None
+    stations = Stations(options.ground_port, options.vehicle_port, options.tcp_port, options.bind, signer)
+    leaving.callback(stations.close)
+    if stations.exposed:
+        print("warning: whoever reaches this address commands the vehicle; give --signing-key to ask for a key")
+    child = PlantProcess(options.name, options.port, gains.Ts, options.seed, options.speed, faults=outside)
+    link = PlantLink(options.plant or child)
+    leaving.callback(link.close)
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what Ctrl-C leaves in order, this does, too
+    if link.child is not None:
+        link.child.start()  # it comes up while we compile
+    autopilot = Autopilot(options.airframe, gains)
+    autopilot.warm_up()
+    log = FlightLog(options.log, options.airframe, gains.Ts) if options.log else None
+    host = Host(autopilot, link, log)
+    leaving.callback(host.leave)
+    if len(options.faults) > len(outside):
+        host.faults = AutopilotFaults(options.faults, gains.Ts, autopilot)
+    telemetry = Telemetry(host.situation)
+    commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
+    injector = Injector(gains.Ts)
+    host.excitation = Excitation(injector, host.situation)
+    if options.scenario is not None:
+        host.pilot = pilot = ScriptedPilot(options.scenario)
+        host.excitation = lambda now: pilot.moment
+    store = ParameterStore(options.parameters) if options.parameters else None
+    server = ParameterServer(autopilot.controller, gains, injector, store)
+    leaving.callback(server.close)
+    if server.summary:
+        print(server.summary)
+    if link.child is not None:
+        link.child.wait()
+    return host, Ground(server, commands, telemetry, stations)
+
+
+def _faults_of_the_plant(options: Options) -> list[Fault]:
+    """What happens in the plant and in its link, for a plant of ours."""
+    for fault in options.faults:
+        check_fault(fault, options.airframe, options.gains.Ts, None)
+    outside = [fault for fault in options.faults if fault.place != "autopilot"]
+    if options.plant and outside:
+        raise SitlError(f"fault {str(outside[0])!r}: happens in the plant that runs already: give it to that one")
+    return outside

@@ -1,0 +1,215 @@
+"""MAVLink commands to the vehicle, and their acknowledgements."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from mimopilot.sitl.autopilot.flight_modes import Denied, Failed, Mode, Refused, Severity, Vehicle
+from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
+from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TOPICS
+from mimopilot.sitl.mavlink.wire.px4_modes import mode_of, mode_of_pair
+from pymavlink.dialects.v20 import common as mavlink
+
+FORCE = 21196  # param2 of arm and disarm: override
+TAKEOFF_HEIGHT = 2.5  # m, when none is given
+MAX_INTERVAL_US = 2_000_000_000  # MESSAGE_INTERVAL can tell little more
+
+
+class Unsupported(Refused):
+    """Asked of many vehicles, and not known to this one: no news for the pilot."""
+
+
+RESULTS = {
+    Unsupported: mavlink.MAV_RESULT_UNSUPPORTED,
+    Refused: mavlink.MAV_RESULT_TEMPORARILY_REJECTED,
+    Denied: mavlink.MAV_RESULT_DENIED,
+    Failed: mavlink.MAV_RESULT_FAILED,
+}
+
+
+@dataclass(frozen=True)
+class Command:
+    """COMMAND_LONG or COMMAND_INT.
+
+    Attributes
+    ----------
+    number : int
+        MAV_CMD.
+    params : tuple of float
+        param1 to param7; NaN: not given.
+    absolute : bool
+        Whether param7 is an altitude above the sea.
+    """
+
+    number: int
+    params: tuple[float, ...]
+    absolute: bool = False
+
+    @classmethod
+    def of(cls, message: Any) -> Command:
+        """From either message."""
+        if message.get_type() == "COMMAND_LONG":
+            last: tuple[float, float, float] = (message.param5, message.param6, message.param7)
+            absolute = False
+        else:
+            last = (message.x, message.y, message.z)
+            absolute = message.frame in (mavlink.MAV_FRAME_GLOBAL, mavlink.MAV_FRAME_GLOBAL_INT)
+        params = (message.param1, message.param2, message.param3, message.param4, *last)
+        return cls(message.command, tuple(float(value) for value in params), absolute)
+
+    def whole(self, place: int) -> int:
+        """A parameter (1 to 7) that is a whole number.
+
+        Raises
+        ------
+        Denied
+            When it is none.
+        """
+        value = self.params[place - 1]
+        if not (math.isfinite(value) and value == round(value)):
+            raise Denied(f"command {self.number}: param{place} is {value:g}, expected a whole number")
+        return round(value)
+
+
+#: A command's handler: messages to send behind the acknowledgement; it may raise `Refused`.
+Handler = Callable[[Command], list[Any]]
+
+
+class VehicleCommands:
+    """Carries commands out.
+
+    Parameters
+    ----------
+    vehicle : Vehicle
+    telemetry : Telemetry
+    reboot : callable
+        Puts the vehicle back at its start; may raise `Refused`.
+
+    Attributes
+    ----------
+    handlers : dict
+        MAV_CMD -> handler; others may add theirs.
+    """
+
+    def __init__(self, vehicle: Vehicle, telemetry: Telemetry, reboot: Callable[[], None]) -> None:
+        self.vehicle, self.telemetry, self.reboot = vehicle, telemetry, reboot
+        self.handlers: dict[int, Handler] = {
+            mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
+            mavlink.MAV_CMD_NAV_TAKEOFF: self._take_off,
+            mavlink.MAV_CMD_NAV_LAND: self._land,
+            mavlink.MAV_CMD_DO_SET_MODE: self._set_mode,
+            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
+            mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
+            mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
+            mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._capabilities,
+            mavlink.MAV_CMD_GET_HOME_POSITION: self._home,
+            mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
+        }
+
+    def answer(self, message: Any) -> list[Any]:
+        """Carry a command out; the acknowledgement, and what comes with it."""
+        sender = message.get_srcSystem(), message.get_srcComponent()
+
+        def acknowledge(result: int) -> Any:
+            return mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, *sender)
+
+        handler = self.handlers.get(message.command)
+        if handler is None:
+            return [acknowledge(mavlink.MAV_RESULT_UNSUPPORTED)]
+        try:
+            more = handler(Command.of(message))
+        except Refused as refusal:
+            if not isinstance(refusal, Unsupported):
+                self.vehicle.say(Severity.WARNING, str(refusal))
+            return [acknowledge(RESULTS[type(refusal)])]
+        return [acknowledge(mavlink.MAV_RESULT_ACCEPTED), *more]
+
+    def set_mode(self, message: Any) -> list[Any]:
+        """SET_MODE, the older message: it has no acknowledgement."""
+        try:
+            self.vehicle.enter(mode_of(message.custom_mode))
+        except Refused as refusal:
+            self.vehicle.say(Severity.WARNING, str(refusal))
+        return []
+
+    def _arm(self, command: Command) -> list[Any]:
+        wanted, force = command.whole(1), command.params[1] == FORCE
+        if wanted == 1:
+            self.vehicle.arm(force)
+        elif wanted == 0:
+            self.vehicle.disarm(force)
+        else:
+            raise Denied(f"arm: param1 is {wanted}, expected 0 or 1")
+        return []
+
+    def _take_off(self, command: Command) -> list[Any]:
+        height = command.params[6]
+        if command.absolute:
+            height -= self.vehicle.lift.ground
+        self.vehicle.take_off(TAKEOFF_HEIGHT if math.isnan(height) else height)
+        return []
+
+    def _land(self, command: Command) -> list[Any]:
+        self.vehicle.enter(Mode.LAND)
+        return []
+
+    def _set_mode(self, command: Command) -> list[Any]:
+        if not command.whole(1) & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
+            raise Denied("modes are set by their number: base_mode 1, custom_mode")
+        main = command.whole(2)
+        whole = main > 0xFF  # the whole custom_mode in one, as MAVProxy sends it
+        self.vehicle.enter(mode_of(main) if whole else mode_of_pair(main, command.whole(3)))
+        return []
+
+    def _topic(self, command: Command) -> int:
+        number = command.whole(1)
+        if number not in TOPICS:
+            raise Unsupported(f"there is no message {number} here")
+        return number
+
+    def _set_interval(self, command: Command) -> list[Any]:
+        number, interval = self._topic(command), command.params[1]
+        if interval == 0:
+            self.telemetry.set_rate(number, TOPICS[number].rate)
+        elif interval == -1:
+            self.telemetry.set_rate(number, 0.0)
+        elif 0 < interval <= MAX_INTERVAL_US:
+            self.telemetry.set_rate(number, 1e6 / interval)
+        else:
+            raise Denied(
+                f"message interval {interval:g} us: expected -1 (never), 0 (default) or up to {MAX_INTERVAL_US}"
+            )
+        return []
+
+    def _get_interval(self, command: Command) -> list[Any]:
+        number = command.whole(1)
+        rate = self.telemetry.rates.get(number)
+        interval = 0 if rate is None else -1 if rate == 0 else round(1e6 / rate)
+        return [mavlink.MAVLink_message_interval_message(number % 65536, interval)]
+
+    def _request_message(self, command: Command) -> list[Any]:
+        number = self._topic(command)
+        message = self.telemetry.build(number)
+        if message is None:
+            raise Refused(f"message {number}: nothing is known yet")
+        return [message]
+
+    def _capabilities(self, command: Command) -> list[Any]:
+        return [self.telemetry.build(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION)]
+
+    def _home(self, command: Command) -> list[Any]:
+        message = self.telemetry.build(mavlink.MAVLINK_MSG_ID_HOME_POSITION)
+        if message is None:
+            raise Refused("no home: no plant has told a position yet")
+        return [message]
+
+    def _reboot(self, command: Command) -> list[Any]:
+        if command.whole(1) not in (1, 3):
+            raise Denied("reboot: param1 must be 1")
+        if self.vehicle.armed:
+            raise Refused("no reboot: armed")
+        self.reboot()
+        return []

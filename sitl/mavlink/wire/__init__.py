@@ -1,0 +1,1 @@
+"""Bytes and numbers of MAVLink 2, for both ends of a link."""

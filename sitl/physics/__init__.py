@@ -1,0 +1,1 @@
+"""The vehicle: airframes, rigid body, motors, sensors, the ground."""

@@ -1,0 +1,230 @@
+"""Flights in process: loop, recorder and reader, figures of performance."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mimopilot.codegen.cortex_m4 import load_emulated
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.flight.flight_log import quaternions, record_flight, save_flight
+from mimopilot.sitl.flight.metrics import performance
+from mimopilot.sitl.flight.scenario import doublet, excitation_flight, hover, make_scenario, step
+from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, fly
+from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.sitl.physics.state_estimate import euler_angles
+from mimopilot.tuning.controller import Controller
+from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.parameters import PARAMETERS
+from mimopilot.tuning.reference_model import second_order
+from pyulog import ULog
+
+TS = 0.004
+
+
+@pytest.fixture(scope="module")
+def vehicle():
+    return load_airframe("adam0")
+
+
+def fresh(vehicle):
+    return Autopilot(vehicle.airframe, vehicle.default_gains())
+
+
+def short_experiment(vehicle, seed=3, seconds=4.0):
+    scenario = excitation_flight(seconds, 0.15, 50.0, TS, np.random.default_rng(seed))
+    return fly(vehicle.airframe, fresh(vehicle), scenario, seed)
+
+
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(vehicle):
+    logs = [
+        record_flight(short_experiment(vehicle, seed), vehicle.airframe, vehicle.default_gains()) for seed in (3, 3, 4)
+    ]
+    assert logs[0] == logs[1] != logs[2]
+
+
+def test_the_flown_moments_are_those_of_the_python_reference(vehicle):
+    flight = short_experiment(vehicle)
+    controller = Controller(vehicle.default_gains())
+    saturation = np.zeros(3)
+    for row in flight.record:
+        out = controller.step(row["setpoint"], row["attitude"], row["rates"], row["excitation"], saturation)
+        assert (out.moment == row["moment"]).all()
+        saturation = row["unallocated"]
+
+
+def test_a_minute_on_the_emulated_processor_is_the_flight_of_the_native_library_in_every_bit(vehicle):
+    scenario = excitation_flight(30.0, 0.15, 50.0, TS, np.random.default_rng(2))
+    gains = vehicle.default_gains()
+    native = fly(vehicle.airframe, fresh(vehicle), scenario, 5)
+    emulated = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains, load_emulated(gains)), scenario, 5)
+    assert len(native.record) == 15_000
+    assert np.abs(native.record["moment"]).max() > 0.1
+    assert native.record.tobytes() == emulated.record.tobytes()
+    assert native.truth.tobytes() == emulated.truth.tobytes()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_processor_that_stops_loses_the_vehicle_and_flies_no_stale_moment(vehicle):
+    gains = vehicle.default_gains()
+    processor = load_emulated(gains)
+    processor.image.functions["step"] = 0x3000_0000  # no memory there
+    flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains, processor), hover("roll", 1.0, TS), 0)
+    assert np.isnan(flight.record["moment"]).all()
+    assert flight.crashed_at == 0.0
+
+
+def test_noise_has_the_stated_size_and_no_noise_means_none(vehicle):
+    scenario = hover("roll", 8.0, TS)
+    noisy = fly(vehicle.airframe, fresh(vehicle), scenario, 1)
+    for measured, true, sigma in (("attitude", "attitude", 0.003), ("rates", "rates", 0.01)):
+        error = noisy.record[measured] - noisy.truth[true]
+        assert error.std(axis=0) == pytest.approx(sigma, rel=0.06)
+    exact = fly(vehicle.airframe, fresh(vehicle), scenario, 1, noise=False)
+    assert exact.record["attitude"] == pytest.approx(exact.truth["attitude"], abs=1e-6)
+
+
+def test_the_block_size_does_not_change_the_noise(vehicle):
+    whole = Simulator(vehicle.airframe, TS, 7).noise(1000)
+    parts = Simulator(vehicle.airframe, TS, 7)
+    assert (np.vstack([parts.noise(n) for n in (1, 249, 500, 250)]) == whole).all()
+
+
+def test_a_command_acts_one_period_after_its_measurement(vehicle):
+    # A moment injected at sample k: motors may move in [k+1, k+2), the rate is seen to change at k+2.
+    scenario = hover("roll", 0.4, TS)
+    scenario.excitation[50:, 0] = 0.5
+    flight = fly(vehicle.airframe, fresh(vehicle), scenario, noise=False)
+    # The command is single precision, so hovering is not exactly still.
+    moved = np.flatnonzero(np.abs(flight.truth["rates"][:, 0]) > 1e-3)
+    assert flight.record["moment"][50, 0] > 0.4
+    assert moved[0] == 52
+
+
+def test_altitude_is_held_through_the_experiment(vehicle):
+    flight = short_experiment(vehicle)
+    assert np.abs(flight.truth["position"][:, 2] + 10.0).max() < 0.5
+
+
+def test_a_recorded_flight_reads_back_as_it_was_flown(vehicle, tmp_path):
+    flight = short_experiment(vehicle)
+    save_flight(tmp_path / "a.ulg", flight, vehicle.airframe, vehicle.default_gains())
+    read = read_log(tmp_path / "a.ulg")
+    # The experiment ends with its last injected sample; here the whole flight is excited.
+    assert read.Ts == TS
+    assert read.segments == ((0, len(flight.record)),)
+    for name, field in (("u", "moment"), ("y_i", "rates"), ("r_i", "rates_setpoint"), ("u_bar", "excitation")):
+        assert (getattr(read, name) == flight.record[field][:, :2]).all()
+    assert read.y_o == pytest.approx(flight.record["attitude"][:, :2], abs=1e-6)
+    assert read.flown is not None
+    for code, value in vehicle.default_gains().elements().items():
+        assert read.flown.elements()[code] == pytest.approx(value, rel=1e-6)
+    assert read.flown.moment_scale == pytest.approx(vehicle.default_gains().moment_scale, rel=1e-6)
+
+
+def test_the_log_is_a_px4_log_to_pyulog(vehicle, tmp_path):
+    flight = short_experiment(vehicle)
+    save_flight(tmp_path / "a.ulg", flight, vehicle.airframe, vehicle.default_gains())
+    log = ULog(str(tmp_path / "a.ulg"))
+    assert not log.file_corruption
+    assert log.msg_info_dict["sys_name"] == "mimopilot"
+    torque = log.get_dataset("vehicle_torque_setpoint").data
+    rates = log.get_dataset("vehicle_angular_velocity").data
+    assert (torque["timestamp_sample"] == rates["timestamp_sample"]).all()
+    assert (np.diff(torque["timestamp"]) == 4000).all()
+    assert (torque["xyz[1]"] == flight.record["moment"][:, 1]).all()
+    assert (log.get_dataset("debug_vect").data["x"] == flight.record["excitation"][:, 0]).all()
+    for parameter in PARAMETERS:
+        assert parameter.name in log.initial_parameters
+
+
+@given(st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3)))
+@settings(deadline=None)
+def test_quaternions_and_angles_are_inverse_to_each_other(angles):
+    q = quaternions(np.array([angles]))[0].astype(float)
+    assert euler_angles(*q) == pytest.approx(angles, abs=2e-6)
+
+
+def test_an_exact_measurement_is_the_state_in_single_precision(vehicle):
+    simulator = Simulator(vehicle.airframe, TS, 0, noise=False, altitude=12.3456)
+    out = simulator.measure(np.ones(6))
+    assert out == pytest.approx([1, 0, 0, 0, 0, 0, 0, 12346, 0])
+
+
+def synthetic_flight(response, rate):
+    """A flight whose signals are given: for checking the figures by hand."""
+    scenario = doublet("roll", 0.2, 0.4, TS, tail=0.2)
+    from mimopilot.sitl.autopilot.autopilot import RECORD
+
+    record, truth = np.zeros(len(scenario.setpoint), RECORD), np.zeros(len(scenario.setpoint), TRUTH)
+    record["setpoint"] = scenario.setpoint
+    record["attitude"][:, 0] = response(scenario.setpoint[:, 0])
+    record["rates_setpoint"][:, 0] = 1.0
+    record["rates"][:, 0] = rate
+    record["moment"][:, :2] = [0.3, 0.4]
+    truth["attitude"][:, 1] = np.radians(2.0)
+    return Flight(scenario, record, truth)
+
+
+def test_the_figures_of_a_perfect_response_are_zero_and_the_others_those_of_their_definitions():
+    inner, outer = second_order(20, 0.4, 0, TS), second_order(10, 0.7, 0, TS)
+    flight = synthetic_flight(outer.response, 0.5)
+    figures = performance(flight, inner, outer)
+    assert figures.J_M_o == pytest.approx(0, abs=1e-12)
+    window = slice(*flight.scenario.window)
+    setpoint = flight.scenario.setpoint[window, 0]
+    assert window.stop - window.start == 100
+    assert figures.J_r_o == pytest.approx(
+        np.mean((outer.response(flight.scenario.setpoint[:, 0])[window] - setpoint) ** 2), rel=1e-5
+    )
+    assert figures.J_r_i == pytest.approx(0.25)
+    assert figures.J_M_i == pytest.approx(np.mean((0.5 - inner.response(np.ones(len(flight.record)))[window]) ** 2))
+    assert figures.offaxis_peak_deg == pytest.approx(2.0)
+    assert figures.offaxis_rms_deg == pytest.approx(2.0)
+    assert figures.effort_rms == pytest.approx(0.5)
+
+
+def test_a_lost_vehicle_is_reported_when_the_crash_rule_is_met(vehicle):
+    unstable = vehicle.default_gains().with_elements({"RP_RP": 1.0, "RP_PR": 1.0})
+    flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, unstable), hover("roll", 6.0, TS), 1)
+    assert flight.crashed_at is not None
+    tilt = np.abs(flight.truth["attitude"][:, 0])
+    first = np.flatnonzero(tilt > np.radians(60))[0] * TS
+    assert flight.crashed_at >= first + 0.28
+
+
+def test_touching_the_ground_is_a_loss(vehicle):
+    low = Autopilot(vehicle.airframe, vehicle.default_gains(), altitude=0.02)
+    flight = fly(vehicle.airframe, low, step("roll", np.radians(59.0), 6.0, TS), 1)
+    assert flight.crashed_at is not None
+    first = np.flatnonzero(flight.truth["position"][:, 2] > 0)[0]
+    assert flight.crashed_at == pytest.approx(first * TS)
+
+
+def test_a_steady_flight_is_not_reported_as_lost(vehicle):
+    assert fly(vehicle.airframe, fresh(vehicle), hover("roll", 2.0, TS), 1).crashed_at is None
+
+
+def test_a_doublet_is_up_then_down_then_level():
+    scenario = doublet("pitch", 0.4, 0.42, TS)
+    start, stop = scenario.window
+    assert stop - start == 104
+    assert (scenario.setpoint[start : start + 52, 1] == 0.4).all()
+    assert (scenario.setpoint[start + 52 : stop, 1] == -0.4).all()
+    assert (scenario.setpoint[stop:] == 0).all()
+    assert (scenario.setpoint[:, [0, 2]] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: make_scenario("loop", "roll", 10, 1, TS), "scenario: got 'loop'"),
+        (lambda: make_scenario("doublet", "yaw", 10, 1, TS), "axis: got 'yaw'"),
+        (lambda: step("roll", -1, 1, TS), "amplitude: got -57.2958 degrees"),
+        (lambda: step("roll", 0.1, float("nan"), TS), "period: got nan"),
+        (lambda: excitation_flight(20, 1.5, 50, TS, np.random.default_rng(0)), "amplitude: got 1.5"),
+    ],
+)
+def test_an_impossible_scenario_is_refused(call, message):
+    with pytest.raises(SitlError, match=message):
+        call()

@@ -1,0 +1,124 @@
+"""Faults of the plant process and of its link: the flight in process again."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.autopilot.setpoints import Attitude
+from mimopilot.sitl.faults.inject_autopilot import AutopilotFaults
+from mimopilot.sitl.faults.kinds import parse_fault
+from mimopilot.sitl.flight.scenario import doublet, hover
+from mimopilot.sitl.flight.simulator import fly
+from mimopilot.sitl.mavlink.simulator_api import lockstep
+from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState
+from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
+from mimopilot.sitl.mavlink.vehicle.host import Host
+from mimopilot.sitl.physics.airframe import load_airframe
+
+from tests.conftest import assert_one_clear_line
+
+TS = 0.004
+
+
+@pytest.fixture(scope="module")
+def vehicle():
+    return load_airframe("adam0")
+
+
+@pytest.fixture(scope="module")
+def library(vehicle):
+    return load_native(vehicle.default_gains())
+
+
+def pilot(vehicle, library):
+    gains = vehicle.default_gains()
+    return Autopilot(vehicle.airframe, gains, NativeController(library, gains))
+
+
+def over_both(vehicle, library, scenario, *texts, seed=3):
+    """The same flight in process and over MAVLink."""
+    faults = tuple(map(parse_fault, texts))
+    flight = fly(vehicle.airframe, pilot(vehicle, library), replace(scenario, faults=faults), seed)
+    with plant_process("adam0", 0, TS, seed, None, faults=faults) as port:
+        return flight, lockstep.fly(pilot(vehicle, library), scenario, port)
+
+
+def test_a_flight_with_broken_parts_and_late_commands_is_the_same_over_mavlink_in_every_bit(vehicle, library):
+    texts = (
+        *("motor:3=0.8@1.1", "battery=0.9@0.5+0.4", "mass:0.1,-0.1,0=0.1@1.3", "delay=0.012@1.05", "jitter=0.008@1.2"),
+        *("gyro-bias:roll=0.1@0.9", "gyro-noise=0.05@1.0+0.3", "gyro-stuck:pitch@1.15+0.05", "gyro-nan@1.5+0.02"),
+    )
+    flight, record = over_both(vehicle, library, doublet("roll", 0.3, 0.42, TS), *texts)
+    assert np.isnan(record["rates"]).any()
+    assert record.tobytes() == flight.record.tobytes()
+
+
+def test_ticks_that_the_link_loses_are_the_same_ones_over_mavlink(vehicle, library):
+    texts = ("loss=0.3@0.2+0.3", "skip=5@0.8", "link@1.0+0.2", "clock=0.1@1.5")
+    flight, record = over_both(vehicle, library, hover("roll", 2.0, TS), *texts)
+    seen = flight.record[flight.runs == 1]
+    assert 500 - len(seen) == pytest.approx(0.3 * 75 + 5 + 50 + 25, abs=15)
+    assert record[: len(seen)].tobytes() == seen.tobytes()
+
+
+def test_messages_that_come_twice_are_flown_once(vehicle, library):
+    flight, record = over_both(vehicle, library, hover("roll", 1.0, TS), "duplicate=0.5@0")
+    assert (flight.runs == 2).any()
+    sound = fly(vehicle.airframe, pilot(vehicle, library), hover("roll", 1.0, TS), 3)
+    assert record.tobytes() == sound.record.tobytes()
+
+
+def test_the_plant_refuses_what_it_cannot_do_before_it_listens(mimopilot):
+    assert_one_clear_line(mimopilot("plant", "adam0", "--port", 0, "--fault", "gain=2@1"), "'gain=2@1'", "autopilot")
+    assert_one_clear_line(mimopilot("plant", "adam0", "--port", 0, "--fault", "motor:5=0@1"), "motors 1 to 4")
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--plant", "127.0.0.1:1", "--fault", "loss=0.1@1"), ("'loss=0.1@1'", "give it to that one")),
+        (("--fault", "gain:Kp_o=100@1"), ("MIMO_AP_RR would be 650", "a vehicle refuses that write")),
+    ],
+)
+def test_the_vehicle_refuses_what_it_cannot_do_before_it_flies(mimopilot, words, told):
+    assert_one_clear_line(mimopilot("sitl", "adam0", *words), *told)
+
+
+class Frames:
+    """A plant that only tells that the vehicle hangs in the air, level."""
+
+    socket = None
+
+    def answer(self, stamp, commands, armed):
+        pass
+
+
+def test_a_fault_at_the_moment_of_an_examination_is_not_taken_for_a_plant_of_another_rate(vehicle, library):
+    host = Host(pilot(vehicle, library), Frames())
+    for k in range(1001):
+        rate = math.nan if 450 <= k <= 520 else 0.0
+        host._period(PlantState(7_000_000 + 4000 * k, 1, 0, 0, 0, rate, *[0.0] * 4, 10_000, *[0] * 8))
+    texts = [text for _, text in host.vehicle.said]
+    assert any("the controller refuses its inputs" in text for text in texts)
+    assert not any("period" in text for text in texts)
+
+
+def test_the_host_corrupts_its_gains_and_hears_no_set_points_in_the_time_of_the_fault(vehicle, library):
+    autopilot = pilot(vehicle, library)
+    controller = autopilot.controller
+    faults = AutopilotFaults(tuple(map(parse_fault, ("gain:Kp_i=0.5@0.2+0.4", "stale@0.4+0.8"))), TS, autopilot)
+    host = Host(autopilot, Frames())
+    host.faults = faults
+    sound, Kp_i, fresh = controller.state["gains"][0].copy(), slice(4, 8), []
+    for k in range(400):
+        host._period(PlantState(7_000_000 + 4000 * k, 1, 0, 0, 0, *[0.0] * 5, 10_000, *[0] * 8))
+        factor = 0.5 if 50 <= k < 150 else 1.0
+        assert (controller.state["gains"][0, Kp_i] == np.float32(factor) * sound[Kp_i]).all(), k
+        fresh.append(host.vehicle.attitude.fresh(host.vehicle.now))
+        host.vehicle.attitude.put(Attitude(0.1, 0.0, 0.0, None), host.vehicle.now)  # a ground station steers
+    # The one of sample 99 counts for half a second; the first that is heard again comes after sample 300.
+    assert np.flatnonzero(~np.array(fresh)).tolist() == [0, *range(225, 301)]
+    assert (controller.state["gains"][0] == sound).all()

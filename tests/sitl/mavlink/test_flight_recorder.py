@@ -1,0 +1,54 @@
+"""The log of flights by others: its numbers, and a disk that is full."""
+
+import pytest
+from mimopilot.sitl.autopilot.flight_modes import Vehicle
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
+from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.tuning.parameters import to_array
+from pyulog import ULog
+
+TS = 0.004
+
+
+@pytest.fixture(scope="module")
+def model():
+    return load_airframe("adam0")
+
+
+def flies(log, model, seconds):
+    """One flight, whose rows say how long they have flown."""
+    vehicle = Vehicle(0.5)
+    log.begin(to_array(model.default_gains()))
+    for k in range(round(seconds / TS)):
+        log.row(vehicle)["rates"] = k * TS
+
+
+def seconds(path):
+    return len(ULog(str(path)).get_dataset("vehicle_land_detected").data["timestamp"]) * TS
+
+
+def test_a_flight_that_cannot_be_written_keeps_its_number_and_is_written_later(model, tmp_path):
+    folder = tmp_path / "logs"
+    log = FlightLog(folder / "f.ulg", model.airframe, TS)
+    flies(log, model, 1.0)
+    assert log.save() == [folder / "f.ulg"]
+    folder.rename(tmp_path / "away")
+    folder.write_text("no folder any more")
+    for flight in (2.0, 3.0):
+        flies(log, model, flight)
+        with pytest.raises(OSError, match="File exists"):
+            log.save()
+    assert log.unsaved == [folder / "f-2.ulg", folder / "f-3.ulg"]
+    folder.unlink()
+    (tmp_path / "away").rename(folder)
+    flies(log, model, 4.0)
+    assert log.save() == [folder / f"f-{n}.ulg" for n in (2, 3, 4)]
+    assert [seconds(folder / name) for name in ("f.ulg", "f-2.ulg", "f-3.ulg", "f-4.ulg")] == [1.0, 2.0, 3.0, 4.0]
+    assert (log.save(), log.unsaved, log.flights) == ([], [], 4)
+
+
+def test_a_folder_is_no_log(model, tmp_path):
+    with pytest.raises(SitlError, match="cannot be written there"):
+        FlightLog(tmp_path, model.airframe, TS)
+    assert list(tmp_path.iterdir()) == []

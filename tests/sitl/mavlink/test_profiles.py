@@ -1,0 +1,127 @@
+"""What gains become in the parameters of our module and of stock autopilots."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from mimopilot.codegen.errors import CodegenError
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.mavlink.ground_station.events import single
+from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, off_diagonals, restoration
+from mimopilot.tuning.gains import MATRICES, Limits
+from mimopilot.tuning.logs.flown_gains import flown_gains
+from mimopilot.tuning.parameters import PARAMETERS, to_array
+
+
+@pytest.fixture
+def diagonal(gains):
+    """The set without its off-diagonals, and with a gentle yaw."""
+    matrices = {name: np.diag(np.diag(getattr(gains, name))) for name in MATRICES}
+    return dataclasses.replace(gains, **matrices)
+
+
+def test_our_module_gets_every_writable_parameter_with_the_bits_of_the_struct(gains):
+    plan = make_plan(gains)
+    array = {p.name: float(v) for p, v in zip(PARAMETERS, to_array(gains), strict=True)}
+    assert plan.fixed == {"MIMO_TS": array.pop("MIMO_TS")}
+    assert plan.values == array
+    assert plan.dropped == {}
+    assert plan.scale == ("MIMO_SCALE_R", "MIMO_SCALE_P", "MIMO_SCALE_Y")
+
+
+def test_px4s_parameters_describe_the_same_controller(diagonal):
+    """The log reader's own table, which knows nothing of profiles, finds the gains again."""
+    plan = make_plan(diagonal, "px4-stock")
+    found = flown_gains(plan.values, diagonal.Ts)
+    for code, value in diagonal.elements().items():
+        if not code.startswith("UMAX"):
+            assert found.elements()[code] == pytest.approx(value, rel=1e-6), code
+    assert plan.values["MC_ROLLRATE_MAX"] == single(math.degrees(5.0))
+    assert plan.values["MC_YAWRATE_K"] == 1.0
+    assert plan.values["IMU_DGYRO_CUTOFF"] == 30.0
+    assert any("moment_max (pitch, yaw)" in note for note in plan.notes)
+
+
+def test_ardupilots_parameters_are_the_diagonal_in_its_units(diagonal):
+    values = make_plan(diagonal, "ardupilot-stock").values
+    for axis, name in enumerate(("RLL", "PIT", "YAW")):
+        if axis == 2:
+            terms = [getattr(diagonal.yaw, matrix) for matrix in MATRICES]
+        else:
+            terms = [getattr(diagonal, matrix)[axis, axis] for matrix in MATRICES]
+        written = [
+            values[f"ATC_{part}"] for part in (f"ANG_{name}_P", *(f"RAT_{name}_{t}" for t in ("P", "I", "D", "FF")))
+        ]
+        assert written == [single(term) for term in terms]
+        assert values[f"ATC_RAT_{name}_IMAX"] == single(diagonal.limits.integral_max[axis])
+        assert values[f"ATC_RAT_{name}_FLTD"] == 30.0
+        assert values[f"ATC_RATE_{name[0]}_MAX"] == single(math.degrees(diagonal.limits.rate_max[axis]))
+    assert len(values) == 24
+
+
+@pytest.mark.parametrize("profile", ["px4-stock", "ardupilot-stock"])
+def test_large_off_diagonals_are_not_dropped_unasked(gains, profile):
+    with pytest.raises(SitlError, match=rf"R[PD]_RP: the {profile} controller has no off-diagonals, .* 13% of"):
+        make_plan(gains, profile)
+    plan = make_plan(gains, profile, drop=True)
+    assert plan.dropped == off_diagonals(gains)
+    assert plan.dropped["RP_RP"] == pytest.approx(0.02 / 0.15)
+    assert plan.dropped["AP_PR"] == pytest.approx(0.2 / 5.5)
+    assert len(plan.dropped) == 10
+
+
+def test_an_off_diagonal_beside_a_zero_counts_as_infinite(diagonal):
+    odd = dataclasses.replace(diagonal, Kff_i=np.array([[0.0, 0.001], [0.0, 0.0]]))
+    assert off_diagonals(odd) == {"RF_RP": math.inf}
+    with pytest.raises(SitlError, match="RF_RP"):
+        make_plan(odd, "px4-stock")
+
+
+def test_small_off_diagonals_are_dropped_and_told(diagonal):
+    small = dataclasses.replace(diagonal, Kp_i=np.array([[0.15, 0.003], [0.0, 0.13]]))
+    assert make_plan(small, "px4-stock").dropped == {"RP_RP": pytest.approx(0.02)}
+
+
+@pytest.mark.parametrize(
+    ("profile", "change", "message"),
+    [
+        ("mimo", {"Kp_i": np.eye(2) * 6}, "MIMO_RP_RR: got 6 s, expected 0.0001 to 5"),
+        ("px4-stock", {"Kp_i": np.eye(2) * 0.7}, "MC_ROLLRATE_P: got 0.7, expected 0 to 0.5 s"),
+        ("px4-stock", {"Kd_i": -np.eye(2) * 0.001}, "MC_ROLLRATE_D: got -0.001, expected 0 to 0.01"),
+        ("ardupilot-stock", {"Kp_o": np.eye(2) * 13}, "ATC_ANG_RLL_P: got 13, expected 0 to 12"),
+        (
+            "ardupilot-stock",
+            {"limits": Limits(rate_max=(20.0, 1.0, 1.0))},
+            "ATC_RATE_R_MAX: got 1145.92, expected 0 to 1080",
+        ),
+        ("betaflight", {}, "--profile: got 'betaflight', expected one of mimo, px4-stock, ardupilot-stock"),
+    ],
+)
+def test_what_a_vehicle_would_take_without_a_word_is_refused_here(diagonal, profile, change, message):
+    with pytest.raises((SitlError, CodegenError), match=message):
+        make_plan(dataclasses.replace(diagonal, **change), profile)
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+def test_every_name_and_value_can_go_over_the_wire(diagonal, profile):
+    for name, value in make_plan(diagonal, profile).values.items():
+        assert len(name) <= 16
+        assert name == name.upper()
+        assert value == single(value)
+
+
+def test_a_snapshot_is_a_whole_set_within_our_ranges(diagonal):
+    values = make_plan(diagonal).values
+    plan = restoration(values | {"MIMO_TS": 0.004, "SYS_X": 1e9}, "old.params")
+    assert plan.values == values | {"SYS_X": 1e9}
+    assert (plan.fixed, plan.profile) == ({"MIMO_TS": 0.004}, "mimo")
+    assert [s.unit for s in plan.settings][:1] == ["1/s"]
+    with pytest.raises(SitlError, match=r"old\.params: MIMO_RP_RR: got 99, expected -?[0-9.e-]+ to 5 s"):
+        restoration(values | {"MIMO_RP_RR": 99.0}, "old.params")
+    with pytest.raises(SitlError, match=r"holds 33 of our 35 gains and lacks MIMO_RP_RP and 1 more"):
+        restoration({n: v for n, v in values.items() if n not in ("MIMO_RP_RP", "MIMO_D_POLE")}, "old.params")
+    foreign = restoration({"MC_ROLL_P": 99.0}, "px4.params")
+    assert (foreign.values, foreign.profile) == ({"MC_ROLL_P": 99.0}, "px4-stock")
+    assert restoration({"ATC_ANG_RLL_P": 5.0}, "x").profile == "ardupilot-stock"
+    assert restoration({"WPNAV_SPEED": 5.0}, "x").profile == ""

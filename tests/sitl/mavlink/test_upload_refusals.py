@@ -1,0 +1,194 @@
+"""upload and restore against vehicles, storage and files that are not as they should be: what is told, and the code."""
+
+import json
+
+import pytest
+from mimopilot.sitl.mavlink.ground_station.events import Value
+from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
+
+from tests.conftest import assert_one_clear_line
+from tests.sitl.mavlink.running import wait_for
+from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, UdpVehicle, float32
+
+KEY = bytes(range(32))
+
+
+@pytest.fixture
+def mimopilot(quick_mimopilot):
+    return quick_mimopilot
+
+
+def upload(mimopilot, certified, link, *extra):
+    return mimopilot("upload", certified, "--connect", link.url, "--yes", *extra)
+
+
+def held_gains(vehicle, new):
+    return {name: vehicle.values[name] for name in new}
+
+
+class AtStoring(ScriptedVehicle):
+    """Something happens to it as it is told to store; `happens` returns what it says then."""
+
+    def __init__(self, values, happens):
+        super().__init__(values)
+        self.happens, self.before = happens, dict(self.values)
+
+    def answer(self, order):
+        answers = super().answer(order)
+        return (
+            [*answers, *(self.happens(self) or [])] if self.stored == 1 and type(order).__name__ == "Store" else answers
+        )
+
+
+def restarts(vehicle):
+    vehicle.values.update(vehicle.before)
+
+
+def clamps(vehicle):
+    vehicle.values["MIMO_RP_RR"] = float32(0.1)
+
+
+def is_written(vehicle):
+    return [Value(1, 1, "MIMO_RP_RR", 0.5), Value(1, 1, "MIMO_RP_RR", vehicle.values["MIMO_RP_RR"])]
+
+
+def arms(vehicle):
+    vehicle.armed = True
+    return vehicle.heartbeat()
+
+
+@pytest.mark.parametrize(
+    ("happens", "words"),
+    [
+        (restarts, ("MIMO_AP_RR: reads back as 5.25, expected 6.0",)),
+        (clamps, ("MIMO_RP_RR: reads back as 0.1, expected 0.15",)),
+        (is_written, ("MIMO_RP_RR: 0.5, after the vehicle said 0.15",)),
+        (arms, ("the vehicle was armed before the last reading", "although the vehicle was armed")),
+    ],
+)
+def test_what_happens_as_a_vehicle_stores_is_exit_1_and_undone(mimopilot, certified, old, new, happens, words):
+    vehicle = AtStoring(old, happens)
+    with UdpVehicle(vehicle) as link:
+        failed = upload(mimopilot, certified, link)
+    assert_one_clear_line(failed, *words, "the old values were put back and read back", code=1)
+    assert vehicle.values == old
+
+
+@pytest.mark.parametrize(("result", "word", "said"), [(2, "denied", "DENIED"), (4, "failed", "FAILED")])
+def test_storage_that_is_refused_is_told_as_such(mimopilot, certified, old, new, result, word, said):
+    vehicle = ScriptedVehicle(old, storage=result)
+    with UdpVehicle(vehicle) as link:
+        failed = upload(mimopilot, certified, link, "--json")
+        assert_one_clear_line(failed, "all values were read back, but not stored", f"MAV_RESULT_{said}", code=1)
+        assert (json.loads(failed.stdout)["state"], json.loads(failed.stdout)["storage"]) == ("verified", word)
+        assert held_gains(vehicle, new) == new
+        vehicle.values.update(old)
+        vehicle.fault, vehicle.victim = "echoes one", "MIMO_RP_RR"
+        failed = upload(mimopilot, certified, link)
+        assert_one_clear_line(failed, "put back and read back; not stored", f"MAV_RESULT_{said}", code=1)
+
+
+def test_a_second_vehicle_of_the_same_number_is_never_written(mimopilot, certified, old, new):
+    first, second = ScriptedVehicle(old), ScriptedVehicle(new)
+    with UdpVehicle(first) as link:
+        other = UdpVehicle(second)
+        other.ground = link.ground
+        write, transmit, started, sent = first.write, other.transmit, [], []
+        other.transmit = lambda data: sent.append(transmit(data))
+
+        def appear(name, value):
+            if first.writes == 9:
+                started.append(other.__enter__())
+                wait_for(lambda: sent)
+            return write(name, value)
+
+        first.write = appear
+        try:
+            failed = upload(mimopilot, certified, link)
+        finally:
+            assert started
+            other.__exit__()
+        addresses = [f"127.0.0.1:{vehicle.port_number}" for vehicle in (link, other)]
+    assert_one_clear_line(failed, "system 1 is heard from two addresses", *addresses, "put back and read back", code=1)
+    assert first.values == old
+    assert (second.writes, second.stored, second.values) == (0, 0, new)
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "kind", "profile", "words"),
+    [
+        (3, 1, "mimo", ("a plane with ArduPilot", "no profile fits")),
+        (12, 1, "px4-stock", ("a plane with PX4", "no profile fits")),
+        (3, 10, "ardupilot-stock", ("a rover with ArduPilot", "no profile fits")),
+        (12, 10, "mimo", ("a rover with PX4",)),
+        (3, 2, "mimo", ("a quadrotor with ArduPilot", "the profile that fits is ardupilot-stock")),
+        (3, 14, "px4-stock", ("an octorotor with ArduPilot", "the profile that fits is ardupilot-stock")),
+        (12, 13, "ardupilot-stock", ("a hexarotor with PX4", "the profile that fits is px4-stock or mimo")),
+        (0, 2, "px4-stock", ("a quadrotor with generic autopilot", "the profile that fits is mimo")),
+    ],
+)
+def test_a_vehicle_of_another_kind_is_named_with_the_profile_that_fits(
+    mimopilot, certified, old, autopilot, kind, profile, words
+):
+    vehicle = ScriptedVehicle(old)
+    vehicle.autopilot, vehicle.type = autopilot, kind
+    stock = () if profile == "mimo" else ("--profile", profile, "--drop-off-diagonals", "--moment-scale", "flown")
+    with UdpVehicle(vehicle) as link:
+        refused = upload(mimopilot, certified, link, *stock)
+    assert_one_clear_line(refused, *words, "nothing was written")
+    assert (vehicle.reads, vehicle.writes) == (0, 0)
+
+
+def test_a_stock_px4_is_named_and_a_vehicle_that_hears_nothing_is_not_taken_for_one(mimopilot, certified):
+    for values, words, code in [
+        ({"MC_ROLL_P": 6.5}, ("a quadrotor with PX4 and its stock controllers", "px4-stock"), 2),
+        ({}, ("MIMO_AP_RR", "no answer in 2 s"), 1),
+    ]:
+        with UdpVehicle(ScriptedVehicle(values)) as link:
+            refused = upload(mimopilot, certified, link, "--timeout", "2")
+        assert_one_clear_line(refused, *words, "nothing was written", code=code)
+
+
+def test_a_vehicle_whose_clock_is_behind_is_told_from_one_with_another_key(mimopilot, certified, old, tmp_path):
+    (tmp_path / "key").write_bytes(KEY)
+    for key, late, words in [
+        (KEY, 3600.0, ("signed with this key, 36", "s behind this computer's clock")),
+        (KEY[::-1], 0.0, ("not signed with this key",)),
+    ]:
+        with UdpVehicle(ScriptedVehicle(old), key=key, late=late) as link:
+            refused = upload(mimopilot, certified, link, "--signing-key", "key", "--timeout", "2")
+        assert_one_clear_line(refused, "no HEARTBEAT", *words, code=1)
+
+
+def test_a_snapshot_that_is_not_whole_or_out_of_range_is_refused_before_the_vehicle_is_asked(
+    mimopilot, certified, old, new, tmp_path
+):
+    vehicle = ScriptedVehicle(old)
+    with UdpVehicle(vehicle) as link:
+        assert upload(mimopilot, certified, link).returncode == 0
+        text, reads, writes = (tmp_path / "my.before-1.params").read_text(), vehicle.reads, vehicle.writes
+        lines = text.splitlines(keepends=True)
+        unsealed = "".join(lines[1:])
+        for content, words in [
+            ("".join(lines[:-5]), ("holds 30 parameters, but its first line says 35",)),
+            (text[:-4], ("it was cut short",)),
+            (text.replace("0.13125", "0.13126"), ("damaged or edited",)),
+            ("".join(lines[1:-5]), ("holds 30 of our 35 gains", "lacks")),
+            (unsealed.replace("\t0.13125001\t", "\t99\t"), ("MIMO_RP_RR: got 99, expected",)),
+        ]:
+            (tmp_path / "bad.params").write_text(content)
+            refused = mimopilot("restore", "bad.params", "--connect", link.url, "--yes")
+            assert_one_clear_line(refused, "bad.params", *words)
+            assert (vehicle.reads, vehicle.writes) == (reads, writes)
+        (tmp_path / "unsealed.params").write_text(unsealed)
+        assert mimopilot("restore", "unsealed.params", "--connect", link.url, "--yes").returncode == 0
+        assert held_gains(vehicle, new) == {name: old[name] for name in new}
+    assert read_parameters(tmp_path / "my.before-1.params") == {name: old[name] for name in new}
+
+
+def test_a_value_that_restore_would_refuse_is_not_overwritten(mimopilot, certified, old):
+    vehicle = ScriptedVehicle(old | {"MIMO_RP_RR": 99.0})
+    with UdpVehicle(vehicle) as link:
+        refused = upload(mimopilot, certified, link)
+    assert_one_clear_line(refused, "MIMO_RP_RR: the vehicle holds 99, expected", "set it by hand first")
+    assert vehicle.writes == 0

@@ -1,0 +1,145 @@
+"""Chapter 6 on the bench, in small: few seeds, the same rules."""
+
+import json
+
+import numpy as np
+import pytest
+from mimopilot.sitl.flight.scenario import AXES
+from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.sitl.studies.attitude import AUTOTUNE, BEST, BOUND, MIMO, REFINED, SISO, SISO_OWN, experiment, studies
+from mimopilot.sitl.studies.attitude_report import study_sections
+from mimopilot.sitl.studies.attitude_runs import run_once, run_studies
+from mimopilot.sitl.studies.autotune import autotune, identify_arx, minimum_variance_pid
+from mimopilot.sitl.studies.benchmarks import TABLES
+from mimopilot.sitl.studies.expectations import EFFORT, expectations
+from mimopilot.sitl.studies.reproduce import ALL, STUDIES, reproduce
+
+from mimopilot.cli.studies import Study as Choice
+from mimopilot.common.parallel import processes
+
+PRINTED = json.loads(TABLES.read_text())
+SEEDS = 3
+
+
+@pytest.fixture(scope="module")
+def found():
+    """The perturbed vehicle and the strongly coupled one, as `reproduce` computes them."""
+    known = studies()
+    names = ("adam0-perturbed", "coupled")
+    return dict(zip(names, run_studies([known[name] for name in names], SEEDS, 2), strict=True))
+
+
+def test_the_command_offers_what_can_be_studied():
+    assert [choice.value for choice in Choice] == [*STUDIES, ALL]
+
+
+def test_studies_take_their_tasks_from_the_printed_tables():
+    known = studies()
+    flight = PRINTED["adam0_flight_nominal"]
+    assert known["adam0"].amplitude_deg == flight["doublet"]["amplitude_deg"]
+    assert known["adam0"].inner == tuple(flight["reference_models"]["MIMO"]["inner"].values())
+    assert known["adam0"].siso_models[0] == tuple(flight["reference_models"]["SISO"]["inner"].values())
+    assert known["antr"].excitation[1] == PRINTED["antr_flight"]["prbs"]["amplitude"]
+    # The thesis tuned SISO for the perturbed vehicle on the nominal log.
+    assert known["adam0-perturbed"].siso_airframe == "adam0_nominal"
+
+
+def test_the_boom_couples_by_forty_per_cent_and_keeps_the_balance():
+    plant = load_airframe("adam0_boom").airframe.plant()
+    J = plant.inertia
+    assert J[0, 1] / np.sqrt(J[0, 0] * J[1, 1]) == pytest.approx(0.40, abs=0.002)
+    assert plant.mass == pytest.approx(1.85)
+    assert plant.rotors.mean(axis=0) == pytest.approx(0, abs=1e-12)
+
+
+def test_decoupling_and_effort_are_as_expected(found):
+    rows = [row for row in expectations(list(found.values())) if row.over == SISO]
+    assert len(rows) == 2 * 3 * 2
+    for row in rows:
+        assert row.met(REFINED), row
+
+
+def test_following_is_near_the_best_possible(found):
+    rows = [row for row in expectations(list(found.values())) if row.over == BEST]
+    assert len(rows) == 4
+    for row in rows:
+        assert row.met(REFINED), row
+
+
+@pytest.mark.parametrize("name", ["adam0-perturbed", "coupled"])
+def test_the_best_on_the_true_plant_keeps_its_limits_and_is_the_best_within_them(found, name):
+    statistics = found[name]
+    for axis in AXES:
+        # 5 % without noise; what brisk gains make of the noise comes on top.
+        assert statistics.median(BEST, axis, "effort_rms") < EFFORT * statistics.median(SISO, axis, "effort_rms")
+        for method in (SISO, MIMO):
+            assert statistics.median(BEST, axis, "J_M_o") < statistics.median(method, axis, "J_M_o")
+        assert statistics.median(BOUND, axis, "J_M_o") < statistics.median(BEST, axis, "J_M_o")
+
+
+def test_the_own_log_gives_siso_gains_too_but_no_decoupling(found):
+    statistics = found["adam0-perturbed"]
+    for axis in AXES:
+        assert statistics.median(SISO_OWN, axis, "J_M_o") < statistics.median(SISO, axis, "J_M_o")
+        assert statistics.median(SISO_OWN, axis, "offaxis_peak_deg") > 1.5
+
+
+def test_a_run_is_the_same_whatever_the_process_and_what_else_it_did(found):
+    statistics = found["coupled"]
+    best = {method: statistics.shown.gains[method] for method in (BEST, BOUND)}
+    with processes(1) as pool:
+        _, again = pool.submit(run_once, (statistics.study, 1, best)).result()
+    assert json.dumps(again) == json.dumps(statistics.runs[1])
+
+
+def test_the_report_has_the_printed_figures_and_the_same_bytes_again(found):
+    statistics = found["adam0-perturbed"]
+    sections = study_sections(statistics)
+    cells = [cell for section in sections for table in section.tables for row in table.rows for cell in row]
+    for value in np.ravel(PRINTED["adam0_flight_perturbed"]["table_6_4"]["MIMO"]["Kp_o"]):
+        assert f"{value:.4f}" in cells
+    assert f"{PRINTED['adam0_flight_perturbed']['table_6_5_pitch']['SISO']['J_M_o']:.3g}" in cells
+    assert "only be compared in kind" in " ".join(section.text for section in sections)
+    assert sum(len(section.figures) for section in sections) == 9
+    assert study_sections(statistics) == sections
+
+
+def test_the_gmvc_design_of_a_known_model():
+    """y = 0.5 y(k-1) + u(k-1): P - (1 - z^-1) A (1 + e1 z^-1) by hand."""
+    Ts, pole = 0.01, np.exp(-2 * 0.01 / 0.14)
+    e1 = -2 * pole + 1.5
+    f0, f1 = pole**2 - 0.5 + 1.5 * e1, -0.5 * e1
+    size = 0.7 + 1 + e1
+    Kp, Ki, Kd = minimum_variance_pid(np.array([-0.5, 0.0]), np.array([1.0, 0.0, 0.0]), Ts)
+    assert [Kp, Ki, Kd] == pytest.approx([-f1 / size, (f0 + f1) / size / Ts, 0.0], abs=1e-12)
+
+
+def test_the_arx_fit_finds_a_second_order_model():
+    generator = np.random.default_rng(0)
+    u = np.concatenate([np.zeros(3), np.repeat(generator.choice([-1.0, 1.0], 400), 5)])  # from rest
+    y = np.zeros_like(u)
+    for k in range(3, len(u)):
+        y[k] = 1.7 * y[k - 1] - 0.72 * y[k - 2] + 0.02 * u[k - 1] + 0.01 * u[k - 2]
+    a, b, period = identify_arx([(u, y)], 0.008)
+    assert period == 0.008
+    assert a == pytest.approx([-1.7, 0.72], abs=1e-6)
+    assert b == pytest.approx([0.02, 0.01, 0.0], abs=1e-6)
+
+
+def test_the_per_axis_baseline_flies_but_leaks():
+    study = studies()["coupled"]
+    _, log = experiment(study, study.airframe, 0)
+    gains = autotune(log, log.flown)
+    assert gains.Kp_i[0, 1] == gains.Kp_i[1, 0] == 0
+    assert 2.0 <= gains.Kp_o[0, 0] <= 6.5
+    assert (np.diag(gains.Kp_i) > 0).all()
+
+
+def test_the_autotuned_set_is_in_every_study():
+    assert all(AUTOTUNE in study.methods() for study in studies().values())
+
+
+def test_a_benchmark_and_a_report_of_its_own(tmp_path):
+    found = reproduce("numerical-example", tmp_path)
+    assert found.report == tmp_path / "numerical-example.html"
+    assert set(found.figures) == {"numerical-example"}

@@ -1,0 +1,307 @@
+"""The certificate against plants whose closed loop is known exactly."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from mimopilot.sitl.physics.airframe import Frame, load_airframe
+from mimopilot.tuning.analysis.certificate import CERTIFIED, NOT_CERTIFIED, THIN, UNSTABLE, certify, large_again
+from mimopilot.tuning.design.cascade import certify_from_log, tune
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.plant.frequency_response import PlantResponse
+from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.reference_model import second_order
+from mimopilot.tuning.spec import load_spec
+from mimopilot.tuning.thresholds import Thresholds
+
+from tests.tuning.truth import TS, Truth, experiment
+
+MODELS = ((second_order(20, 0.4, 0, TS),) * 2, (second_order(10, 0.7, 0, TS),) * 2)
+#: Amplitude of the excitation: ANT-R hovers at 14 % of its thrust, where a larger one is no longer linear.
+PLANTS = {"adam0": 0.15, "adam0_perturbed": 0.15, "adam0_boom": 0.15, "antr": 0.05, "px4_sih": 0.15}
+
+
+def exact(plant, omega):
+    """A response without error."""
+    G = plant.frequency_response(omega)
+    empty = np.zeros((len(omega), 6, 6)), np.zeros((len(omega), 2, 2))
+    return PlantResponse(omega, G[:, :2], G[:, 2:], *empty, np.ones((len(omega), 2)), TS)
+
+
+@pytest.fixture(scope="module")
+def flights():
+    found = {}
+    for name, amplitude in PLANTS.items():
+        log = experiment(name, amplitude=amplitude)
+        found[name] = (log, Measured(log), Truth.of(load_airframe(name).airframe))
+    return found
+
+
+def test_the_measured_response_is_that_of_the_plant(flights):
+    for _, measured, truth in flights.values():
+        plant = measured.response
+        band = (plant.omega > 4) & (plant.omega < 60)
+        true = exact(truth.plant, plant.omega)
+        for got, wanted in ((plant.G_i, true.G_i), (plant.G_o, true.G_o)):
+            error = np.linalg.norm(got - wanted, axis=(1, 2)) / np.linalg.norm(wanted, axis=(1, 2))
+            assert np.median(error[band]) < 0.03
+        # What is claimed of its error is what it is, in the part that noise decides.
+        noisy = plant.known() & (plant.omega > 60)
+        error = np.linalg.norm(plant.G_i - true.G_i, axis=(1, 2)) / np.linalg.norm(plant.deviation(), axis=(1, 2))
+        assert 0.4 < np.sqrt(np.mean(error[noisy] ** 2)) < 1.6
+
+
+def random_set(base, rng):
+    """A set of another loop gain, another balance of its terms, and other coupling."""
+    scale = {code: np.exp(rng.uniform(-1.2, 1.3)) for code in ("AP", "RP", "RI", "RD")}
+    changes = {}
+    for code, value in base.elements().items():
+        if code[:2] not in scale or code.endswith("Y"):
+            continue
+        diagonal = base.elements()[code[:4] + code[3]]
+        if code[3] == code[4]:
+            changes[code] = float(value * scale[code[:2]] * np.exp(0.25 * rng.normal()))
+        else:
+            changes[code] = float(value + 0.25 * scale[code[:2]] * abs(diagonal) * rng.normal())
+    return base.with_elements(changes)
+
+
+def judged(measured, truth, count, rng):
+    """Verdicts of sets with good margins, and of unstable ones, by the true loop."""
+    bases = (measured.experiment.flown, tune(measured.experiment))
+    good, unstable = [], []
+    while len(good) < count or len(unstable) < count:
+        gains = random_set(bases[rng.integers(2)], rng)
+        if truth.spectral_radius(gains) >= 1:
+            kind = unstable
+        else:
+            Ms, phase = truth.margins(gains, 500)
+            kind = good if Ms < 1.6 and phase >= 43 else None
+        if kind is not None and len(kind) < count:
+            kind.append(certify(gains, measured.response, *MODELS, model=lambda: measured.model).verdict)
+    return good, unstable
+
+
+def test_no_unstable_set_passes_and_nearly_all_good_ones_are_certified(flights):
+    rng = np.random.default_rng(7)
+    good, unstable = [], []
+    for _, measured, truth in flights.values():
+        one, other = judged(measured, truth, 12, rng)
+        good, unstable = good + one, unstable + other
+    assert not {CERTIFIED, THIN} & set(unstable)
+    assert unstable.count(UNSTABLE) >= 0.9 * len(unstable)
+    assert good.count(CERTIFIED) >= 0.95 * len(good)
+
+
+@pytest.fixture(scope="module", params=[(25.0, 0.4), (25.0, 0.8), (12.0, 0.4)], ids=str)
+def flexible(request):
+    frequency, gain = request.param
+    frame = Frame(frequency_hz=frequency, damping=0.02, gain=gain)
+    airframe = load_airframe("adam0").airframe.model_copy(update={"frame": frame})
+    return frequency, Measured(experiment("adam0", airframe=airframe)), Truth.of(airframe)
+
+
+def test_a_mode_of_the_frame_is_seen_and_what_it_makes_thin_or_unstable_is_not_certified(flexible):
+    frequency, measured, truth = flexible
+    omega = 2 * np.pi * frequency
+    near = np.abs(measured.response.omega / omega - 1) < 0.05
+    true = exact(truth.plant, measured.response.omega[near]).G_i
+    error = np.linalg.norm(measured.response.G_i[near] - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
+    assert np.median(error) < 0.25
+    rng, base, named = np.random.default_rng(1), load_airframe("adam0").default_gains(), 0
+    for _ in range(40):
+        gains = random_set(base, rng)
+        found = certify(gains, measured.response, *MODELS, model=lambda: measured.model)
+        if truth.spectral_radius(gains) >= 1:
+            assert found.verdict in (UNSTABLE, NOT_CERTIFIED)
+        elif truth.margins(gains, 500)[0] > 2.6:
+            assert found.verdict not in (CERTIFIED, THIN)
+        again = large_again(gains, measured.response)
+        named += again is not None and abs(again[0] / omega - 1) < 0.05
+    assert named >= 10
+
+
+def test_without_excitation_at_a_mode_its_neighbourhood_is_needed_and_noise_is_no_mode(flights):
+    _, measured, _ = flights["adam0"]
+    assert large_again(load_airframe("adam0").default_gains(), measured.response) is None
+
+
+@pytest.mark.parametrize("name", ["y_i", "y_o"])
+def test_a_log_with_roll_in_place_of_pitch_is_refused(flights, name):
+    log = flights["adam0"][0]
+    twice = dataclasses.replace(log, **{name: np.repeat(getattr(log, name)[:, :1], 2, axis=1)})
+    with pytest.raises(TuningError, match="are one signal"):
+        certify_from_log(twice, log.flown)
+
+
+def test_the_response_between_its_frequencies_is_that_of_a_body(flights):
+    """Exact for a body with damping, and near for a vehicle with motors."""
+    omega = np.arange(1.3, 100.0, 1.3)
+    K = np.array([[80.0, -8.0], [-7.0, 90.0]])
+    empty = np.zeros((len(omega), 6, 6)), np.zeros((len(omega), 2, 2))
+    s = 1j * omega[:, None, None]
+    body = PlantResponse(omega, K / (s + 1.5), K / (s + 1.5) / s, *empty, np.ones((len(omega), 2)), TS).interpolated(
+        0.05
+    )
+    s = 1j * body.omega[:, None, None]
+    assert body.G_i == pytest.approx(K / (s + 1.5), rel=1e-12)
+    assert body.G_o == pytest.approx(K / (s + 1.5) / s, rel=1e-12)
+    assert np.max(body.omega[1:] / body.omega[:-1]) < 1.05 + 1e-9
+    assert set(omega) <= set(body.omega)
+    plant = flights["adam0"][2].plant
+    between = exact(plant, omega).interpolated(0.05)
+    true = exact(plant, between.omega).G_i
+    error = np.linalg.norm(between.G_i - true, axis=(1, 2)) / np.linalg.norm(true, axis=(1, 2))
+    assert error.max() < 0.02
+
+
+def test_every_margin_is_the_true_one(flights):
+    """Ms and phase against the exact loop, each within its own error and the motors' square law."""
+    for log, measured, truth in flights.values():
+        for gains in (log.flown, tune(log)):
+            figures = certify(gains, measured.response, *MODELS).figures
+            Ms, phase = truth.margins(gains)
+            assert figures["Ms"] == pytest.approx(Ms, rel=0.06)
+            assert min(figures["phase_margin_deg"].values()) == pytest.approx(phase, abs=4)
+
+
+def test_the_errors_of_the_peak_and_of_the_phase_are_their_spread_over_logs():
+    truth = Truth.of(load_airframe("px4_sih").airframe)
+    gains = load_airframe("px4_sih").default_gains()
+    found = [certify(gains, Measured(experiment("px4_sih", seed=s)).response, *MODELS).figures for s in range(12)]
+    phases = [(f["phase_margin_deg"]["pitch"], f["phase_margin_error_deg"]["pitch"]) for f in found]
+    peaks = [(f["Ms"], f["Ms_error"]) for f in found]
+    for pairs, true in ((peaks, truth.margins(gains)[0]), (phases, np.mean([phase for phase, _ in phases]))):
+        values, errors = np.array(pairs).T
+        spread = np.sqrt(np.mean((values - true) ** 2))
+        # Two standard errors: with 12 logs their estimate is good to a factor of two.
+        assert 0.5 * spread < np.mean(errors) < 5 * spread
+
+
+def test_each_verdict_is_given_with_its_reason(flights):
+    _, measured, truth = flights["adam0"]
+    plant = measured.response
+    base = load_airframe("adam0").default_gains()
+    assert certify(base, plant, *MODELS).verdict == CERTIFIED
+    reversed_axis = base.with_elements({"RP_PP": -0.15})
+    assert truth.spectral_radius(reversed_axis) > 1
+    found = certify(reversed_axis, plant, *MODELS)
+    assert (found.verdict, "rate loop" in found.reason) == (UNSTABLE, True)
+    for factor, verdict, words in ((1.75, THIN, "is above 1.8"), (2.6, NOT_CERTIFIED, "the margin is too thin")):
+        outer = base.with_elements({"AP_RR": 6.5 * factor, "AP_PP": 6.5 * factor})
+        assert truth.spectral_radius(outer) < 1
+        found = certify(outer, plant, *MODELS)
+        assert found.verdict == verdict
+        assert words in found.reason
+    narrow = plant.at(plant.omega < 12)
+    found = certify(base, narrow, *MODELS)
+    assert found.verdict == NOT_CERTIFIED
+    assert "excitation ends at" in found.reason
+    runaway = base.with_elements({"RI_RP": 0.3, "RI_PR": -0.05})
+    assert "Ki_i through the measured plant" in certify(runaway, plant, *MODELS).reason
+    late = plant.at(plant.omega > 9)
+    assert "excitation begins at 9" in certify(base, late, *MODELS).reason
+
+
+def test_a_controller_without_an_integral_is_judged_as_well(flights):
+    for _, measured, truth in flights.values():
+        gains = dataclasses.replace(measured.experiment.flown, Ki_i=np.zeros((2, 2)))
+        assert truth.spectral_radius(gains) == pytest.approx(1.0)  # the integrals stand still
+        assert certify(gains, measured.response, *MODELS).verdict in (CERTIFIED, THIN)
+        one = dataclasses.replace(gains, Ki_i=np.diag([0.05, 0.0]))
+        assert certify(one, measured.response, *MODELS).verdict in (CERTIFIED, THIN, NOT_CERTIFIED)
+        bad = dataclasses.replace(gains, Kp_i=gains.Kp_i * np.array([[1.0], [-1.0]]))
+        assert certify(bad, measured.response, *MODELS).verdict not in (CERTIFIED, THIN)
+        assert certify(bad, measured.response, *MODELS, model=lambda m=measured: m.model).verdict == UNSTABLE
+
+
+def test_thresholds_are_settable_stored_and_bound(flights):
+    log, measured, _ = flights["adam0"]
+    gains = log.flown
+    strict = certify_from_log(log, gains, load_spec(certificate={"Ms": 1.2, "phase_deg": 60.0}))
+    assert strict.verdict()[0] == THIN
+    assert strict.certificate["thresholds"]["Ms"] == 1.2
+    loose = Thresholds(thin_Ms=9.0, thin_phase_deg=5.0)
+    outer = gains.with_elements({"AP_RR": 16.0, "AP_PP": 16.0})
+    assert certify(outer, measured.response, *MODELS).verdict == NOT_CERTIFIED
+    assert certify(outer, measured.response, *MODELS, thresholds=loose).verdict == THIN
+    with pytest.raises(TuningError, match="thin_Ms must be at least Ms"):
+        load_spec(certificate={"Ms": 3.0})
+    edited = {**strict.certificate, "thresholds": {**strict.certificate["thresholds"], "Ms": 1.8}}
+    assert dataclasses.replace(strict, certificate=edited).verdict()[0] == "void"
+
+
+def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_open(flights):
+    _, measured, _ = flights["adam0"]
+    base = measured.experiment.flown
+    response, model = measured.response, measured.model
+    late = response.at(response.omega > 9)
+    assert certify(base, late, *MODELS).verdict == NOT_CERTIFIED
+    assert certify(base, late, *MODELS, model=lambda: model).verdict == NOT_CERTIFIED
+    growing = dataclasses.replace(model, B=-model.B)
+    assert certify(base, late, *MODELS, model=lambda: growing).verdict == UNSTABLE
+    assert certify(base, response, *MODELS, model=lambda: growing).verdict == CERTIFIED
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        lambda g: dataclasses.replace(g, Kp_o=g.Kp_o * 1.0001),
+        lambda g: dataclasses.replace(g, Ts=0.0041),
+        lambda g: dataclasses.replace(g, derivative_cutoff_hz=31.0),
+        lambda g: dataclasses.replace(g, moment_scale=(2.5, 2.5, 0.3)),
+        lambda g: dataclasses.replace(g, limits=dataclasses.replace(g.limits, moment_max=(0.9, 1.0, 1.0))),
+        lambda g: dataclasses.replace(g, yaw=dataclasses.replace(g.yaw, Kp_i=0.51)),
+        *(
+            lambda g, name=name, value=value: dataclasses.replace(g, certificate={**g.certificate, name: value})
+            for name, value in (
+                ("verdict", "stable, thin margin"),
+                ("reason", "none"),
+                ("band", [0.1, 700.0]),
+                ("log_sha256", "0"),
+                ("figures", {}),
+            )
+        ),
+        lambda g: dataclasses.replace(g, certificate={k: v for k, v in g.certificate.items() if k != "seal"}),
+    ],
+)
+def test_whatever_is_edited_voids_the_certificate(flights, tmp_path, edit):
+    from mimopilot.tuning.gains import load_gains
+
+    log = flights["adam0"][0]
+    examined = certify_from_log(log, log.flown)
+    examined.save(tmp_path / "x.gains.toml")
+    loaded = load_gains(tmp_path / "x.gains.toml")
+    assert loaded.verdict()[0] == CERTIFIED
+    edit(loaded).save(tmp_path / "y.gains.toml")
+    assert load_gains(tmp_path / "y.gains.toml").verdict()[0] == "void"
+
+
+def test_a_log_of_another_unit_of_torque_does_not_certify(flights):
+    log = flights["adam0"][0]
+    other_unit = dataclasses.replace(log.flown, moment_scale=(25.0, 25.0, 2.7))
+    with pytest.raises(TuningError, match=r"stands for 2\.546, 2\.546 N m .* in the gains for 25, 25"):
+        certify_from_log(log, other_unit)
+    assert dataclasses.replace(log.flown, certificate=None).verdict()[0] == "none"
+
+
+def test_margins_are_where_the_loop_becomes_unstable(flights):
+    _, measured, _ = flights["adam0"]
+    airframe = load_airframe("adam0").airframe
+    gains = measured.experiment.flown.with_elements({"RP_RR": 0.5, "RP_PP": 0.5, "AP_RR": 4.0, "AP_PP": 4.0})
+    figures = certify(gains, measured.response, *MODELS).figures
+    # All axes late at once: no axis has less than it has by itself with the other one on time.
+    late = min(figures["delay_margin_ms"].values()) / 1e3 / TS
+    assert Truth.of(airframe, int(0.8 * late)).spectral_radius(gains) < 1
+    assert Truth.of(airframe, int(1.25 * late) + 1).spectral_radius(gains) > 1
+    # The gain margin is one that can be vouched for: the truth may be larger.
+    assert set(figures["gain_margin"].values()) <= {"exact", "at least"}
+    margin = 10 ** (figures["gain_margin_db"]["roll"] / 20)
+    assert margin > 1.5
+    truth = Truth.of(airframe)
+    for factor in (0.95 * margin, 1 / margin):
+        codes = [f"{code}_R{axis}" for code in ("RP", "RI", "RD") for axis in "RP"]
+        assert truth.spectral_radius(gains.with_elements({c: gains.elements()[c] * factor for c in codes})) < 1
+    if figures["gain_margin"]["roll"] == "exact":
+        beyond = {c: gains.elements()[c] * 1.1 * margin for c in codes}
+        assert truth.spectral_radius(gains.with_elements(beyond)) > 1

@@ -1,0 +1,71 @@
+import mimopilot.tuning.design.advise as advisor
+import numpy as np
+import pytest
+from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.flight.scenario import doublet
+from mimopilot.sitl.flight.simulator import fly
+from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.tuning.analysis.certificate import CERTIFIED
+from mimopilot.tuning.design.advise import Doublet, advise, predict
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.plant.frequency_response import plant_response
+from mimopilot.tuning.spec import TuningSpec
+
+from tests.tuning.analysis.test_certificate import experiment
+from tests.tuning.truth import thesis
+
+TS = 0.004
+
+
+@pytest.fixture(scope="module")
+def log():
+    return experiment("adam0")
+
+
+def rms(signal):
+    return float(np.sqrt(np.mean(signal**2)))
+
+
+def test_the_predicted_doublet_is_the_flown_one(log):
+    airframe = load_airframe("adam0").airframe
+    plant = plant_response(log, log.u_bar, 300.0)
+    spec = thesis()
+    for gains in (log.flown, tune(log, thesis())):
+        follow, offaxis, effort = predict(gains, plant, spec, Doublet(amplitude_deg=10.0, period_s=0.8))
+        for column, axis in enumerate(("roll", "pitch")):
+            task = doublet(axis, np.radians(10.0), 0.8, TS, tail=0.8)
+            flight = fly(airframe, Autopilot(airframe, gains), task, noise=False)
+            rows = slice(task.window[0], task.window[0] + round(1.6 / TS))
+            model = spec.models("outer", TS)[column].response(task.setpoint[:, column])
+            angles, moments = flight.truth["attitude"][rows], flight.record["moment"][rows, :2]
+            away = np.degrees(angles[:, column] - model[rows])
+            assert follow[column] == pytest.approx(rms(away), rel=0.1)
+            # The edges of the moment are faster than what the log knows.
+            assert effort[column] == pytest.approx(np.sqrt(2) * rms(moments), rel=0.15)
+            # Off-axis is small: the response is known to a few hundredths of a degree.
+            assert offaxis[column] == pytest.approx(rms(np.degrees(angles[:, 1 - column])), rel=0.15, abs=0.06)
+
+
+def test_the_recommended_model_follows_better_than_the_thesis_one_and_is_certified(log, monkeypatch):
+    monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 30.0))
+    monkeypatch.setattr(advisor, "DAMPINGS", (0.4, 1.0))
+    monkeypatch.setattr(advisor, "DELAYS", (0, 2))
+    found = advise(log, TuningSpec(derivative_cutoff_hz=30.0))
+    candidates, best = found.candidates, found.recommended
+    assert found.zero is None
+    assert len(candidates) == 8
+    thesis = next(c for c in candidates if c.inner == (20.0, 0.4, 0))
+    assert best.verdict == CERTIFIED
+    assert np.hypot(*best.follow_deg) < 0.6 * np.hypot(*thesis.follow_deg)
+    for other in candidates:
+        if other.verdict == CERTIFIED and np.hypot(*other.follow_deg) <= np.hypot(*best.follow_deg):
+            assert np.hypot(*other.effort) >= np.hypot(*best.effort)
+
+
+def test_without_a_certified_candidate_nothing_is_recommended(log, monkeypatch):
+    monkeypatch.setattr(advisor, "BANDWIDTHS", (60.0,))
+    monkeypatch.setattr(advisor, "DAMPINGS", (0.2,))
+    monkeypatch.setattr(advisor, "DELAYS", (0,))
+    with pytest.raises(TuningError, match="none of 1 rate loops is certified"):
+        advise(log, TuningSpec(derivative_cutoff_hz=30.0))

@@ -1,0 +1,85 @@
+"""Non-minimum-phase zeros against plants whose zeros are known."""
+
+import dataclasses
+
+import mimopilot.tuning.design.advise as advisor
+import numpy as np
+import pytest
+from mimopilot.tuning.design.advise import advise
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
+from mimopilot.tuning.excitation import prbs
+from mimopilot.tuning.reference_model import second_order
+from mimopilot.tuning.spec import TuningSpec
+from scipy.signal import cont2discrete, lfilter
+
+from tests.tuning.analysis.test_certificate import experiment
+from tests.tuning.truth import thesis
+
+TS = 0.004
+START = second_order(15, 0.7, 0, TS)
+
+
+def closed_loop_data(zero, noise, seed=1, n=8000):
+    """u, y and the injected moment of a rate plant 150 (1 - s/zero)/((s + 1.2)(0.05 s + 1)) under P = 0.02."""
+    numerator = [150.0] if zero is None else [-150.0 / zero, 150.0]
+    b, a, _ = cont2discrete((numerator, np.polymul([1.0, 1.2], [0.05, 1.0])), TS)
+    rng = np.random.default_rng(seed)
+    u_bar = prbs(n, 0.15, 16, 64, rng)
+    closed = np.polyadd(a, 0.02 * b[0])
+    y = lfilter(b[0], closed, u_bar) + lfilter(a, closed, noise * rng.standard_normal(n))
+    return u_bar - 0.02 * y, y, u_bar[:, None]
+
+
+@pytest.mark.parametrize("zero", [15.0, 30.0, 60.0])
+def test_a_known_zero_is_found_in_closed_loop_with_and_without_noise(zero):
+    for noise, accuracy in ((0.0, 0.02), (0.1, 0.08)):
+        found = flexible_model(*closed_loop_data(zero, noise), START)
+        assert found.nonminimum_phase_zeros() == [pytest.approx(zero, rel=accuracy)]
+        assert np.sum(found.model.num) / np.sum(found.model.den) == pytest.approx(1.0, rel=1e-9)
+        assert found.misfit < 1e-4
+
+
+def test_a_minimum_phase_plant_has_none_and_neither_has_the_vehicle():
+    assert flexible_model(*closed_loop_data(None, 0.02), START).nonminimum_phase_zeros() == []
+    log = experiment("adam0")
+    models = [flexible_model(log.u[:, i], log.y_i[:, i], log.u_bar, START) for i in range(2)]
+    assert slowest_zero(models) is None
+
+
+def test_data_that_are_short_or_dead_are_refused():
+    u, y, w = closed_loop_data(30.0, 0.0)
+    with pytest.raises(TuningError, match="too short"):
+        flexible_model(u[:500], y[:500], w[:500], START)
+    with pytest.raises(TuningError, match="does not reach the output"):
+        flexible_model(u, 0 * y, w, START)
+
+
+def test_the_advisor_asks_for_nothing_faster_than_half_of_the_zero(monkeypatch):
+    monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 40.0))
+    monkeypatch.setattr(advisor, "DAMPINGS", (1.0,))
+    monkeypatch.setattr(advisor, "DELAYS", (0,))
+    log = experiment("adam0")
+    spec = TuningSpec(derivative_cutoff_hz=30.0)
+    assert [c.inner[0] for c in advise(log, spec).candidates] == [20.0, 40.0]
+    monkeypatch.setattr(advisor, "slowest_zero", lambda models: 50.0)
+    found = advise(log, spec)
+    assert found.zero == 50.0
+    assert [c.inner[0] for c in found.candidates] == [20.0]
+    monkeypatch.setattr(advisor, "slowest_zero", lambda models: 20.0)
+    with pytest.raises(TuningError, match=r"zero at 20\.0 rad/s, too slow"):
+        advise(log, spec)
+
+
+def test_the_advisor_tries_lower_derivative_filters_than_the_flown_one_unless_told(monkeypatch):
+    monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0,))
+    monkeypatch.setattr(advisor, "DAMPINGS", (1.0,))
+    monkeypatch.setattr(advisor, "DELAYS", (0,))
+    log = experiment("adam0")
+    assert [c.cutoff_hz for c in advise(log, thesis()).candidates] == [30.0, 10.0, 5.0]
+    eight = dataclasses.replace(log, flown=dataclasses.replace(log.flown, derivative_cutoff_hz=8.0))
+    found = advise(eight, thesis())
+    assert [c.cutoff_hz for c in found.candidates] == [8.0, 5.0]
+    for c in found.candidates:
+        assert c.gains.derivative_cutoff_hz == c.cutoff_hz
+        assert c.delta[0] == c.gains.certificate["figures"]["delta"]

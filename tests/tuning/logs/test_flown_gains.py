@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+from mimopilot.tuning.logs.flown_gains import flown_gains
+
+PX4 = {
+    **{f"MC_{axis}_P": 6.5 for axis in ("ROLL", "PITCH")},
+    "MC_YAW_P": 2.8,
+    **{
+        f"MC_{axis}RATE_{term}": value
+        for axis in ("ROLL", "PITCH")
+        for term, value in (("P", 0.15), ("I", 0.2), ("D", 0.003), ("FF", 0.0), ("K", 2.0))
+    },
+    **{f"MC_YAWRATE_{term}": value for term, value in (("P", 0.2), ("I", 0.1), ("D", 0.0), ("FF", 0.0))},
+    "MC_ROLLRATE_MAX": 220.0,
+    "MC_PITCHRATE_MAX": 220.0,
+    "MC_YAWRATE_MAX": 200.0,
+    "MC_RR_INT_LIM": 0.3,
+    "MC_PR_INT_LIM": 0.3,
+    "MC_YR_INT_LIM": 0.3,
+    "IMU_DGYRO_CUTOFF": 30.0,
+}
+
+
+def test_stock_px4_parameters_are_read_with_their_units_and_overall_factor():
+    gains = flown_gains(PX4, 0.004)
+    assert gains is not None
+    assert gains.Kp_i == pytest.approx(np.eye(2) * 0.30)
+    assert gains.Kd_i == pytest.approx(np.eye(2) * 0.006)
+    assert gains.Kp_o == pytest.approx(np.eye(2) * 6.5)
+    assert gains.yaw.Kp_i == 0.2
+    assert gains.limits.rate_max == pytest.approx((np.radians(220), np.radians(220), np.radians(200)))
+    assert gains.derivative_cutoff_hz == 30.0
+    assert gains.moment_scale is None
+
+
+def test_our_own_parameters_come_first():
+    ours = {"MIMO_RP_RR": 0.12, "MIMO_RP_RP": 0.01, "MIMO_D_POLE": 0.5, "MIMO_RMAX_R": 7.0}
+    gains = flown_gains(PX4 | ours | {f"MIMO_SCALE_{a}": 2.5 for a in "RPY"}, 0.004)
+    assert gains is not None
+    assert gains.Kp_i[0] == pytest.approx([0.12, 0.01])
+    assert gains.Kp_i[1, 1] == pytest.approx(0.30)
+    assert gains.limits.rate_max[0] == 7.0
+    assert gains.derivative_pole == pytest.approx(0.5, rel=1e-5)
+    assert gains.moment_scale == (2.5, 2.5, 2.5)
+
+
+@pytest.mark.parametrize("missing", ["MC_ROLLRATE_P", "MC_YAW_P", "MC_RR_INT_LIM", "MC_ROLLRATE_MAX"])
+def test_parameters_that_do_not_describe_a_whole_controller_give_nothing(missing):
+    assert flown_gains({k: v for k, v in PX4.items() if k != missing}, 0.004) is None

@@ -1,0 +1,72 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.reference_model import second_order
+
+TS = 1 / 250
+
+#: omega, damping, delay, numerator and denominator as the thesis prints them.
+PRINTED = [
+    (20, 0.4, 0, ("0.003131", "0.003065"), ("-1.932", "0.9380")),
+    (10, 0.7, 0, ("0.0007852", "0.0007706"), ("-1.9440", "0.9455")),
+    (15, 0.33, 0, ("0.001776", "0.001753"), ("-1.958", "0.9612")),
+    (10, 0.8, 0, ("0.0007831", "0.0007666"), ("-1.936", "0.938")),
+    (30, 0.3, 1, ("0.007022", "0.006855"), ("-1.917", "0.9305")),
+    (20, 0.8, 1, ("0.003066", "0.002938"), ("-1.874", "0.8799")),
+]
+
+
+@pytest.mark.parametrize(("omega", "zeta", "delay", "num", "den"), PRINTED)
+def test_second_order_models_have_the_printed_digits(omega, zeta, delay, num, den):
+    model = second_order(omega, zeta, delay, TS)
+    assert model.delay == delay
+    assert model.den[0] == 1
+    for value, text in zip((*model.num, *model.den[1:]), (*num, *den), strict=True):
+        # One unit in the last printed digit: the thesis truncates some entries and rounds others.
+        decimals = len(text.split(".")[1])
+        assert abs(value - float(text)) < 10.0**-decimals
+
+
+@given(omega=st.floats(1, 100), zeta=st.floats(0.1, 2), delay=st.integers(0, 5))
+def test_a_model_has_unit_gain_and_its_delay(omega, zeta, delay):
+    model = second_order(omega, zeta, delay, TS)
+    assert sum(model.num) / sum(model.den) == pytest.approx(1, rel=1e-5)
+    step = model.response(np.ones(20))
+    assert (step[: delay + 1] == 0).all()
+    assert step[delay + 1] > 0
+
+
+def test_the_step_response_is_that_of_the_continuous_model():
+    omega, zeta = 20.0, 0.4
+    t = TS * np.arange(200)
+    damped = omega * math.sqrt(1 - zeta**2)
+    exact = 1 - np.exp(-zeta * omega * t) * (np.cos(damped * t) + zeta * omega / damped * np.sin(damped * t))
+    # Zero-order hold is exact for a step.
+    assert second_order(omega, zeta, 0, TS).response(np.ones(200)) == pytest.approx(exact, abs=1e-12)
+
+
+def test_the_frequency_response_is_the_transform_of_the_impulse_response():
+    model = second_order(20, 0.4, 2, TS)
+    impulse = model.response(np.eye(1, 4096)[0])
+    omega = np.array([1.0, 20.0, 100.0])
+    transform = [np.sum(impulse * np.exp(-1j * w * TS * np.arange(4096))) for w in omega]
+    assert model.frequency_response(omega) == pytest.approx(np.array(transform), abs=1e-9)
+
+
+def test_the_transient_is_below_one_percent_after_settling():
+    model = second_order(10, 0.7, 3, TS)
+    impulse = np.abs(model.response(np.eye(1, 2000)[0]))
+    assert impulse[model.settling_samples() + 1 :].max() < 0.011 * impulse.max()
+    assert impulse[model.settling_samples() // 2 :].max() > 0.02 * impulse.max()
+
+
+@pytest.mark.parametrize(
+    ("omega", "zeta", "delay"), [(0, 0.4, 0), (20, -1, 0), (20, 0.4, -1), (1e4, 0.4, 0), (math.nan, 1, 0)]
+)
+def test_an_impossible_model_is_refused(omega, zeta, delay):
+    with pytest.raises(TuningError, match="reference model"):
+        second_order(omega, zeta, delay, TS)

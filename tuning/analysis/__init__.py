@@ -1,0 +1,1 @@
+"""The closed loop of a gain set: transfers, margins, certificate, predicted doublets."""

@@ -1,0 +1,103 @@
+"""A doublet predicted from a log: the flown difference equation around the plant and the motors that the log gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from mimopilot.tuning.gain_stack import GainStack
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.motors import Motors, rotor_lag
+from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.spec import Manoeuvre
+from mimopilot.tuning.statespace import StateSpace
+from numpy.typing import NDArray
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class DoubletModel:
+    """A doublet around an identified plant.
+
+    Attributes
+    ----------
+    plant : StateSpace
+        From moment to body rates.
+    trim : (2,) array
+        Moment that holds the vehicle level.
+    setpoint : (N,) array, rad
+        Of the axis that moves; the other's is zero.
+    motors : Motors or None
+        Behind the moment; None: it is given whatever it is.
+    """
+
+    plant: StateSpace
+    trim: Signal
+    setpoint: Signal
+    motors: Motors | None = None
+
+    def fly(self, stack: GainStack, soft: float = 0.0) -> tuple[Signal, Signal]:
+        """Doublets on roll and on pitch under each of several gain sets, without noise.
+
+        Parameters
+        ----------
+        stack : GainStack
+        soft : float
+            Moment over which the anti-windup's switch is drawn out, so that angles depend on gains without a jump.
+
+        Returns
+        -------
+        angles, moments : (2, sets, N, 2) arrays, rad, dimensionless
+            First index: the axis that moves.
+        """
+        from mimopilot.tuning.analysis.compiled_doublet import fly  # takes longer to import than all of the rest
+
+        gains, plant = stack.stacked(), self.plant
+        angles, moments = (np.empty((2, len(gains), len(self.setpoint), 2)) for _ in range(2))
+        matrices = (np.ascontiguousarray(matrix) for matrix in (plant.A, plant.B, plant.C))
+        limited = (gains, stack.limits, stack.Ts, stack.derivative_pole, soft)
+        fly(*matrices, self.trim, self._motors, self.setpoint, *limited, angles, moments)
+        return angles, moments
+
+    @cached_property
+    def _motors(self) -> tuple[Signal, Signal, Signal, float]:
+        """What the compiled doublet takes."""
+        if self.motors is None:
+            return np.empty((0, 2)), np.empty((2, 0)), np.empty(0), 0.0
+        lag = rotor_lag(self.plant)
+        inverse = np.ascontiguousarray(np.linalg.pinv(self.motors.mixer))
+        return self.motors.mixer, inverse, self.motors.hover, float(np.exp(-self.plant.Ts / lag)) if lag else 0.0
+
+
+def doublet_model(measured: Measured, manoeuvre: Manoeuvre) -> DoubletModel:
+    """The manoeuvre around the plant that was identified from an experiment.
+
+    Parameters
+    ----------
+    measured : Measured
+    manoeuvre : Manoeuvre
+
+    Raises
+    ------
+    TuningError
+        When no model is near the measured response.
+    """
+    experiment, plant = measured.experiment, measured.identified.model.plant
+    half = round(manoeuvre.period_s / 2 / experiment.Ts)
+    height = np.radians(manoeuvre.amplitude_deg) * np.ones(half)
+    u = np.concatenate([experiment.u[start:stop] for start, stop in experiment.segments])
+    return DoubletModel(plant, np.median(u, axis=0), np.concatenate([height, -height]), experiment.motors)
+
+
+def effort(gains: Gains, model: DoubletModel) -> tuple[float, float]:
+    """Predicted RMS of both moments together over the roll and over the pitch doublet."""
+    roll, pitch = moment_rms(model.fly(GainStack.of(gains))[1])[:, 0]
+    return float(roll), float(pitch)
+
+
+def moment_rms(moments: Signal) -> Signal:
+    """RMS of both moments (..., N, 2) together over the N samples, (...)."""
+    power: Signal = np.sqrt(np.mean(np.sum(moments**2, axis=-1), axis=-1))
+    return power

@@ -1,0 +1,110 @@
+"""Margins of a measured loop: gain, phase and delay of one axis, and those of all axes at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from mimopilot.tuning.analysis.closed_loop import CascadeLoop
+from numpy.typing import NDArray
+
+AXES = ("roll", "pitch")
+
+Complex = NDArray[np.complex128]
+Signal = NDArray[np.float64]
+
+
+def sensitivity(loop: CascadeLoop) -> Complex:
+    """S = (I + L_u)^-1 at the plant's input, (K, 2, 2)."""
+    S: Complex = np.linalg.inv(np.eye(2) + loop.L_u).astype(np.complex128)
+    return S
+
+
+def peak(S: Complex) -> float:
+    """Ms: the largest singular value of a sensitivity (K, 2, 2) over all frequencies."""
+    return float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
+
+
+def disk_margin(S: Complex) -> float:
+    """Largest radius of the disk about 1 in which complex factors on both channels may lie together: 1 over the peak of
+    S - I/2 (P. Seiler, A. Packard, P. Gahinet, "An introduction to disk margins", IEEE Control Systems 40, 2020).
+    """
+    return 1 / peak(S - np.eye(2) / 2)
+
+
+def simultaneous(disk: float) -> tuple[float, float]:
+    """Gain (dB, up or down) and phase (deg) that a disk margin allows on all axes at once."""
+    ratio = (2 + disk) / (2 - disk) if disk < 2 else np.inf
+    return float(20 * np.log10(ratio)), float(2 * np.degrees(np.arctan(disk / 2)))
+
+
+def axis_loops(S: Complex) -> Complex:
+    """The loop of each axis with the other one closed, 1 / S_ii - 1, (2, K)."""
+    loops: Complex = 1 / np.stack([S[:, 0, 0], S[:, 1, 1]]) - 1
+    return loops
+
+
+def phase_margin(loop: Complex, omega: Signal) -> tuple[float, float]:
+    """Smallest phase margin (deg) and smallest delay margin (ms) of one loop; infinite where its gain is never 1.
+
+    Parameters
+    ----------
+    loop : (K,) array
+    omega : (K,) array, rad/s
+    """
+    size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
+    at, place = _crossings(size)
+    if not len(at):
+        return np.inf, np.inf
+    crossing = _between(np.log(omega), at, place)
+    lag = np.degrees(_between(phase, at, place)) + 180.0
+    delays = np.radians(lag % 360.0) / np.exp(crossing) * 1e3
+    return float(np.min(np.abs((lag + 180.0) % 360.0 - 180.0))), float(np.min(delays))
+
+
+def gain_margin(loop: Complex) -> float:
+    """Smallest factor, up or down, that makes one loop (K,) unstable, dB; infinite where its phase is never 180 deg."""
+    at, place = _crossings(loop.imag)
+    if not len(at):
+        return np.inf
+    size = _between(np.log(np.abs(loop)), at, place)
+    opposite = _between(loop.real, at, place) < 0
+    return float(np.min(np.abs(20 / np.log(10) * size[opposite]), initial=np.inf))
+
+
+def gain_margins(loops: Complex, above: float) -> dict[str, Any]:
+    """Gain margin of each axis as far as it is known.
+
+    Parameters
+    ----------
+    loops : (2, K) array
+        In the band.
+    above : float
+        What the loop's gain may still reach above it: a margin beyond 1 / above cannot be vouched for.
+
+    Returns
+    -------
+    dict
+        ``gain_margin_db``: by axis, never negative. ``gain_margin``: by axis, what the number is: ``exact``, ``at
+        least`` or ``not known`` (the number is then 0).
+    """
+    ceiling = -20 * float(np.log10(above)) if above > 0 else np.inf
+    margins, kinds = {}, {}
+    for axis, loop in zip(AXES, loops, strict=True):
+        found = gain_margin(loop)
+        if found <= ceiling:
+            margins[axis], kinds[axis] = found, "exact"
+        else:
+            margins[axis], kinds[axis] = (ceiling, "at least") if ceiling > 0 else (0.0, "not known")
+    return {"gain_margin_db": margins, "gain_margin": kinds}
+
+
+def _crossings(values: Signal) -> tuple[NDArray[np.intp], Signal]:
+    """Where values pass zero: index of the sample before, and the share of the way to the next."""
+    at = np.flatnonzero(values[:-1] * values[1:] < 0)
+    return at, values[at] / (values[at] - values[at + 1])
+
+
+def _between(values: Signal, at: NDArray[np.intp], place: Signal) -> Signal:
+    between: Signal = values[at] + place * (values[at + 1] - values[at])
+    return between

@@ -1,0 +1,159 @@
+"""What of an experiment is free of the loop's noise, and so can serve as instrument."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
+from mimopilot.tuning.plant.local_polynomial import local_response
+from mimopilot.tuning.plant.pbsid import pbsid_by_response
+from numpy.typing import NDArray
+from scipy.signal import correlate
+
+AXES = ("roll", "pitch")
+#: Two flights count as one experiment flown twice when their excitations agree to this correlation.
+SAME_EXCITATION = 0.99
+
+Signal = NDArray[np.float64]
+Stretches = list[tuple[slice, list[tuple[int, int]]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Instruments:
+    """What VRFT's instruments are made of.
+
+    Attributes
+    ----------
+    external : (N, 2) array
+        External signal; noise is what it does not explain.
+    lagged : (N, 2) array
+        Signal whose lags are the instruments: `external`, or u.
+    name : str
+        Of what is used, for provenance.
+    y_i, y_o : (N, 2) arrays or None, rad/s, rad
+        Outputs with other noise, whose regressors replace the lags; None: lags are used.
+    """
+
+    external: Signal
+    lagged: Signal
+    name: str
+    y_i: Signal | None = None
+    y_o: Signal | None = None
+
+
+def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = None) -> Instruments:
+    """Instruments of an experiment.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    kind : str
+        ``external``: lags of the external signal. ``u``: lags of u, the thesis' choice; in closed loop it carries
+        fed-back noise. ``model``: the outputs that a model identified by PBSID from the external signal to the outputs
+        gives. ``repeated``: the outputs of a second flight of the same experiment.
+    repeat : Experiment, optional
+        The second flight, row for row the same excitation; see `align`.
+
+    Raises
+    ------
+    TuningError
+        When there is no external signal, the model is not stable, or the second flight is missing or not wanted.
+    """
+    external, name = external_signal(experiment)
+    if (kind == "repeated") != (repeat is not None):
+        raise TuningError(
+            f"instrument {kind!r} {'with' if repeat else 'without'} a second log: a second flight of the same "
+            "experiment goes with instrument 'repeated', and only with it"
+        )
+    if repeat is not None:
+        return Instruments(external, external, f"second experiment {repeat.source}", repeat.y_i, repeat.y_o)
+    if kind == "model":
+        y = np.hstack([experiment.y_i, experiment.y_o])
+        found = local_response(external, y, experiment.Ts, experiment.segments)
+        spread, size = (np.linalg.norm(part, axis=(1, 2)) for part in (found.deviation(), found.response))
+        well = spread < size  # what is worse tells nothing of a model
+        if np.count_nonzero(well) < MIN_FREQUENCIES:
+            raise TuningError(
+                f"{experiment.source}: not excited: the outputs' response is known at {np.count_nonzero(well)} "
+                "frequencies; inject a stronger or longer torque, or leave --instrument model out"
+            )
+        model, _ = pbsid_by_response(
+            external,
+            y,
+            experiment.Ts,
+            found.omega[well],
+            found.response[well],
+            found.deviation()[well],
+            segments=experiment.segments,
+            least_fit=-np.inf,  # an instrument need only resemble the outputs; its strength is judged later
+        )
+        simulated = np.zeros_like(y)
+        for start, stop in experiment.segments:
+            simulated[start:stop] = model.simulate(external[start:stop])
+        name = f"PBSID model of order {model.order}"
+        return Instruments(external, external, name, simulated[:, :2], simulated[:, 2:])
+    if kind == "u":
+        return Instruments(external, experiment.u, "u")
+    return Instruments(external, external, name)
+
+
+def excited_stretches(experiment: Experiment, external: Signal, method: str) -> Stretches:
+    """Which axes are tuned together, and on which samples: SISO uses an axis' own part of the flight.
+
+    Raises
+    ------
+    TuningError
+        When an axis is not excited.
+    """
+    stretches: Stretches = []
+    for axis in range(2):
+        active: list[tuple[int, int]] = []
+        for start, stop in experiment.segments:
+            signal = external[start:stop, axis]
+            moving = start + np.flatnonzero(signal if np.ptp(signal) > 0 else 0 * signal)
+            if len(moving):
+                active.append((int(moving[0]), int(moving[-1]) + 1))
+        if not active:
+            raise TuningError(f"{experiment.source}: not excited on {AXES[axis]}; inject a moment on that axis too")
+        stretches.append((slice(axis, axis + 1), active))
+    return stretches if method == "siso" else [(slice(0, 2), list(experiment.segments))]
+
+
+def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment]:
+    """Two flights of the same experiment, cut to the rows that both have, so that row k of both has one excitation.
+
+    Raises
+    ------
+    TuningError
+        When their periods or their excitations differ.
+    """
+    one, other = external_signal(first)[0], external_signal(second)[0]
+    if abs(first.Ts / second.Ts - 1) > 1e-6:
+        raise TuningError(f"{second.source}: sampled every {second.Ts:g} s, {first.source} every {first.Ts:g} s")
+    likeness = sum(correlate(one[:, i], other[:, i], method="fft") for i in range(2))
+    shift = int(np.argmax(likeness)) - (len(other) - 1)
+    size = np.sqrt(np.sum(one**2) * np.sum(other**2))
+    if np.max(likeness) < SAME_EXCITATION * size:
+        raise TuningError(
+            f"{second.source}: its excitation is not that of {first.source} (correlation "
+            f"{np.max(likeness) / size:.2f}); give a second flight with the same amplitude, hold times and seed"
+        )
+    start, stop = max(shift, 0), min(len(one), len(other) + shift)
+    shared = [
+        (max(a, c + shift) - start, min(b, d + shift) - start)
+        for a, b in first.segments
+        for c, d in second.segments
+        if max(a, c + shift) < min(b, d + shift)
+    ]
+    return _rows(first, start, stop, shared), _rows(second, start - shift, stop - shift, shared)
+
+
+def _rows(experiment: Experiment, start: int, stop: int, segments: Sequence[tuple[int, int]]) -> Experiment:
+    values = {f.name: getattr(experiment, f.name) for f in fields(experiment)}
+    cut: dict[str, Any] = {name: value[start:stop] for name, value in values.items() if isinstance(value, np.ndarray)}
+    return replace(experiment, **cut, segments=tuple(segments))

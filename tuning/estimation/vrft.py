@@ -1,0 +1,281 @@
+"""Multivariable Virtual Reference Feedback Tuning of one loop, with extended instrumental variables.
+
+Given one experiment {u, y} and a diagonal reference model M, the controller C(B) that would make the closed
+loop look like M is the one that turns the virtual error e_V = (M^-1 - I) y into u. All signals pass one
+scalar filter l, so that nothing improper is ever computed; the controller is linear in its gains, and the
+instrument is an external signal of the experiment at 2 l + 1 lags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from mimopilot.tuning.controller import filtered_derivative
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.estimation.regression import Regression, Solution, solve
+from mimopilot.tuning.reference_model import ReferenceModel
+from numpy.typing import NDArray
+
+TERMS = "PIDF"
+Signal = NDArray[np.float64]
+Segments = Sequence[tuple[int, int]]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopEstimate:
+    """Gains of one loop, by term.
+
+    Attributes
+    ----------
+    gains : dict
+        Term (``P``, ``I``, ``D``, ``F``) -> (n_u, n_y) array.
+    samples : int
+        Samples used.
+    window : int
+        Lags l of the instrument.
+    solution : Solution
+        The regression behind it: covariance, strength of the instrument, fit.
+    """
+
+    gains: dict[str, Signal]
+    samples: int
+    window: int
+    solution: Solution
+
+    @cached_property
+    def deviations(self) -> dict[str, Signal]:
+        """Term -> (n_u, n_y) standard deviations under repeated noise."""
+        variances = np.diagonal(self.solution.covariance, axis1=1, axis2=2)
+        found = np.split(np.sqrt(np.maximum(variances, 0.0)), len(self.gains), axis=1)
+        return dict(zip(self.gains, found, strict=True))
+
+    def gain(self, term: str) -> Signal:
+        """Matrix of a term; zeros when the structure does not have it."""
+        first = next(iter(self.gains.values()))
+        return self.gains.get(term, np.zeros_like(first))
+
+
+def default_window(models: Sequence[ReferenceModel]) -> int:
+    """Lags of the instrument: long enough for the slowest reference model to decay to 10 %."""
+    return max(model.settling_samples(0.1) for model in models)
+
+
+def virtual_signals(y: Signal, models: Sequence[ReferenceModel]) -> tuple[Signal, Signal, Signal, list[ReferenceModel]]:
+    """e_l, r_l and y_l for the filter l = product of the distinct models.
+
+    Returns
+    -------
+    e_l, r_l, y_l : (N, n_y) arrays
+        l (M^-1 - I) y, l M^-1 y and l y, in the unit of `y`.
+    factors : list of ReferenceModel
+        The models whose product is l.
+    """
+    factors: list[ReferenceModel] = []
+    for model in models:
+        if model not in factors:
+            factors.append(model)
+    virtual = np.empty_like(y)
+    for j, model in enumerate(models):
+        signal = y[:, j]
+        for factor in factors:
+            if factor != model:
+                signal = factor.response(signal)
+        virtual[:, j] = signal
+    filtered = filter_by(y, factors)
+    return virtual - filtered, virtual, filtered, factors
+
+
+def filter_by(signal: Signal, factors: Sequence[ReferenceModel]) -> Signal:
+    """The scalar filter l on every column."""
+    for factor in factors:
+        signal = factor.response(signal)
+    return signal
+
+
+def filter_by_inverse(signal: Signal, factors: Sequence[ReferenceModel], models: Sequence[ReferenceModel]) -> Signal:
+    """Filter by l and M^-1, as the proper filters l m_j^-1, one a column.
+
+    Parameters
+    ----------
+    signal : (N, n) array
+    factors : sequence of ReferenceModel
+        Whose product is l.
+    models : sequence of n ReferenceModel
+        M.
+
+    Raises
+    ------
+    TuningError
+        When l answers faster than M, or M cannot be inverted.
+    """
+    filtered = filter_by(signal, factors[1:])
+    columns = [factors[0].over(model).response(filtered[:, j]) for j, model in enumerate(models)]
+    return np.column_stack(columns)
+
+
+def regressors(terms: str, e_l: Signal, y_l: Signal, r_l: Signal, Ts: float, derivative_cutoff_hz: float) -> Signal:
+    """The regressor x(k) of the flown difference equation, one column a gain: P, I, D, F as `terms` has them.
+
+    Parameters
+    ----------
+    terms : str
+        Letters of ``PIDF``, in that order.
+    e_l, y_l, r_l : (N, n) arrays
+        Error, output and reference, all filtered by l.
+    Ts : float, s
+        Sampling period.
+    derivative_cutoff_hz : float, Hz
+        Of the flown derivative filter.
+
+    Returns
+    -------
+    (N, n len(terms)) array
+    """
+    columns: dict[str, Callable[[], Signal]] = {
+        "P": lambda: e_l,
+        "I": lambda: Ts * np.cumsum(e_l, axis=0),
+        "D": lambda: -filtered_derivative(y_l, Ts, derivative_cutoff_hz),
+        "F": lambda: r_l,
+    }
+    return np.hstack([columns[term]() for term in terms])
+
+
+def vrft(
+    u: Signal,
+    y: Signal,
+    instrument: Signal,
+    models: Sequence[ReferenceModel],
+    terms: str,
+    *,
+    segments: Segments | None = None,
+    window: int | None = None,
+    derivative_cutoff_hz: float = 0.0,
+    settling: int = 0,
+    weight: str = "optimal",
+    trim: bool = True,
+    external: Signal | None = None,
+    repeated: Signal | None = None,
+    prefilter: Callable[[Signal], Signal] | None = None,
+    inverse: Sequence[ReferenceModel] | None = None,
+    prior: Mapping[str, Signal] | None = None,
+    pull: float = 0.0,
+) -> LoopEstimate:
+    """Gains that bring the closed loop closest to the reference model.
+
+    Parameters
+    ----------
+    u : (N, n_u) array
+        Input of the plant that the controller makes.
+    y : (N, n_y) array
+        Output of the plant.
+    instrument : (N, n_w) array
+        Signal whose lags are the instruments: an external one (the injected excitation, or the set-point), or `u`
+        itself, the thesis' choice, which in closed loop carries fed-back noise.
+    models : sequence of n_y ReferenceModel
+        Wanted complementary sensitivity of each output.
+    terms : str
+        Structure of the controller: ``P``, ``PI``, ``PID``, ``PIDF``...
+    segments : sequence of (start, stop), optional
+        Stretches without a gap; all of the data by default. Filters start anew and a constant (trim and
+        initial integrator) is estimated on each.
+    window : int, optional
+        Lags l of the instrument; see `default_window`.
+    derivative_cutoff_hz : float, Hz
+        Of the flown derivative filter.
+    settling : int, samples
+        Further samples to drop at the start of each segment.
+    weight : str
+        ``identity``: least squares on the correlations, (3.28). ``optimal``: (3.30), in two steps.
+    trim : bool
+        False: no constant, as the thesis has it; right only for data without offsets.
+    external : (N, n_e) array, optional
+        External signal that noise is told from, where `instrument` is not external.
+    repeated : (N, n_y) array, optional
+        y with other noise, of a second experiment (3.13) or simulated by an identified model: its regressors are
+        the instruments, in place of lags; `instrument` then is what noise is told from.
+    prefilter : callable, optional
+        Filter of every signal before l, such as `tuning.estimation.siso.prefilter`.
+    inverse : sequence of n_u ReferenceModel, optional
+        M_i of an inner loop: `u` holds that loop's outputs and M_i^-1 u is meant.
+    prior : mapping, optional
+        Term -> (n_u, n_y) gains towards which the estimate is pulled.
+    pull : float
+        lambda of the pull, relative to the curvature of each gain: 1 goes half of the way.
+
+    Returns
+    -------
+    LoopEstimate
+
+    Raises
+    ------
+    TuningError
+        When a segment is too short, a model's period differs, or the regressors are not excited.
+    """
+    letters = "".join(term for term in TERMS if term in terms)
+    if not letters or len(letters) != len(terms) or weight not in ("optimal", "identity"):
+        raise TuningError(f"terms {terms!r}, weight {weight!r}: expected letters of {TERMS}, and optimal or identity")
+    if len(models) != y.shape[1]:
+        raise TuningError(f"got {len(models)} reference models for {y.shape[1]} outputs")
+    lags = default_window(models) if window is None else window
+    Ts = models[0].Ts
+    drop = settling + sum(model.settling_samples() for model in dict.fromkeys(models))
+    needed = drop + 4 * lags
+    shaped = prefilter or (lambda signal: signal)
+
+    def regressor(output: Signal) -> tuple[Signal, list[ReferenceModel]]:
+        e_l, r_l, y_l, factors = virtual_signals(shaped(output), models)
+        return regressors(letters, e_l, y_l, r_l, Ts, derivative_cutoff_hz)[drop:], factors
+
+    xs: list[Signal] = []
+    us: list[Signal] = []
+    ws: list[Signal] = []
+    vs: list[Signal] = []
+    for start, stop in segments or [(0, len(u))]:
+        if stop - start < needed:
+            continue
+        part = slice(start, stop)
+        x, factors = regressor(y[part])
+        u_l = shaped(u[part])
+        u_l = (filter_by_inverse(u_l, factors, inverse) if inverse else filter_by(u_l, factors))[drop:]
+        w = filter_by(shaped(instrument[part]), factors)[drop:]
+        v = w if external is None else filter_by(shaped(external[part]), factors)[drop:]
+        if repeated is not None:
+            w = regressor(repeated[part])[0]
+        if trim:
+            # The constant (trim, initial integrator), filtered like the rest, is regressor and instrument at once:
+            # to take its part off all others is the same as to estimate it.
+            constant = filter_by(np.ones((stop - start, 1)), factors)[drop:]
+            _take_off(constant, x)
+            _take_off(constant, u_l)
+            if repeated is not None:
+                _take_off(constant, w)
+        for signals, signal in ((xs, x), (us, u_l), (ws, w), (vs, v)):
+            signals.append(signal)
+    if not xs:
+        raise TuningError(
+            f"too short: no stretch without a gap is longer than {needed * Ts:.2f} s, which these reference "
+            "models need; record a longer flight, or ask for faster models"
+        )
+    if repeated is not None:
+        lags = 0
+        # The units of P, I and D differ: brought to one size, over all stretches, the problem is well conditioned.
+        size = np.sqrt(np.sum([np.einsum("ij,ij->j", w, w) for w in ws], axis=0))
+        ws = [w / np.where(size > 0, size, 1.0) for w in ws]
+    problem = Regression(xs, us, ws, lags, memory=max(lags, 2 * drop), external=vs)
+    solution = solve(problem, weight, None if prior is None else np.hstack([prior[t] for t in letters]), pull)
+    n_y = y.shape[1]
+    split = {term: slice(i * n_y, (i + 1) * n_y) for i, term in enumerate(letters)}
+    return LoopEstimate(
+        {term: solution.B[:, columns] for term, columns in split.items()},
+        problem.samples,
+        lags,
+        solution,
+    )
+
+
+def _take_off(constant: Signal, signal: Signal) -> None:
+    """Take its projection on `constant` (N, 1) off `signal` (N, n), in place."""
+    signal -= constant @ (constant.T @ signal / (constant.T @ constant))

@@ -1,0 +1,1 @@
+"""What an experiment says of the vehicle: frequency response, inertia, identified model."""

@@ -1,0 +1,298 @@
+"""The plant's frequency response from one experiment, with its error."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.plant.body_shape import fit_shape, shape_response
+from mimopilot.tuning.plant.local_polynomial import local_response
+from numpy.typing import NDArray
+
+#: Frequencies count where the excitation explains more than this share of a rate's power.
+COHERENT = 0.7
+#: Windows of the response are at least this share of their frequency wide on each side: vehicles answer smoothly there.
+GROWTH = 0.08
+#: Relative errors of G_i (Frobenius norms): below the first it is known whatever its coherence, many bins of little
+#: coherence tell as much as few of a high one; above the second it is not.
+KNOWN, UNKNOWN = 0.3, 0.7
+#: Two known frequencies belong to one stretch up to this ratio: the damped body between them is interpolated.
+HOLE = 1.25
+#: Share of the excitation's power below the highest frequency of a response.
+POWER = 0.9999
+#: Smoothing over frequency: half width (ratio, as a logarithm), least number of values, largest mean square that is
+#: left over their variance, and the relative error that the shape of a body has of its own.
+SMOOTH, ENOUGH, EXPLAINED, SHAPE_ERROR = 0.3, 5, 1.5, 0.03
+#: Angles and rates are compared where the angles' relative error is below this.
+SURE = 0.1
+#: Most that rates may lag behind angles, s: filters of a gyro and an estimator.
+LAG = 0.05
+MIN_FREQUENCIES = 8
+#: Plants that are drawn from the error of a response.
+DRAWS = 64
+
+Complex = NDArray[np.complex128]
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PlantResponse:
+    """What one experiment says of the plant, at K frequencies.
+
+    Attributes
+    ----------
+    omega : (K,) array, rad/s
+        Frequencies.
+    G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
+        Responses of rates and angles to the moment.
+    root : (K, 6, 6) array
+        Square root of the noise spectrum of [u, y_i, y_o].
+    reach : (K, 2, 2) array
+        With X (6, 2) of unit complex normals and E = root X reach, G_i + E_i - G_i E_u and G_o + E_o - G_o E_u are
+        as likely as G_i and G_o.
+    coherence : (K, 2) array
+        Multiple coherence of each rate with the excitation.
+    Ts : float, s
+        Sampling period.
+    """
+
+    omega: Signal
+    G_i: Complex
+    G_o: Complex
+    root: Complex
+    reach: Complex
+    coherence: Signal
+    Ts: float
+
+    def deviation(self) -> Signal:
+        """Standard deviation of each element of G_i, (K, 2, 2)."""
+        noise = np.linalg.norm(self.root[:, 2:4] - self.G_i @ self.root[:, :2], axis=2)
+        reach = np.linalg.norm(self.reach, axis=1)
+        deviation: Signal = noise[:, :, None] * reach[:, None, :]
+        return deviation
+
+    def known(self) -> NDArray[np.bool_]:
+        """Where G_i is known: the excitation explains both rates, or its error is small all the same, (K,)."""
+        error = self.rate_error()
+        return np.asarray(np.all(self.coherence > COHERENT, axis=1) & (error < UNKNOWN) | (error < KNOWN))
+
+    def rate_error(self) -> Signal:
+        """Standard deviation of G_i over its size, (K,), Frobenius norms."""
+        error: Signal = np.linalg.norm(self.deviation(), axis=(1, 2)) / np.linalg.norm(self.G_i, axis=(1, 2))
+        return error
+
+    def known_run(self) -> NDArray[np.intp]:
+        """The longest stretch of known frequencies, as indices; gaps up to `HOLE` do not end it.
+
+        It begins where the error is small. Below, the flying loop leaves the torque little of the excitation: the rates
+        are coherent all the same, and what the vehicle does beside its linear response decides.
+        """
+        sure = np.logical_or.accumulate(self.rate_error() < KNOWN)
+        return self._longest(self.known() & sure)
+
+    def coherent_run(self) -> NDArray[np.intp]:
+        """The longest stretch where the excitation explains both rates: what designs may lean on, as indices."""
+        return self._longest(np.all(self.coherence > COHERENT, axis=1))
+
+    def _longest(self, where: NDArray[np.bool_]) -> NDArray[np.intp]:
+        indices = np.flatnonzero(where)
+        if not len(indices):
+            return indices
+        far = self.omega[indices[1:]] > HOLE * self.omega[indices[:-1]] + 2 * (self.omega[1] - self.omega[0])
+        return max(np.split(indices, np.flatnonzero(far) + 1), key=len)
+
+    def band(self, axis: int) -> tuple[float, float] | None:
+        """Where the excitation explains an axis' rate, rad/s: the first and the last such frequency; None: nowhere."""
+        where = self.omega[self.coherence[:, axis] > COHERENT]
+        return (float(where[0]), float(where[-1])) if len(where) else None
+
+    def relative_error(self) -> Signal:
+        """Standard deviation of G_o over its size, (K,), Frobenius norms."""
+        spread = (self.root[:, 4:] - self.G_o @ self.root[:, :2], self.reach, self.G_o)
+        noise, reach, size = (np.linalg.norm(matrix, axis=(1, 2)) for matrix in spread)
+        relative: Signal = noise * reach / size
+        return relative
+
+    def at(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> PlantResponse:
+        """The response at some of the frequencies."""
+        arrays = {name: value[which] for name, value in vars(self).items() if name != "Ts"}
+        return PlantResponse(Ts=self.Ts, **arrays)
+
+    def extended(self) -> PlantResponse:
+        """The response with frequencies below its own added, where rates integrate the moment and angles the rates.
+
+        Set-points have most of their power there, and there the closed loop hardly depends on the plant: so the shape
+        of a rigid body, 1/w and 1/w^2 from the mean of the lowest frequencies on, is enough.
+        """
+        step = float(np.diff(self.omega).min())
+        low = np.arange(self.omega[0] - step, step / 2, -step)[::-1]
+        if not len(low):
+            return self
+        first, w = slice(0, 3), self.omega[:, None, None]
+        below = low[:, None, None]
+        down = (self.omega[0] / below) ** np.repeat([0, 1, 2], 2)[:, None]
+        return PlantResponse(
+            omega=np.concatenate([low, self.omega]),
+            G_i=np.concatenate([(w * self.G_i)[first].mean(axis=0) / below, self.G_i]),
+            G_o=np.concatenate([(w**2 * self.G_o)[first].mean(axis=0) / below**2, self.G_o]),
+            root=np.concatenate([down * self.root[0], self.root]),
+            reach=np.concatenate([np.repeat(self.reach[:1], len(low), axis=0), self.reach]),
+            coherence=np.concatenate([np.repeat(self.coherence[:1], len(low), axis=0), self.coherence]),
+            Ts=self.Ts,
+        )
+
+    def interpolated(self, share: float) -> PlantResponse:
+        """The response with frequencies between its own, none further from the next than a share of itself.
+
+        A damped body has G_i^-1 and G_o^-1 / w that are linear in w: they are interpolated. All else is the nearest's.
+        """
+        counts = np.ceil(np.diff(self.omega) / (share * self.omega[:-1])).astype(int)
+        place = np.concatenate([*(k + np.arange(n) / n for k, n in enumerate(counts)), [len(counts)]])
+        omega = np.interp(place, np.arange(len(self.omega)), self.omega)
+        low = np.minimum(place.astype(int), len(counts) - 1)
+        part, new, old = (place - low)[:, None, None], omega[:, None, None], self.omega[:, None, None]
+
+        def between(G: Complex) -> Complex:
+            inverse = np.linalg.inv(G)
+            value: Complex = np.linalg.inv((1 - part) * inverse[low] + part * inverse[low + 1])
+            return value
+
+        dense = self.at(np.rint(place).astype(int))
+        return replace(dense, omega=omega, G_i=between(self.G_i), G_o=between(old * self.G_o) / new)
+
+    def draw(self, generator: np.random.Generator) -> PlantResponse:
+        """Another plant that the experiment allows, from its error distribution."""
+        shape = (len(self.omega), 6, 2)
+        X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
+        E = self.root @ X @ self.reach
+        E_u, E_i, E_o = E[:, :2], E[:, 2:4], E[:, 4:]
+        return replace(self, G_i=self.G_i + E_i - self.G_i @ E_u, G_o=self.G_o + E_o - self.G_o @ E_u)
+
+
+def plant_response(experiment: Experiment, instrument: Signal, upper: float = np.inf) -> PlantResponse:
+    """Joint input-output estimate G = T_yw T_uw^-1, consistent in closed loop.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        One flight.
+    instrument : (N, 2) array
+        Its external signal w.
+    upper : float, rad/s
+        Largest frequency of interest; by default all below the Nyquist frequency.
+
+    Raises
+    ------
+    TuningError
+        When the flight is too short, or w does not reach both axes.
+    """
+    signals = np.hstack([experiment.u, experiment.y_i, experiment.y_o])
+    upper = min(upper, 0.95 * np.pi / experiment.Ts, _reach(experiment, instrument))
+    found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper, GROWTH)
+    T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
+    if np.any(np.linalg.matrix_rank(T_u) < 2):
+        raise TuningError("not excited: the external signal does not move both moments independently")
+    for name, T in (("rates", T_i), ("angles", T_o)):
+        if np.any(np.linalg.matrix_rank(T) < 2):
+            raise TuningError(
+                f"{experiment.source}: roll and pitch {name} are one signal; check what was logged as pitch"
+            )
+    inverse = np.linalg.inv(T_u)
+    plant = PlantResponse(
+        omega=found.omega,
+        G_i=T_i @ inverse,
+        G_o=T_o @ inverse,
+        root=_root(found.noise),
+        reach=_root(found.error).transpose(0, 2, 1) @ inverse,
+        coherence=found.explained[:, 2:4],
+        Ts=experiment.Ts,
+    )
+    return _angles_from_rates(_smoothed(plant))
+
+
+@lru_cache(maxsize=1)  # a log is judged by its response when it is read, and then tuned from
+def measured_plant(experiment: Experiment) -> PlantResponse:
+    """The plant's frequency response from the experiment's external signal; see `plant_response`."""
+    return plant_response(experiment, external_signal(experiment)[0])
+
+
+def _reach(experiment: Experiment, instrument: Signal) -> float:
+    """Highest frequency that was excited, rad/s: a chirp ends, and what is above it is told by chance only."""
+    reached = 0.0
+    for start, stop in experiment.segments:
+        part = instrument[start:stop] - instrument[start:stop].mean(axis=0)
+        power = np.cumsum(np.sum(np.abs(np.fft.rfft(part, axis=0)) ** 2, axis=1))
+        if power[-1] > 0:
+            bin_ = int(np.searchsorted(power, POWER * power[-1])) + 1
+            reached = max(reached, 2 * np.pi * bin_ / (len(part) * experiment.Ts))
+    return reached
+
+
+def _smoothed(plant: PlantResponse) -> PlantResponse:
+    """The response to the rates, surer where it is that of a body behind a delay and a lag.
+
+    Divided by that shape it hardly changes with frequency, so each value is taken from a line through those within
+    `SMOOTH` of it; where the line does not explain them, at a mode of the frame, the value stays as it is.
+    """
+    use = plant.known()
+    if np.count_nonzero(use) < MIN_FREQUENCIES:
+        return plant
+    deviation = plant.deviation()
+    size = np.linalg.norm(plant.G_i, axis=(1, 2))[:, None, None]
+    weight = 1 / (deviation[use] ** 2 + (SHAPE_ERROR * size[use]) ** 2)
+    shape = shape_response(plant.omega, fit_shape(plant.omega[use], plant.G_i[use], weight)[0])[:, None, None]
+    ratio, spread = plant.G_i / shape, deviation / np.abs(shape)
+    G_i, reach = plant.G_i.copy(), plant.reach.copy()
+    places = np.log(plant.omega)
+    for k, place in enumerate(places):
+        near = np.flatnonzero(np.abs(places - place) <= SMOOTH)
+        if len(near) < ENOUGH:
+            continue
+        line = np.column_stack([np.ones(len(near)), places[near] - place])
+        certainty = 1 / np.mean(spread[near] ** 2, axis=(1, 2))
+        inverse = np.linalg.inv(line.T @ (certainty[:, None] * line))
+        values = ratio[near].reshape(len(near), -1)
+        found = inverse @ (line.T @ (certainty[:, None] * values))
+        # Windows overlap by half: their errors are those of half as many.
+        misfit = float(np.sum(certainty[:, None] * np.abs(values - line @ found) ** 2)) / (4 * (len(near) - 2))
+        share = np.sqrt(2 * inverse[0, 0] * max(1.0, misfit) * certainty[near == k][0])
+        if misfit < EXPLAINED and share < 1:
+            G_i[k] = shape[k] * found[0].reshape(2, 2)
+            reach[k] *= share
+    return replace(plant, G_i=G_i, reach=reach)
+
+
+def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
+    """Angles by integrating the rates where these are the surer: noise of an angle does not fall with frequency.
+
+    What lies between the two besides the integral, such as the gyro's filter, is a gain and a delay, found where both
+    are known well.
+    """
+    s = 1j * plant.omega
+    integral = plant.G_i / s[:, None, None]
+    spread = np.linalg.norm(plant.root[:, 4:] - plant.G_o @ plant.root[:, :2], axis=(1, 2))
+    of_rates = np.linalg.norm(plant.root[:, 2:4] - plant.G_i @ plant.root[:, :2], axis=(1, 2)) / plant.omega
+    both = plant.known() & (plant.relative_error() < SURE)
+    if np.count_nonzero(both) < MIN_FREQUENCIES:
+        return plant
+    quotient = np.einsum("kij,kij->k", plant.G_o, integral.conj()) / np.sum(np.abs(integral) ** 2, axis=(1, 2))
+    omega, phase = plant.omega[both], np.unwrap(np.angle(quotient[both]))
+    lead = float(np.clip(omega @ phase / (omega @ omega), -LAG, LAG))
+    gain = float(np.median(np.abs(quotient[both])))
+    better = of_rates < spread
+    better[: np.flatnonzero(both)[-1] // 2] = False
+    change = np.where(better, gain * np.exp(1j * plant.omega * lead) / s, 0)[:, None, None]
+    root = plant.root.copy()
+    root[:, 4:] = np.where(better[:, None, None], change * root[:, 2:4], root[:, 4:])
+    G_o = np.where(better[:, None, None], change * plant.G_i, plant.G_o)
+    return replace(plant, G_o=G_o, root=root)
+
+
+def _root(matrices: Complex) -> Complex:
+    """R with R R^H = each of the positive semidefinite `matrices`."""
+    values, vectors = np.linalg.eigh(matrices)
+    root: Complex = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]
+    return root

@@ -1,0 +1,124 @@
+"""Reference models: what each closed loop is asked to look like."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from mimopilot.tuning.errors import TuningError
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter
+
+MAX_DAMPING = 10
+MAX_DELAY = 100
+
+
+@dataclass(frozen=True)
+class ReferenceModel:
+    """Scalar discrete transfer function num(z)/den(z) times z^-delay.
+
+    Attributes
+    ----------
+    num, den : tuple of float
+        Coefficients of descending powers of z; den[0] = 1 and len(num) <= len(den).
+    delay : int, samples
+        Extra dead time.
+    Ts : float, s
+        Sampling period.
+    label : str
+        How it was specified, for reports and provenance.
+    """
+
+    num: tuple[float, ...]
+    den: tuple[float, ...]
+    delay: int
+    Ts: float
+    label: str = ""
+
+    @property
+    def taps(self) -> NDArray[np.float64]:
+        """Numerator in powers of z^-1, aligned with `den` and with the delay in front, for `lfilter`."""
+        lag = len(self.den) - len(self.num) + self.delay
+        return np.concatenate([np.zeros(lag), self.num])
+
+    def response(self, signal: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Output of the model, from rest, along axis 0.
+
+        Parameters
+        ----------
+        signal : (N,) or (N, n) array
+            Input, each column by itself.
+        """
+        filtered: NDArray[np.float64] = lfilter(self.taps, self.den, signal, axis=0)
+        return filtered
+
+    def over(self, other: ReferenceModel) -> ReferenceModel:
+        """Times the inverse of another, as one proper and stable filter.
+
+        Raises
+        ------
+        TuningError
+            When the other answers later than this one, or its inverse is not stable.
+        """
+        lag = len(self.den) - len(self.num) + self.delay - (len(other.den) - len(other.num) + other.delay)
+        if lag < 0 or np.any(np.abs(np.roots(other.num)) >= 1):
+            raise TuningError(
+                f"reference model {self.label} over {other.label}: the quotient is not a proper, stable filter; ask "
+                "the first for as much delay as the second has"
+            )
+        num, den = np.polymul(self.num, other.den), np.polymul(self.den, other.num)
+        delay = lag - (len(den) - len(num))
+        label = f"({self.label}) over ({other.label})"
+        return ReferenceModel(tuple(num / den[0]), tuple(den / den[0]), delay, self.Ts, label)
+
+    def frequency_response(self, omega: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Value at z = exp(j omega Ts); omega in rad/s."""
+        z = np.exp(1j * np.asarray(omega) * self.Ts)
+        value: NDArray[np.complex128] = np.polyval(self.num, z) / np.polyval(self.den, z) * z ** -float(self.delay)
+        return value
+
+    def settling_samples(self, fraction: float = 0.01) -> int:
+        """Samples after which a transient of the model has fallen below `fraction` of its peak, delay included."""
+        slowest = float(np.max(np.abs(np.roots(self.den))))
+        if slowest >= 1:
+            raise TuningError(f"reference model {self.label}: pole at {slowest:.4g}, expected inside the unit circle")
+        horizon = 1 if slowest == 0 else int(np.ceil(np.log(fraction / 100) / np.log(slowest)))
+        transient = np.abs(lfilter([1.0], self.den, np.eye(1, horizon + len(self.den))[0]))
+        return int(np.flatnonzero(transient > fraction * transient.max())[-1]) + 1 + self.delay
+
+
+@lru_cache(maxsize=256)
+def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceModel:
+    """Zero-order-hold discretisation of omega^2/(s^2 + 2 zeta omega s + omega^2), times z^-delay.
+
+    Parameters
+    ----------
+    omega : float, rad/s
+        Natural frequency.
+    zeta : float
+        Damping ratio.
+    delay : int, samples
+        Extra dead time.
+    Ts : float, s
+        Sampling period.
+
+    Raises
+    ------
+    TuningError
+        When omega is above Nyquist, or a number is out of the range of any attitude loop.
+    """
+    if not (1e-3 <= omega < np.pi / Ts and 0 < zeta <= MAX_DAMPING and 0 <= delay <= MAX_DELAY):
+        raise TuningError(
+            f"reference model: got omega {omega} rad/s, damping {zeta}, delay {delay}; "
+            f"expected 0.001 <= omega < {np.pi / Ts:.4g} rad/s, 0 < damping <= {MAX_DAMPING}, "
+            f"delay 0 to {MAX_DELAY} samples"
+        )
+    num, den, _ = cont2discrete(([omega**2], [1, 2 * zeta * omega, omega**2]), Ts, method="zoh")
+    return ReferenceModel(
+        tuple(float(b) for b in num[0][1:]),
+        tuple(float(a) for a in den),
+        int(delay),
+        Ts,
+        label=f"{omega:g} rad/s, {zeta:g}, {delay:d}",
+    )
