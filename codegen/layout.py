@@ -1,7 +1,7 @@
 """The memory layout of the controller's structures, as NumPy sees them.
 
-They mirror ``core/mimo_pid.hpp``; `codegen.native` checks sizes, offsets and the interface hash when a
-library is loaded.
+`GAINS` comes from the parameter table, the others mirror ``core/mimo_pid.hpp``; `codegen.native` checks sizes, offsets
+and the interface hash when a library is loaded.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import PARAMETERS, to_array
+from mimopilot.tuning.parameters import PARAMETERS, ROWS, Row
 from numpy.typing import NDArray
 
 GAINS = np.dtype(("<f4", (len(PARAMETERS),)))
@@ -51,8 +51,20 @@ STATE = np.dtype(
 )
 
 
+def to_array(gains: Gains) -> NDArray[np.float32]:
+    """The float32 array that ``mimopilot::Gains`` is in memory, (len(PARAMETERS),)."""
+    values = gains.elements()
+    return np.array([values[parameter.code] for parameter in PARAMETERS], dtype=np.float32)
+
+
+def offset(row: Row) -> int:
+    """Where a row of the parameter table begins in ``mimopilot::Gains``, bytes."""
+    before = ROWS[: ROWS.index(row)]
+    return GAINS.base.itemsize * sum(len(one.codes) for one in before)
+
+
 def gains_array(gains: Gains | NDArray[np.float32]) -> NDArray[np.float32]:
-    """Gains as the controller takes them, (36,) float32.
+    """Gains as the controller takes them, (len(PARAMETERS),) float32.
 
     Raises
     ------

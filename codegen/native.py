@@ -11,11 +11,10 @@ from typing import Any
 import cffi
 import numpy as np
 from mimopilot.codegen.errors import CodegenError
-from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
+from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows, to_array
 from mimopilot.codegen.render import TEMPLATES, interface_hash, render, write_tree
 from mimopilot.codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import to_array
 from numpy.typing import NDArray
 
 from mimopilot.common.cache import cache_folder
@@ -30,8 +29,6 @@ LAYOUT = (
     INPUT.itemsize,
     OUTPUT.itemsize,
     STATE.itemsize,
-    25 * 4,
-    35 * 4,
     INPUT.fields["rates"][1],  # type: ignore[index]
     INPUT.fields["saturation"][1],  # type: ignore[index]
     INPUT.fields["landed"][1],  # type: ignore[index]
@@ -126,7 +123,7 @@ class NativeLibrary:
             raise CodegenError(f"{path}: sizes and offsets are {layout}, expected {LAYOUT}; generate again")
 
     def default_gains(self) -> NDArray[np.float32]:
-        """The gains that the library was generated with, (36,) float32."""
+        """The gains that the library was generated with, (len(PARAMETERS),) float32."""
         gains = np.zeros(GAINS.shape, np.float32)
         self.lib.mimo_pid_default_gains(self.ffi.from_buffer("float[]", gains))
         return gains
@@ -162,7 +159,7 @@ class NativeController:
 
         Parameters
         ----------
-        gains : Gains or (36,) float32 array
+        gains : Gains or (len(PARAMETERS),) float32 array
             The new set.
         """
         array = gains_array(gains)

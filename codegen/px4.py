@@ -14,7 +14,6 @@ from mimopilot.tuning.parameters import (
     PARAMETERS,
     Parameter,
     Setting,
-    identity_parameters,
 )
 
 APIS = ("crtp", "descriptor")
@@ -58,7 +57,7 @@ def entries(gains: Gains) -> list[Entry]:
     range of one value.
     """
     values = gains.elements()
-    scales = identity_parameters(gains)
+    scales = gains.identity()
     return [
         *(_of_parameter(parameter, values[parameter.code]) for parameter in PARAMETERS),
         *(_of_parameter(parameter, scales[parameter.name]) for parameter in IDENTITY if parameter.name in scales),

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
+from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import jinja2
 from mimopilot.codegen.errors import CodegenError
-from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE
+from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
 from mimopilot.codegen.literals import float_literal
 from mimopilot.codegen.px4 import APIS, entries
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
 from mimopilot.codegen.vectors import emitted_vectors
-from mimopilot.tuning.gains import Gains, gains_to_toml
-from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, check_names, check_ranges, identity_parameters
+from mimopilot.tuning.acceptance import check_ranges
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains_file import gains_to_toml
+from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, Row, Shape, check_names
 
 from mimopilot.common.files import inside, read_text, sha256, write_atomically
 
 TEMPLATES = Path(__file__).resolve().parent.parent / "firmware_templates"
+#: What defines the C interface, beside the parameter table.
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
 MANIFEST = "manifest.json"
 MANIFEST_SCHEMA = 1
@@ -43,8 +48,9 @@ def generator_version() -> str:
 
 
 def interface_hash() -> int:
-    """First 32 bits of the SHA-256 of the headers that define the C interface."""
-    digest = hashlib.sha256(b"".join((TEMPLATES / name).read_bytes() for name in INTERFACE))
+    """First 32 bits of the SHA-256 of what defines the C interface: two headers and the members of the gains."""
+    members = "".join(f"{row.member}{row.dimensions};" for row in ROWS).encode()
+    digest = hashlib.sha256(b"".join((TEMPLATES / name).read_bytes() for name in INTERFACE) + members)
     return int.from_bytes(digest.digest()[:4], "big")
 
 
@@ -101,12 +107,11 @@ def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict
 def _context(gains: Gains, target: str) -> dict[str, Any]:
     literal = {code: float_literal(value) for code, value in gains.elements().items()}
 
-    def matrix(code: str) -> str:
-        rows = (", ".join(literal[f"{code}_{i}{j}"] for j in "RP") for i in "RP")
-        return "{" + ", ".join(f"{{{row}}}" for row in rows) + "}"
-
-    def triple(code: str) -> str:
-        return "{" + ", ".join(literal[f"{code}_{axis}"] for axis in "RPY") + "}"
+    def initialiser(row: Row) -> str:
+        values = [literal[code] for code in row.codes]
+        if row.shape is Shape.MATRIX:
+            return f"{{{{{values[0]}, {values[1]}}}, {{{values[2]}, {values[3]}}}}}"
+        return "{" + ", ".join(values) + "}" if row.shape is Shape.AXES else values[0]
 
     origin = sha256(gains_to_toml(gains))[:16]
     return {
@@ -114,12 +119,14 @@ def _context(gains: Gains, target: str) -> dict[str, Any]:
         "target": target,
         "gains": gains,
         "parameters": PARAMETERS,
-        "identity": list(identity_parameters(gains)),
+        "identity": list(gains.identity()),
         "excitation_settings": EXCITATION,
         "px4_parameters": entries(gains),
         "literal": literal,
-        "matrix": matrix,
-        "triple": triple,
+        "rows": ROWS,
+        "offset": offset,
+        "initialiser": initialiser,
+        "validity": list(_validity()),
         "float_literal": float_literal,
         "interface_hash": f"0x{interface_hash():08x}",
         "layout": {
@@ -132,6 +139,18 @@ def _context(gains: Gains, target: str) -> dict[str, Any]:
         "cortex_m4_flags": " ".join(CORTEX_M4_FLAGS),
         "vectors": emitted_vectors(gains),
     }
+
+
+def _validity() -> Iterator[str]:
+    """C++ conditions of `tuning.parameters.Valid`, for every element that has one."""
+    for row in ROWS:
+        for i, _ in enumerate(row.codes):
+            member = f"gains.{row.member}" + (f"[{i}]" if row.shape is Shape.AXES else "")
+            low, high = row.valid.lowest, row.valid.highest
+            if math.isfinite(low):
+                yield f"{member} {'>=' if row.valid.lowest_included else '>'} {float_literal(low)}"
+            if math.isfinite(high):
+                yield f"{member} {'<=' if row.valid.highest_included else '<'} {float_literal(high)}"
 
 
 def _manifest(files: dict[str, str], gains: Gains, target: str) -> str:

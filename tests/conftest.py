@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 from mimopilot.tuning.gains import Gains, Limits, YawGains
+from mimopilot.tuning.law import Filters
 
 #: How fast the machine is decides nothing.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -28,8 +29,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--update-golden", action="store_true", help="rewrite the golden directories of tests/codegen")
 
 
-@pytest.fixture
-def gains() -> Gains:
+def coupled_gains() -> Gains:
     """A full, coupled set with every term in use."""
     return Gains(
         Kp_o=np.array([[6.0, 0.3], [-0.2, 5.5]]),
@@ -38,11 +38,16 @@ def gains() -> Gains:
         Kd_i=np.array([[0.003, 0.0004], [0.0002, 0.002]]),
         Kff_i=np.array([[0.02, 0.001], [0.002, 0.03]]),
         yaw=YawGains(1.5, 0.5, 0.1, 0.01, 0.02),
-        Ts=0.004,
-        derivative_cutoff_hz=30.0,
+        filters=Filters(Ts=0.004, derivative_cutoff_hz=30.0),
         limits=Limits(rate_max=(5.0, 4.0, 3.0), moment_max=(1.0, 0.9, 0.8), integral_max=(0.3, 0.25, 0.2)),
         moment_scale=(2.54592, 2.54592, 0.2736),
     )
+
+
+@pytest.fixture
+def gains() -> Gains:
+    """See `coupled_gains`."""
+    return coupled_gains()
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from mimopilot.sitl.physics.airframe import FOLDER
-from mimopilot.tuning.gains import load_gains
+from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.ulog_file import open_ulog
 from pyulog import ULog
 
@@ -144,7 +144,7 @@ def test_models_window_and_specification_are_taken(mimopilot, log, tmp_path):
         (("tune", "text.ulg", "--out", "x.toml"), ("text.ulg", "not a flight log")),
         (("tune", "cut.ulg", "--out", "x.toml"), ("cut.ulg",)),
         (("tune", "LOG", "--inner", "20", "--out", "x.toml"), ("expected OMEGA,ZETA,DELAY",)),
-        (("tune", "LOG", "--inner", "20,-1,0", "--out", "x.toml"), ("inner.0.1",)),
+        (("tune", "LOG", "--inner", "20,-1,0", "--out", "x.toml"), ("inner", "damping -1")),
         (("tune", "LOG", "--method", "magic", "--out", "x.toml"), ("method", "'mimo' or 'siso'")),
         (("tune", "LOG", "--outer", "0.5,0.7,0", "--out", "x.toml"), ("too short",)),
         (("generate", "bad.toml", "--out", "cpp"), ("bad.toml", "schema")),

@@ -1,8 +1,6 @@
-"""The controller's difference equation in Python, and its inverse.
+"""The independent reference of the generated C++: the flown law, step by step.
 
-`Controller` is an independent, step-by-step statement of the equation that the generated C++ flies;
-with ``dtype=np.float32`` it must return the same bits. `rebuild_rate_setpoint` runs the inner loop's
-controller backwards, (3.32)-(3.34) of the thesis, for tuning the outer loop.
+With ``dtype=np.float32`` `Controller` must return the same bits as the C++.
 """
 
 from __future__ import annotations
@@ -11,11 +9,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mimopilot.tuning.errors import NotMinimumPhaseError
-from mimopilot.tuning.gains import MATRICES, Gains, derivative_pole
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameters import MATRICES
 from numpy.typing import NDArray
-from scipy.linalg import schur
-from scipy.signal import lfilter
 
 HOLD_SAMPLES = 25
 MAX_RATE = 100.0
@@ -67,7 +63,7 @@ class Controller:
         self.rate_max = [f(v) for v in gains.limits.rate_max]
         self.moment_max = [f(v) for v in gains.limits.moment_max]
         self.integral_max = [f(v) for v in gains.limits.integral_max]
-        self.pole, self.period = f(gains.derivative_pole), f(gains.Ts)
+        self.pole, self.period = f(gains.filters.derivative_pole), f(gains.Ts)
 
     def _times(self, name: str, x: list[Any], axis: int) -> Any:
         gain = self.matrix[name][axis]
@@ -187,99 +183,3 @@ class Controller:
             for j in range(3)
         ]
         return Step(np.array(u, f), np.zeros(3, f), fault, self.fault_count)
-
-
-def filtered_derivative(y: NDArray[np.float64], Ts: float, cutoff_hz: float) -> NDArray[np.float64]:
-    """d(k) = a d(k-1) + (1-a) (y(k) - y(k-1)) / Ts with d(0) = 0, along axis 0.
-
-    Parameters
-    ----------
-    y : (N, n) array
-        Measured signal, any unit.
-    Ts : float, s
-        Sampling period.
-    cutoff_hz : float, Hz
-        Cut-off f_d of the filter; 0 means none (a = 0).
-
-    Returns
-    -------
-    (N, n) array
-        The unit of `y` per second.
-    """
-    a = derivative_pole(cutoff_hz, Ts)
-    slope = np.diff(y, axis=0, prepend=y[:1]) / Ts
-    filtered: NDArray[np.float64] = lfilter([1 - a], [1, -a], slope, axis=0)
-    return filtered
-
-
-def inverse_eigenvalues(Kp: NDArray[np.float64], Ki: NDArray[np.float64], Kff: NDArray[np.float64], Ts: float) -> Any:
-    """Eigenvalues of I - Ts Ki G_c^-1, G_c = Kp + Ts Ki + Kff: the poles of the inverse controller.
-
-    Raises
-    ------
-    NotMinimumPhaseError
-        When G_c is singular: the controller has no inverse.
-    """
-    Gc = Kp + Ts * Ki + Kff
-    if np.linalg.cond(Gc) > 1e12:
-        raise NotMinimumPhaseError(f"the inner controller has no inverse: Kp + Ts Ki + Kff = {Gc.tolist()} is singular")
-    return np.linalg.eigvals(np.eye(len(Gc)) - Ts * Ki @ np.linalg.inv(Gc))
-
-
-def rebuild_rate_setpoint(
-    gains: Gains, u: NDArray[np.float64], y_i: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], int]:
-    """Rate set-point that the inner controller would have needed to make `u`: e_i = C_i^-1 u.
-
-    The recursion e(k) = G_c^-1 (u(k) - I(k-1) + Kd d(k) - Kff y_i(k)), I(k) = I(k-1) + Ts Ki e(k) is
-    solved by a Schur form of I - Ts Ki G_c^-1, one first-order filter a state.
-
-    Parameters
-    ----------
-    gains : Gains
-        The inner loop's gains (roll and pitch).
-    u : (N, 2) array
-        Control moment applied to the plant, injection included: the virtual controller makes all of it.
-    y_i : (N, 2) array, rad/s
-        Measured body rates.
-
-    Returns
-    -------
-    r_i : (N, 2) array, rad/s
-        The rebuilt set-point; its first samples hold the transient of the unknown initial integrator.
-    settling : int, samples
-        After so many samples that transient is below 1 %.
-
-    Raises
-    ------
-    NotMinimumPhaseError
-        When the inner controller is not minimum phase, with the eigenvalues; or has no inverse.
-    """
-    Ts, Ki, Kff = gains.Ts, gains.Ki_i, gains.Kff_i
-    eigenvalues = inverse_eigenvalues(gains.Kp_i, Ki, Kff, Ts)
-    # An integrator that is not used (a zero row of Ki) leaves its state at rest: an eigenvalue of exactly 1.
-    at_rest = np.isclose(eigenvalues, 1.0, rtol=0, atol=1e-12)
-    if np.any(np.abs(eigenvalues[~at_rest]) >= 1) or (at_rest.any() and np.linalg.matrix_rank(Ki) + at_rest.sum() > 2):
-        raise NotMinimumPhaseError(
-            "the inner controller cannot be run backwards, it is not minimum phase: eigenvalues of I - Ts Ki Gc^-1 are "
-            f"{', '.join(f'{v:.6g}' for v in eigenvalues)}, expected inside the unit circle; "
-            f"Ki_i = {Ki.round(6).tolist()} should be positive definite"
-        )
-    inverse = np.linalg.inv(gains.Kp_i + Ts * Ki + Kff)
-    known = u + filtered_derivative(y_i, Ts, gains.derivative_cutoff_hz) @ gains.Kd_i.T - y_i @ Kff.T
-    push = known @ (Ts * Ki @ inverse).T
-    triangle, basis = schur(np.eye(2) - Ts * Ki @ inverse, output="complex")
-    drive = push @ basis.conj()
-    states = np.zeros_like(drive)
-    for i in (1, 0):  # upper triangular: the last state depends on itself alone
-        coupled = drive[:, i].copy()
-        for j in range(i + 1, 2):
-            coupled[1:] += triangle[i, j] * states[:-1, j]
-        states[:, i] = lfilter([1], [1, -triangle[i, i]], coupled)
-    integral = (states @ basis.T).real
-    previous = np.vstack([np.zeros((1, 2)), integral[:-1]])
-    error = (known - previous) @ inverse.T
-    moving = np.abs(eigenvalues[~at_rest])
-    slowest = float(moving.max()) if len(moving) else 0.0
-    settling = int(np.ceil(np.log(0.01) / np.log(slowest))) if 0 < slowest < 1 else 0
-    return error + y_i, settling

@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from mimopilot.tuning.gains import MATRICES, Gains
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import Filters
+from mimopilot.tuning.parameters import MATRICES
 from numpy.typing import NDArray
 
 Signal = NDArray[np.float64]
@@ -22,7 +24,8 @@ class GainStack:
         As in `tuning.gains.Gains`.
     limits : (3, 2) array
         Of rates (rad/s), moments and integral, the same for all.
-    Ts, derivative_pole : float
+    filters : Filters
+        Period and filters, the same for all.
     """
 
     Kp_o: Signal
@@ -31,22 +34,26 @@ class GainStack:
     Kd_i: Signal
     Kff_i: Signal
     limits: Signal
-    Ts: float
-    derivative_pole: float
+    filters: Filters
+
+    @property
+    def Ts(self) -> float:  # noqa: N802
+        """Control period, s."""
+        return self.filters.Ts
 
     @classmethod
     def of(cls, gains: Gains) -> GainStack:
         """A stack of one."""
         limits = np.array([gains.limits.rate_max[:2], gains.limits.moment_max[:2], gains.limits.integral_max[:2]])
         matrices = {name: getattr(gains, name)[None, None] for name in MATRICES}
-        return cls(**matrices, limits=limits, Ts=gains.Ts, derivative_pole=gains.derivative_pole)
+        return cls(**matrices, limits=limits, filters=gains.filters)
 
     def varied(self, matrices: Mapping[str, Signal]) -> GainStack:
         """The first set with some of its matrices replaced, (K, 2, 2) each."""
         count = len(next(iter(matrices.values())))
         every = {name: np.broadcast_to(getattr(self, name)[:1], (count, 1, 2, 2)) for name in MATRICES}
         every |= {name: matrix[:, None] for name, matrix in matrices.items()}
-        return GainStack(**every, limits=self.limits, Ts=self.Ts, derivative_pole=self.derivative_pole)
+        return GainStack(**every, limits=self.limits, filters=self.filters)
 
     def stacked(self) -> Signal:
         """All in one array, (K, 5, 2, 2)."""

@@ -1,22 +1,180 @@
 """The one table of the controller's parameters.
 
-The C++ headers, PX4's module.yaml, ground-station files, the SITL's parameter server and the uploader
-all come from here. Its order is that of ``mimopilot::Gains`` seen as an array of float.
+A row of `ROWS` is a member of the C++ ``struct Gains``. From the table come that struct and its order, its layout in
+memory, the keys of the gains file, and what every vehicle and ground station calls a parameter, with its range:
+headers, PX4's module.yaml, parameter files, the simulated vehicle's parameters and the uploader.
 """
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import Enum
 
-import numpy as np
-from mimopilot.codegen.errors import CodegenError
-from mimopilot.tuning.gains import AXES, LIMITS, MATRICES, PARAMETER_PREFIX, Gains
-from mimopilot.tuning.logs.flown_gains import SCALE
-from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS
-from numpy.typing import NDArray
+from mimopilot.tuning.errors import TuningError
 
-AXIS_NAMES = dict(zip("RPY", AXES, strict=True))
+#: Before every code in a parameter's name.
+PREFIX = "MIMO_"
+AXES = ("roll", "pitch", "yaw")
+AXIS_LETTERS = "RPY"
+AXIS_NAMES = dict(zip(AXIS_LETTERS, AXES, strict=True))
+#: Longest name that MAVLink and PX4 carry.
+NAME_LENGTH = 16
+
+
+def pole_of(cutoff_hz: float, Ts: float) -> float:
+    """Pole of a first-order filter, exp(-2 pi f Ts), 0 when f = 0.
+
+    Parameters
+    ----------
+    cutoff_hz : float, Hz
+    Ts : float, s
+    """
+    return math.exp(-2 * math.pi * cutoff_hz * Ts) if cutoff_hz > 0 else 0.0
+
+
+def cutoff_of(pole: float, Ts: float) -> float:
+    """Cut-off of a first-order filter, Hz: the inverse of `pole_of`; 0 when the pole is 0."""
+    return -math.log(pole) / (2 * math.pi * Ts) if pole > 0 else 0.0
+
+
+class Shape(Enum):
+    """What a row holds."""
+
+    MATRIX = "2x2 matrix, roll and pitch"
+    YAW = "scalar of the yaw axis"
+    AXES = "one value an axis: roll, pitch, yaw"
+    POLE = "pole of a first-order filter; the gains file has its cut-off in Hz"
+    SCALAR = "one value"
+
+
+@dataclass(frozen=True)
+class Valid:
+    """Values with which the controller can run at all; a vehicle's range may be narrower.
+
+    Attributes
+    ----------
+    lowest, highest : float
+        Bounds; infinite where there is none.
+    lowest_included, highest_included : bool
+        Whether the bound itself is valid.
+    """
+
+    lowest: float = -math.inf
+    highest: float = math.inf
+    lowest_included: bool = True
+    highest_included: bool = True
+
+    def holds(self, value: float) -> bool:
+        """Whether a value is finite and within the bounds."""
+        above = value >= self.lowest if self.lowest_included else value > self.lowest
+        below = value <= self.highest if self.highest_included else value < self.highest
+        return math.isfinite(value) and above and below
+
+    def __str__(self) -> str:
+        low = f"{'at least' if self.lowest_included else 'more than'} {self.lowest:g}"
+        high = f"{'at most' if self.highest_included else 'below'} {self.highest:g}"
+        parts = [text for text, bound in ((low, self.lowest), (high, self.highest)) if math.isfinite(bound)]
+        return " and ".join(parts) or "a finite number"
+
+
+ANY = Valid()
+POSITIVE = Valid(lowest=0.0, lowest_included=False)
+STABLE_POLE = Valid(0.0, 1.0, highest_included=False)
+#: 1 Hz to 10 kHz.
+PERIOD = Valid(1e-4, 1.0)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One member of the controller's gains.
+
+    Attributes
+    ----------
+    key : str
+        Its name in the gains file and in Python.
+    member : str
+        Its name in C++.
+    code : str
+        Short name; with prefix and axes a parameter's name.
+    shape : Shape
+    unit : str
+        As PX4 spells it; empty when it has none there.
+    minimum, maximum : float
+        Range that a vehicle accepts, both included.
+    description : str
+        Of a parameter.
+    comment : str
+        Of the C++ member; empty: none.
+    diagonal_minimum : float or None
+        Of a matrix: the lower limit of its diagonal, where that is another.
+    default : float or None
+        Value of a gains file that lacks the key; None: the key must be there. A gain matrix has none.
+    writable : bool
+        False for what is fixed in the firmware and published only to be checked.
+    valid : Valid
+        See `Valid`.
+    """
+
+    key: str
+    member: str
+    code: str
+    shape: Shape
+    unit: str
+    minimum: float
+    maximum: float
+    description: str
+    comment: str = ""
+    diagonal_minimum: float | None = None
+    default: float | None = None
+    writable: bool = True
+    valid: Valid = ANY
+
+    @property
+    def section(self) -> str:
+        """Table of the gains file that holds the key; empty: its top level."""
+        return {Shape.MATRIX: "roll_pitch", Shape.YAW: "yaw", Shape.AXES: "limits"}.get(self.shape, "")
+
+    @property
+    def codes(self) -> tuple[str, ...]:
+        """Codes of its elements, in the order of the C++ member."""
+        if self.shape is Shape.MATRIX:
+            return tuple(f"{self.code}_{i}{j}" for i in "RP" for j in "RP")
+        if self.shape is Shape.YAW:
+            return (f"{self.code}_YY",)
+        if self.shape is Shape.AXES:
+            return tuple(f"{self.code}_{axis}" for axis in AXIS_LETTERS)
+        return (self.code,)
+
+    @property
+    def dimensions(self) -> str:
+        """Of the C++ member."""
+        return {Shape.MATRIX: "[2][2]", Shape.AXES: "[kAxes]"}.get(self.shape, "")
+
+    def element(self, value: float, Ts: float) -> float:
+        """What the controller runs on, of a value of the gains file."""
+        return pole_of(value, Ts) if self.shape is Shape.POLE else value
+
+    def value(self, element: float, Ts: float) -> float:
+        """Inverse of `element`."""
+        return cutoff_of(element, Ts) if self.shape is Shape.POLE else element
+
+    def parameters(self) -> Iterator[Parameter]:
+        """Its parameters, one for each element."""
+        for code in self.codes:
+            axes = code.removeprefix(self.code).removeprefix("_")
+            what, minimum = self.description, self.minimum
+            if self.shape in (Shape.MATRIX, Shape.YAW):
+                output, error = axes[0], axes[1]
+                where = AXIS_NAMES[output] if output == error else f"{AXIS_NAMES[output]} from {AXIS_NAMES[error]}"
+                what = f"{self.key}: {what}, {where}"
+                if output == error and self.diagonal_minimum is not None:
+                    minimum = self.diagonal_minimum
+            elif axes:
+                what = f"{what}, {AXIS_NAMES[axes]}"
+            yield Parameter(PREFIX + code, code, self.unit, minimum, self.maximum, self.writable, what)
 
 
 @dataclass(frozen=True)
@@ -48,63 +206,112 @@ class Parameter:
     description: str
 
 
-#: Matrix -> (unit, largest value, what it does).
-_TERMS = {
-    "Kp_o": ("1/s", 50.0, "rate set-point from angle error"),
-    "Kp_i": ("s", 5.0, "moment from rate error"),
-    "Ki_i": ("", 10.0, "moment from the integral of the rate error"),
-    "Kd_i": ("s^2", 0.5, "moment from angular acceleration, subtracted"),
-    "Kff_i": ("s", 5.0, "moment from rate set-point"),
-}
-#: Matrix -> least value of its diagonal: a loop without positive P, or with negative I, is none. D and feed-forward may
-#: be negative: a reference model may ask for less damping than the vehicle has. P is a hundredth of what small
-#: vehicles have, or more.
-_DIAGONAL = {"Kp_o": 0.01, "Kp_i": 1e-4, "Ki_i": 0.0}
-_LIMITS = {
-    "rate_max": ("rad/s", 0.01, 50.0, "limit of the rate set-point"),
-    "moment_max": ("norm", 0.01, 1.0, "limit of the moment, excitation included"),
-    "integral_max": ("norm", 0.001, 1.0, "limit of the integral term"),
-}
+def _gain(
+    key: str, code: str, unit: str, largest: float, description: str, comment: str, diagonal: float | None = None
+) -> Row:
+    smallest = -largest
+    return Row(key, key.lower(), code, Shape.MATRIX, unit, smallest, largest, description, comment, diagonal)
 
 
-def _gain(matrix: str, output: str, error: str) -> Parameter:
-    unit, largest, text = _TERMS[matrix]
-    code = f"{MATRICES[matrix]}_{output}{error}"
-    what = (
-        f"{text}, {AXIS_NAMES[output]} from {AXIS_NAMES[error]}" if output != error else f"{text}, {AXIS_NAMES[output]}"
+def _yaw(gain: Row) -> Row:
+    """The yaw axis' scalar of a gain matrix."""
+    return Row(
+        gain.key,
+        f"yaw_{gain.member}",
+        gain.code,
+        Shape.YAW,
+        gain.unit,
+        gain.minimum,
+        gain.maximum,
+        gain.description,
+        diagonal_minimum=gain.diagonal_minimum,
     )
-    smallest = _DIAGONAL.get(matrix, -largest) if output == error else -largest
-    return Parameter(PARAMETER_PREFIX + code, code, unit, smallest, largest, True, f"{matrix}: {what}")
 
 
-def _limit(limit: str, axis: str) -> Parameter:
-    unit, smallest, largest, text = _LIMITS[limit]
-    code = f"{LIMITS[limit]}_{axis}"
-    return Parameter(PARAMETER_PREFIX + code, code, unit, smallest, largest, True, f"{text}, {AXIS_NAMES[axis]}")
+def _limit(key: str, code: str, unit: str, smallest: float, largest: float, description: str, comment: str) -> Row:
+    return Row(key, key, code, Shape.AXES, unit, smallest, largest, description, comment, valid=POSITIVE)
 
 
-PARAMETERS: tuple[Parameter, ...] = (
-    *(_gain(matrix, output, error) for matrix in MATRICES for output in "RP" for error in "RP"),
-    *(_gain(matrix, "Y", "Y") for matrix in MATRICES),
-    *(_limit(limit, axis) for limit in LIMITS for axis in "RPY"),
-    Parameter(
-        "MIMO_D_POLE", "D_POLE", "norm", 0.0, 0.9999, True, "pole of the derivative filter, exp(-2 pi f_d Ts); 0: none"
+# A diagonal without positive P, or with negative I, is no loop. D and feed-forward may be negative: a reference model
+# may ask for less damping than the vehicle has. The least P is a hundredth of what small vehicles have.
+_GAINS = (
+    _gain("Kp_o", "AP", "1/s", 50.0, "rate set-point from angle error", "1/s, angle error to rate set-point", 0.01),
+    _gain("Kp_i", "RP", "s", 5.0, "moment from rate error", "s, rate error to moment", 1e-4),
+    _gain(
+        "Ki_i",
+        "RI",
+        "",
+        10.0,
+        "moment from the integral of the rate error",
+        "1, integral of the rate error to moment",
+        0.0,
     ),
-    Parameter("MIMO_TS", "TS", "s", 1e-4, 1.0, False, "control period, fixed in the firmware"),
+    _gain(
+        "Kd_i",
+        "RD",
+        "s^2",
+        0.5,
+        "moment from angular acceleration, subtracted",
+        "s^2, measured angular acceleration to moment, subtracted",
+    ),
+    _gain("Kff_i", "RF", "s", 5.0, "moment from rate set-point", "s, rate set-point to moment"),
 )
 
-#: What a vehicle publishes beside them, so that gains made for another unit of moment are noticed.
+#: The table, in the order of the C++ struct.
+ROWS: tuple[Row, ...] = (
+    *_GAINS,
+    *map(_yaw, _GAINS),
+    _limit("rate_max", "RMAX", "rad/s", 0.01, 50.0, "limit of the rate set-point", "rad/s"),
+    _limit("moment_max", "UMAX", "norm", 0.01, 1.0, "limit of the moment, excitation included", "dimensionless"),
+    _limit("integral_max", "IMAX", "norm", 0.001, 1.0, "limit of the integral term", "dimensionless"),
+    Row(
+        "derivative_cutoff_hz",
+        "derivative_pole",
+        "D_POLE",
+        Shape.POLE,
+        "norm",
+        0.0,
+        0.9999,
+        "pole of the derivative filter, exp(-2 pi f_d Ts); 0: none",
+        "a = exp(-2 pi f_d Ts), 0: no filter",
+        valid=STABLE_POLE,
+    ),
+    Row(
+        "Ts",
+        "period",
+        "TS",
+        Shape.SCALAR,
+        "s",
+        1e-4,
+        1.0,
+        "control period, fixed in the firmware",
+        "Ts, s",
+        writable=False,
+        valid=PERIOD,
+    ),
+)
+
+
+def rows(*shapes: Shape) -> tuple[Row, ...]:
+    """The rows of some shapes."""
+    return tuple(row for row in ROWS if row.shape in shapes)
+
+
+#: Gain matrix -> code of its loop and term.
+MATRICES = {row.key: row.code for row in rows(Shape.MATRIX)}
+#: Limit -> code.
+LIMITS = {row.key: row.code for row in rows(Shape.AXES)}
+
+PARAMETERS: tuple[Parameter, ...] = tuple(parameter for row in ROWS for parameter in row.parameters())
+
+#: Code of the unit of torque: N m that u = 1 stands for, by axis.
+SCALE = "SCALE"
+#: What a vehicle publishes beside the parameters, so that gains made for another unit of torque are noticed.
 IDENTITY: tuple[Parameter, ...] = tuple(
     Parameter(
-        f"{PARAMETER_PREFIX}{SCALE}_{axis}",
-        f"{SCALE}_{axis}",
-        "N m",
-        0.0,
-        1e6,
-        False,
-        f"moment of u = 1, {AXIS_NAMES[axis]}",
+        f"{PREFIX}{SCALE}_{axis}", f"{SCALE}_{axis}", "N m", 0.0, 1e6, False, f"moment of u = 1, {AXIS_NAMES[axis]}"
     )
-    for axis in "RPY"
+    for axis in AXIS_LETTERS
 )
 
 
@@ -147,19 +354,12 @@ EXCITATION: tuple[Setting, ...] = (
 ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
 
 
-#: Verdicts that gains may be emitted and uploaded with, the best first.
-ACCEPTED = ("certified", "stable, thin margin")
-
-#: Longest name that MAVLink and PX4 carry.
-NAME_LENGTH = 16
-
-
 def check_names() -> None:
     """Refuse a table that a vehicle would garble: PX4 and MAVLink say nothing of a name that is too long.
 
     Raises
     ------
-    CodegenError
+    TuningError
         Naming a parameter whose name is too long, not of A-Z, 0-9 and _, or taken twice.
     """
     table: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
@@ -167,81 +367,9 @@ def check_names() -> None:
     for parameter in table:
         name = parameter.name
         if len(name) > NAME_LENGTH:
-            raise CodegenError(f"{name}: a name of {len(name)} characters, a vehicle stores at most {NAME_LENGTH}")
+            raise TuningError(f"{name}: a name of {len(name)} characters, a vehicle stores at most {NAME_LENGTH}")
         if not re.fullmatch("[A-Z][A-Z0-9_]*", name):
-            raise CodegenError(f"{name}: expected a letter, then A-Z, 0-9 and _: a vehicle drops other names")
+            raise TuningError(f"{name}: expected a letter, then A-Z, 0-9 and _: a vehicle drops other names")
         if name in seen:
-            raise CodegenError(f"{name}: two parameters have this name")
+            raise TuningError(f"{name}: two parameters have this name")
         seen.add(name)
-
-
-def identity_parameters(gains: Gains) -> dict[str, float]:
-    """Name -> value of `IDENTITY`; empty when the gains do not say their unit of moment."""
-    return {p.name: value for p, value in zip(IDENTITY, gains.moment_scale or (), strict=False)}
-
-
-def check_ranges(gains: Gains) -> None:
-    """Refuse a set that a vehicle would refuse.
-
-    Raises
-    ------
-    CodegenError
-        Naming the first parameter out of its range, its value and the range.
-    """
-    values = gains.elements()
-    for parameter in PARAMETERS:
-        value = values[parameter.code]
-        if not parameter.minimum <= value <= parameter.maximum:
-            raise CodegenError(
-                f"{parameter.name}: got {value:.6g} {parameter.unit}".rstrip()
-                + f", expected {parameter.minimum:g} to {parameter.maximum:g} ({parameter.description})"
-            )
-
-
-def check_verdict(gains: Gains, allow: bool) -> str:
-    """Refuse gains whose loop is unstable, too near to it, or was never examined.
-
-    Parameters
-    ----------
-    gains : Gains
-        The set, with its certificate.
-    allow : bool
-        Go on all the same.
-
-    Returns
-    -------
-    str
-        A warning to show; empty when the set is certified.
-
-    Raises
-    ------
-    CodegenError
-        When the verdict is any other than ``certified`` and ``stable, thin margin``, and `allow` is False.
-    """
-    verdict, reason = gains.verdict()
-    loose = _loose_thresholds(gains) if verdict in ACCEPTED else ""
-    if verdict == ACCEPTED[0]:
-        return loose
-    if verdict not in ACCEPTED and not allow:
-        verdict = "no certificate" if verdict == "none" else verdict
-        raise CodegenError(f"{verdict}: {reason}; tune or certify again, or give --uncertified to go on all the same")
-    return f"certificate: {verdict}: {reason}{'; ' if loose else ''}{loose}"
-
-
-def _loose_thresholds(gains: Gains) -> str:
-    """What is to be said where a certificate asked for less margin than usual."""
-    asked = {**DEFAULT_THRESHOLDS.model_dump(), **dict((gains.certificate or {}).get("thresholds", {}))}
-    usual = DEFAULT_THRESHOLDS
-    peaks = asked["Ms"] <= usual.Ms and asked["thin_Ms"] <= usual.thin_Ms
-    if peaks and asked["phase_deg"] >= usual.phase_deg and asked["thin_phase_deg"] >= usual.thin_phase_deg:
-        return ""
-    return (
-        f"the certificate asked for less margin than usual: Ms {asked['Ms']:g} and {asked['phase_deg']:g} degrees "
-        f"(thin: {asked['thin_Ms']:g} and {asked['thin_phase_deg']:g})"
-    )
-
-
-def to_array(gains: Gains) -> NDArray[np.float32]:
-    """The (36,) float32 array that ``mimopilot::Gains`` is in memory."""
-    values = gains.elements()
-    return np.array([values[parameter.code] for parameter in PARAMETERS], dtype=np.float32)

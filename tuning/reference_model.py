@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
 from functools import lru_cache
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
+
+from mimopilot.common.toml import shown
 
 MAX_DAMPING = 10
 MAX_DELAY = 100
@@ -86,6 +90,96 @@ class ReferenceModel:
         horizon = 1 if slowest == 0 else int(np.ceil(np.log(fraction / 100) / np.log(slowest)))
         transient = np.abs(lfilter([1.0], self.den, np.eye(1, horizon + len(self.den))[0]))
         return int(np.flatnonzero(transient > fraction * transient.max())[-1]) + 1 + self.delay
+
+
+class ContinuousModel(Protocol):
+    """A reference model as it is asked for, in continuous time."""
+
+    type: ClassVar[str]
+
+    @property
+    def bandwidth(self) -> float:
+        """Where its magnitude begins to fall, rad/s."""
+
+    def discretise(self, Ts: float) -> ReferenceModel:
+        """The model sampled every `Ts` seconds, zero-order hold."""
+
+    def as_table(self) -> dict[str, Any]:
+        """Its parameters and its type, as plain TOML values; see `model_from_table`."""
+
+
+@dataclass(frozen=True)
+class SecondOrder:
+    """omega^2/(s^2 + 2 zeta omega s + omega^2), times z^-delay.
+
+    Attributes
+    ----------
+    omega : float, rad/s
+        Natural frequency.
+    zeta : float
+        Damping ratio.
+    delay : int, samples
+        Extra dead time.
+    """
+
+    type: ClassVar[str] = "second_order"
+
+    omega: float
+    zeta: float
+    delay: int = 0
+
+    def __post_init__(self) -> None:
+        whole = 0 <= self.delay < np.inf and self.delay == int(self.delay)
+        if not (0 < self.omega < np.inf and 0 < self.zeta < np.inf and whole):
+            raise TuningError(
+                f"reference model: got omega {self.omega} rad/s, damping {self.zeta}, delay {self.delay}; expected "
+                "omega and damping above 0, and a delay of whole samples"
+            )
+        object.__setattr__(self, "delay", int(self.delay))
+
+    @property
+    def bandwidth(self) -> float:
+        """The natural frequency, rad/s."""
+        return self.omega
+
+    def discretise(self, Ts: float) -> ReferenceModel:
+        """See `second_order`."""
+        return second_order(self.omega, self.zeta, self.delay, Ts)
+
+    def as_table(self) -> dict[str, Any]:
+        """The model as plain TOML values."""
+        return {"type": self.type, **asdict(self)}
+
+    def as_list(self) -> list[float | int]:
+        """OMEGA, ZETA, DELAY, as a specification and the command line have it."""
+        return [self.omega, self.zeta, self.delay]
+
+
+#: Type -> class of every reference model that there is; a new one is a class and a row.
+CONTINUOUS_MODELS: dict[str, type[SecondOrder]] = {SecondOrder.type: SecondOrder}
+
+
+def model_from_table(table: Any, where: str) -> ContinuousModel:
+    """A model from its table, or from the list [omega, zeta, delay] of a second-order one.
+
+    Raises
+    ------
+    TuningError
+        When the type is unknown, or an entry is missing, unknown or no number.
+    """
+    if isinstance(table, list | tuple) and len(table) in (2, 3):
+        table = {"type": SecondOrder.type, **dict(zip(("omega", "zeta", "delay"), table, strict=False))}
+    kind = CONTINUOUS_MODELS.get(table.get("type", "")) if isinstance(table, Mapping) else None
+    numbers = [value for name, value in table.items() if name != "type"] if kind else []
+    if kind is None or any(isinstance(v, bool) or not isinstance(v, int | float) for v in numbers):
+        raise TuningError(
+            f"{where}: got {shown(table)}, expected [omega, damping, delay], or a table with type "
+            f"{' or '.join(CONTINUOUS_MODELS)} and its numbers"
+        )
+    try:
+        return kind(**{name: value for name, value in table.items() if name != "type"})
+    except TypeError:
+        raise TuningError(f"{where}: got {shown(table)}, expected the numbers of a {table['type']} model") from None
 
 
 @lru_cache(maxsize=256)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
+from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.reference_model import ReferenceModel, second_order
-from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS, Thresholds
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder, model_from_table
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from mimopilot.common.toml import checked, read_toml
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Model = tuple[Positive, Positive, Annotated[int, Field(ge=0)]]
 Triple = tuple[Positive, Positive, Positive]
 
 
@@ -65,8 +64,9 @@ class TuningSpec(_Table):
     ----------
     method : str
         ``mimo``: full matrices. ``siso``: each axis by itself, with the optimal prefilter (3.12).
-    inner, outer : tuple of (omega rad/s, damping, delay samples)
-        Reference models of the rate and the attitude loop: one for both axes, or one each.
+    inner, outer : tuple of 2 SecondOrder
+        Reference models of the rate and the attitude loop, roll then pitch. In TOML [omega rad/s, damping, delay
+        samples], one list for both axes or one each.
     structure : str
         Terms of the rate controller: letters of ``PIDF`` in that order, P among them. The attitude controller is P.
     instrument : str
@@ -101,8 +101,8 @@ class TuningSpec(_Table):
     """
 
     method: Literal["mimo", "siso"] = "mimo"
-    inner: tuple[Model, Model] = ((30.0, 0.7, 0), (30.0, 0.7, 0))
-    outer: tuple[Model, Model] = ((10.0, 0.7, 0), (10.0, 0.7, 0))
+    inner: tuple[SecondOrder, SecondOrder] = (SecondOrder(30.0, 0.7), SecondOrder(30.0, 0.7))
+    outer: tuple[SecondOrder, SecondOrder] = (SecondOrder(10.0, 0.7), SecondOrder(10.0, 0.7))
     structure: Annotated[str, Field(pattern="^PI?D?F?$")] = "PID"
     instrument: Literal["external", "u", "model", "repeated"] = "external"
     trim: bool = True
@@ -120,14 +120,17 @@ class TuningSpec(_Table):
 
     @field_validator("inner", "outer", mode="before")
     @classmethod
-    def _one_model_for_both_axes(cls, value: object) -> object:
-        if isinstance(value, list | tuple) and len(value) == 3 and not isinstance(value[0], list | tuple):
-            return (tuple(value), tuple(value))
-        return tuple(tuple(v) if isinstance(v, list) else v for v in value) if isinstance(value, list) else value
+    def _one_model_for_both_axes(cls, value: object, info: ValidationInfo) -> object:
+        several = isinstance(value, list | tuple) and len(value) == 2 and not isinstance(value[0], int | float)
+        models = value if isinstance(value, list | tuple) and several else (value, value)
+        return tuple(
+            model if isinstance(model, SecondOrder) else model_from_table(model, str(info.field_name))
+            for model in models
+        )
 
     def models(self, loop: Literal["inner", "outer"], Ts: float) -> list[ReferenceModel]:
         """Reference models of a loop, roll then pitch."""
-        return [second_order(omega, zeta, delay, Ts) for omega, zeta, delay in getattr(self, loop)]
+        return [model.discretise(Ts) for model in getattr(self, loop)]
 
 
 def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
@@ -143,7 +146,7 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
     return checked(TuningSpec, table, str(path or "specification"))
 
 
-def parse_model(text: str) -> tuple[float, float, int]:
+def parse_model(text: str) -> SecondOrder:
     """``OMEGA,ZETA,DELAY`` (rad/s, damping, samples) as it stands on the command line.
 
     Raises
@@ -154,15 +157,16 @@ def parse_model(text: str) -> tuple[float, float, int]:
     Examples
     --------
     >>> parse_model("20,0.4,0")
-    (20.0, 0.4, 0)
+    SecondOrder(omega=20.0, zeta=0.4, delay=0)
     """
     parts = text.split(",")
     try:
         if len(parts) not in (2, 3):
             raise ValueError
-        return float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
+        omega, zeta, delay = float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
     except ValueError:
         raise TuningError(f"reference model: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0") from None
+    return SecondOrder(omega, zeta, delay)
 
 
 def parse_doublet(text: str) -> dict[str, float]:

@@ -64,20 +64,14 @@ float wrap(float angle)
 
 [[gnu::cold, gnu::noinline]] bool acceptable(const Gains &gains)
 {
-	constexpr int kCount = 36;
-	static_assert(sizeof(Gains) == kCount * sizeof(float), "Gains is a row of floats");
+	static_assert(sizeof(Gains) == kGainCount * sizeof(float), "Gains is a row of floats");
 	const float *const values = reinterpret_cast<const float *>(&gains);
 
-	for (int i = 0; i < kCount; i++) {
+	for (int i = 0; i < kGainCount; i++) {
 		if (!within(values[i], kMaxGain)) { return false; }
 	}
 
-	for (int j = 0; j < kAxes; j++) {
-		if (gains.rate_max[j] <= 0.0F || gains.moment_max[j] <= 0.0F || gains.integral_max[j] <= 0.0F) { return false; }
-	}
-
-	return gains.derivative_pole >= 0.0F && gains.derivative_pole < 1.0F
-	       && gains.period >= 1.0e-4F && gains.period <= 1.0F;
+	return valid(gains);
 }
 
 // The outer loop: rate set-points r.

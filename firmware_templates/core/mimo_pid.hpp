@@ -13,33 +13,15 @@
 
 #include <stdint.h>
 
+#include "gains_struct.hpp"
+
 namespace mimopilot {
 
-constexpr int kAxes = 3;            // roll, pitch, yaw
 constexpr int32_t kHoldSamples = 25;  // an invalid input is replaced by its last good value for so long
 constexpr float kMaxRate = 100.0F;    // rad/s, range of a credible body rate
 constexpr float kMaxAngle = 12.566371F;  // rad, 4 pi, range of a credible angle or set-point
 constexpr float kMaxExcitation = 1.0F;   // range of a credible injected moment
 constexpr float kMaxGain = 1.0e6F;       // no gain or limit may be larger
-
-// Row: output. Column: error. Index 0 is roll, 1 is pitch. All floats, in the order of the parameter table.
-struct Gains {
-	float kp_o[2][2];   // 1/s, angle error to rate set-point
-	float kp_i[2][2];   // s, rate error to moment
-	float ki_i[2][2];   // 1, integral of the rate error to moment
-	float kd_i[2][2];   // s^2, measured angular acceleration to moment, subtracted
-	float kff_i[2][2];  // s, rate set-point to moment
-	float yaw_kp_o;
-	float yaw_kp_i;
-	float yaw_ki_i;
-	float yaw_kd_i;
-	float yaw_kff_i;
-	float rate_max[kAxes];      // rad/s
-	float moment_max[kAxes];    // dimensionless
-	float integral_max[kAxes];  // dimensionless
-	float derivative_pole;      // a = exp(-2 pi f_d Ts), 0: no filter
-	float period;               // Ts, s
-};
 
 struct Input {
 	float attitude_setpoint[kAxes];  // rad

@@ -16,8 +16,6 @@ enum mimo_pid_layout_item {
 	MIMO_PID_SIZEOF_INPUT,
 	MIMO_PID_SIZEOF_OUTPUT,
 	MIMO_PID_SIZEOF_STATE,
-	MIMO_PID_OFFSET_GAINS_RATE_MAX,
-	MIMO_PID_OFFSET_GAINS_PERIOD,
 	MIMO_PID_OFFSET_INPUT_RATES,
 	MIMO_PID_OFFSET_INPUT_SATURATION,
 	MIMO_PID_OFFSET_INPUT_LANDED,
@@ -26,7 +24,7 @@ enum mimo_pid_layout_item {
 	MIMO_PID_LAYOUT_ITEMS
 };
 
-/* First 32 bits of the SHA-256 of the two headers that define this interface. */
+/* First 32 bits of the SHA-256 of this header, of core/mimo_pid.hpp and of the members of Gains. */
 uint32_t mimo_pid_interface_hash(void);
 
 /* Size or offset in bytes; -1 for an unknown item. */

@@ -71,7 +71,7 @@ def convert(
 ) -> None:
     """Bring gains into the unit of moment of an airframe's allocator: the moment in N m stays the same."""
     from mimopilot.sitl.physics.airframe import load_airframe
-    from mimopilot.tuning.gains import load_gains
+    from mimopilot.tuning.gains_file import load_gains
 
     loaded, scale = load_gains(gains), load_airframe(airframe).airframe.moment_scale()
     loaded.with_moment_scale(scale).save(out)
@@ -81,7 +81,7 @@ def convert(
 
 def _load(airframe: str, gains: Path | None) -> tuple[Any, Any]:
     from mimopilot.sitl.physics.airframe import load_airframe
-    from mimopilot.tuning.gains import load_gains
+    from mimopilot.tuning.gains_file import load_gains
 
     vehicle = load_airframe(airframe)
     return vehicle.airframe, load_gains(gains) if gains else vehicle.default_gains()

@@ -34,8 +34,8 @@ def generate(
 ) -> None:
     """Emit the C++ controller with its gains, parameter table, build files and tests."""
     from mimopilot.codegen.render import render, write_tree
-    from mimopilot.tuning.gains import load_gains
-    from mimopilot.tuning.parameters import check_verdict
+    from mimopilot.tuning.acceptance import check_verdict
+    from mimopilot.tuning.gains_file import load_gains
 
     loaded = load_gains(gains)
     warning = check_verdict(loaded, allow=uncertified)
@@ -56,7 +56,7 @@ def pil(
     from mimopilot.codegen.budget import processor_in_the_loop
     from mimopilot.codegen.errors import CodegenError
     from mimopilot.common.console import print_json, print_table
-    from mimopilot.tuning.gains import load_gains
+    from mimopilot.tuning.gains_file import load_gains
 
     figures = processor_in_the_loop(load_gains(gains), rows, emulator)
     failed = [figure.name for figure in figures if not figure.passed]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,8 +75,8 @@ def tune(
     from mimopilot.common.console import print_json
     from mimopilot.tuning.design.cascade import tune as tune_cascade
     from mimopilot.tuning.errors import TuningError
-    from mimopilot.tuning.gains import MATRICES
     from mimopilot.tuning.logs.columns import load_columns
+    from mimopilot.tuning.parameters import MATRICES
     from mimopilot.tuning.spec import load_spec, parse_doublet, parse_model
 
     task = load_spec(
@@ -100,12 +100,13 @@ def tune(
     experiment = read_warned(log, columns)
     gains = tune_cascade(experiment, task, repeat=read_warned(repeat, columns) if repeat else None)
     gains.save(out)
-    deviations = gains.provenance["standard_deviation"]
-    print_warnings(log, (warning for warning in gains.provenance["warnings"] if warning not in experiment.warnings))
+    deviations = gains.provenance.standard_deviation
+    print_warnings(log, (warning for warning in gains.provenance.warnings if warning not in experiment.warnings))
     if as_json:
         matrices: dict[str, Any] = {name: getattr(gains, name).tolist() for name in MATRICES}
         found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}
-        print_json({**found, "certificate": gains.certificate})
+        certificate = gains.certificate.as_table() if gains.certificate else None
+        print_json({**found, "derivative_cutoff_hz": gains.derivative_cutoff_hz, "certificate": certificate})
         return
     print_gains(f"{task.method.upper()} gains from {log.name} (standard deviation)", gains, deviations)
     print_certificate(gains)
@@ -149,19 +150,19 @@ def certify(
 ) -> None:
     """Say whether a loop will be stable, from a flight of the vehicle under any gains. Exit code 1: not shown."""
     from mimopilot.common.console import print_json
-    from mimopilot.tuning.analysis.certificate import CERTIFIED, THIN
+    from mimopilot.tuning.certificate import ACCEPTED
     from mimopilot.tuning.design.cascade import certify_from_log
-    from mimopilot.tuning.gains import load_gains
+    from mimopilot.tuning.gains_file import load_gains
     from mimopilot.tuning.spec import load_spec
 
     examined = certify_from_log(read_warned(log, columns), load_gains(gains), load_spec(spec))
     if out is not None:
         examined.save(out)
     if as_json:
-        print_json(examined.certificate or {})
+        print_json(examined.certificate.as_table() if examined.certificate else {})
     else:
         print_certificate(examined)
-    if examined.verdict()[0] not in (CERTIFIED, THIN):
+    if examined.verdict()[0] not in ACCEPTED:
         raise typer.Exit(1)
 
 
@@ -230,8 +231,8 @@ def print_certificate(gains: Any) -> None:
     from mimopilot.tuning.analysis.margins import AXES
 
     certificate = gains.certificate
-    figures = certificate["figures"]
-    print(f"{certificate['verdict']}: {certificate['reason']}")
+    figures = certificate.figures
+    print(f"{certificate.verdict}: {certificate.reason}")
     if not figures:
         return
     rows = [
@@ -251,7 +252,7 @@ def print_certificate(gains: Any) -> None:
                 f"{figures['delay_margin_ms'][axis]:.1f} ms",
             ]
         )
-    low, high = certificate["band"]
+    low, high = certificate.band
     print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)
 
 
@@ -345,10 +346,10 @@ def print_warnings(log: Path, warnings: Iterable[str]) -> None:
         print(f"mimopilot: warning: {log}: {warning}", file=sys.stderr)
 
 
-def print_gains(title: str, gains: Any, deviations: dict[str, Any]) -> None:
+def print_gains(title: str, gains: Any, deviations: Mapping[str, Any]) -> None:
     """The matrices of a set as a table, with standard deviations where they are known."""
     from mimopilot.common.console import print_table
-    from mimopilot.tuning.gains import MATRICES
+    from mimopilot.tuning.parameters import MATRICES
 
     rows = []
     for name in MATRICES:

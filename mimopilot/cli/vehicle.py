@@ -75,8 +75,8 @@ def upload(
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
     from mimopilot.sitl.mavlink.ground_station.session import Options
     from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, transact
-    from mimopilot.tuning.gains import load_gains
-    from mimopilot.tuning.parameters import check_verdict
+    from mimopilot.tuning.acceptance import check_verdict
+    from mimopilot.tuning.gains_file import load_gains
 
     loaded = load_gains(gains)
     warning = check_verdict(loaded, allow=uncertified)

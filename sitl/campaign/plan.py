@@ -17,7 +17,8 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import parse_fault
 from mimopilot.sitl.flight.scenario import Scenario, make_scenario
 from mimopilot.sitl.physics.airframe import Airframe, Vehicle, airframe_from_toml
-from mimopilot.tuning.gains import Gains, gains_from_toml, gains_to_toml
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml
 from pydantic import BaseModel, ConfigDict, Field
 
 from mimopilot.common.files import inside, read_text, sha256, write_atomically

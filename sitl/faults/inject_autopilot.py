@@ -9,8 +9,7 @@ import numpy as np
 from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import Fault
-from mimopilot.tuning.gains import MATRICES
-from mimopilot.tuning.parameters import PARAMETERS
+from mimopilot.tuning.parameters import MATRICES, PARAMETERS
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.airframe import Vector
-from mimopilot.tuning.gains import AXES
+from mimopilot.tuning.parameters import AXES
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mimopilot.common.toml import complaint

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.render import generator_version
 from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import IDENTITY, PARAMETERS, to_array
+from mimopilot.tuning.parameters import IDENTITY, PARAMETERS
 from numpy.typing import NDArray
 
 from mimopilot.common.files import write_atomically

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.reference_model import ReferenceModel, second_order
+from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
 
-DEFAULT_INNER = (20.0, 0.4, 0)
-DEFAULT_OUTER = (10.0, 0.7, 0)
+#: The thesis' own, for both axes.
+DEFAULT_INNER = (SecondOrder(20.0, 0.4),) * 2
+DEFAULT_OUTER = (SecondOrder(10.0, 0.7),) * 2
 
 
 def reference_models(gains: Gains, axis: int) -> tuple[ReferenceModel, ReferenceModel]:
     """Inner and outer model of an axis, from the gains' provenance; the thesis' own when they have none."""
-    inner: tuple[float, float, int] = gains.provenance.get("inner_model", [DEFAULT_INNER, DEFAULT_INNER])[axis]
-    outer: tuple[float, float, int] = gains.provenance.get("outer_model", [DEFAULT_OUTER, DEFAULT_OUTER])[axis]
-    return second_order(*inner, gains.Ts), second_order(*outer, gains.Ts)
+    inner = (gains.provenance.inner_model or DEFAULT_INNER)[axis]
+    outer = (gains.provenance.outer_model or DEFAULT_OUTER)[axis]
+    return inner.discretise(gains.Ts), outer.discretise(gains.Ts)

@@ -12,7 +12,8 @@ import numpy as np
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.mixer import Allocation, make_allocation, moment_scale
 from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, checked_inertia
-from mimopilot.tuning.gains import Gains, load_gains
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains_file import load_gains
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 

@@ -20,6 +20,7 @@ from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.sitl.studies.optimum import Task, best_gains, flown_effort
 from mimopilot.tuning.analysis.certificate import DENSE, certify, sensitivity_peak
 from mimopilot.tuning.analysis.doublet_prediction import doublet_model, effort
+from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.design.refine_manoeuvre import INTEGRAL
 from mimopilot.tuning.experiment import Experiment
@@ -28,9 +29,8 @@ from mimopilot.tuning.motors import fit_motors
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.inertia import rigid_body
 from mimopilot.tuning.plant.measured import Measured
-from mimopilot.tuning.reference_model import ReferenceModel, second_order
+from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder, second_order
 from mimopilot.tuning.spec import Manoeuvre, TuningSpec
-from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS
 
 DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, perturbed log"
 MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same with any effort"
@@ -242,9 +242,10 @@ def tune_all(study: Study, measured: Measured, siso_log: Experiment) -> dict[str
     """Every data-driven method, each from one log."""
     log = measured.experiment
     default = _bench(study.airframe)[1]
-    inner, outer = study.siso_models
-    siso = TuningSpec(method="siso", inner=(inner, inner), outer=(outer, outer))
-    mimo = TuningSpec(inner=(study.inner, study.inner), outer=(study.outer, study.outer))
+    own, others = ((SecondOrder(*m) for m in models) for models in ((study.inner, study.outer), study.siso_models))
+    (inner, outer), (siso_inner, siso_outer) = own, others
+    siso = TuningSpec(method="siso", inner=(siso_inner, siso_inner), outer=(siso_outer, siso_outer))
+    mimo = TuningSpec(inner=(inner, inner), outer=(outer, outer))
     found = {DEFAULT: default, AUTOTUNE: autotune(log, default), SISO: tune(siso_log, siso)}
     if siso_log is not log:
         found[SISO_OWN] = tune(log, siso)
@@ -309,7 +310,7 @@ def run(study: Study, seed: int, best: dict[str, Gains]) -> Run:
     measured = Measured(log)
     inner, outer = ([model] * 2 for model in study.models(MIMO, log.Ts))
     gains = {
-        method: certify(found, measured.response, inner, outer).bound_to(found)
+        method: found.with_certificate(certify(found, measured.response, inner, outer))
         for method, found in (tune_all(study, measured, siso_log) | best).items()
     }
     doublets = study.doublets(log.Ts)
@@ -328,7 +329,7 @@ def numbers(found: Run) -> dict[str, Any]:
     return {
         method: {
             "verdict": gains.verdict()[0],
-            "Ms": (gains.certificate or {}).get("figures", {}).get("Ms"),
+            "Ms": gains.certificate.figures.get("Ms") if gains.certificate else None,
             "gains": {name: np.asarray(getattr(gains, name)).tolist() for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i")},
             **{axis: asdict(figures) for axis, figures in zip(AXES, found.figures[method], strict=True)},
         }

@@ -23,6 +23,7 @@ import numpy as np
 from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.provenance import Provenance
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
 
@@ -64,7 +65,7 @@ def autotune(experiment: Experiment, flown: Gains) -> Gains:
         Kd_i=Kd_i,
         Kff_i=zero,
         certificate=None,
-        provenance={"method": "autotune", "log": experiment.source},
+        provenance=Provenance("autotune", experiment.source),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from mimopilot.sitl.flight.figures import MODEL, STYLES
 from mimopilot.sitl.studies.benchmarks import Benchmark
-from mimopilot.tuning.loop import LoopController, closed_loop, complementary_sensitivity
+from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 
 #: Okabe-Ito, and a style of its own each.
 LINES = (*STYLES, ("#E69F00", (0, (5, 1, 1, 1, 1, 1))))

@@ -18,7 +18,8 @@ from mimopilot.tuning.design.refine import refine
 from mimopilot.tuning.estimation.cbt_ift import Comparison, correlation_based_tuning, iterative_feedback_tuning
 from mimopilot.tuning.estimation.siso import siso_vrft
 from mimopilot.tuning.estimation.vrft import vrft
-from mimopilot.tuning.loop import LoopController
+from mimopilot.tuning.law import Filters
+from mimopilot.tuning.loop_controller import LoopController
 from mimopilot.tuning.plant.pbsid import pbsid
 
 from mimopilot.common.html_report import Section, Table
@@ -57,11 +58,11 @@ def tune_once(task: Benchmark, design: str, seed: int) -> dict[str, LoopControll
     Ts, models = task.plant.Ts, task.models
     thesis = vrft(u, y, u, models, "PI", weight="identity")
     external = vrft(u, y, u_bar, models, "PI", weight="identity")
-    optimal = LoopController(vrft(u, y, u_bar, models, "PI").gains, Ts)
+    optimal = LoopController(vrft(u, y, u_bar, models, "PI").gains, Filters(Ts))
     plant = pbsid(u, y, Ts, external=u_bar).plant
     return {
-        "VRFT, instrument u, W = I (thesis)": LoopController(thesis.gains, Ts),
-        "VRFT, instrument u_bar, W = I": LoopController(external.gains, Ts),
+        "VRFT, instrument u, W = I (thesis)": LoopController(thesis.gains, Filters(Ts)),
+        "VRFT, instrument u_bar, W = I": LoopController(external.gains, Filters(Ts)),
         "VRFT, instrument u_bar, optimal W": optimal,
         "VRFT, refined on a PBSID model": refine(optimal, plant, models).controller,
     }
@@ -119,13 +120,13 @@ def study_numerical_example() -> Part:
     half = 1000
     u = excitation(2 * half, "in turn", np.random.default_rng(0))
     u, y = task.run(None, np.zeros_like(u), u, np.random.default_rng(0))
-    mimo = LoopController(vrft(u, y, u, task.models, "PI", weight="identity").gains, task.plant.Ts)
+    mimo = LoopController(vrft(u, y, u, task.models, "PI", weight="identity").gains, Filters(task.plant.Ts))
     axes = []
     for i, part in enumerate((slice(half), slice(half, None))):
         u_i, y_i = u[part, i : i + 1], y[part, i : i + 1]
         axes.append(siso_vrft(u_i, y_i, u_i, task.model, "PI", repeated=y_i, weight="identity"))
     diagonal = {term: np.diag([axis.gain(term).item() for axis in axes]) for term in "PI"}
-    found = {"MIMO": mimo, "SISO": LoopController(diagonal, task.plant.Ts)}
+    found = {"MIMO": mimo, "SISO": LoopController(diagonal, Filters(task.plant.Ts))}
     shown = _beside(found, _printed(task, "table_5_3"), "Table 5.3")
     table = Table("Table 5.3: (B0 z + B1)/(z - 1), noise-free", CONTROLLER_COLUMNS, _rows(task, shown, {}))
     figure = svg(step_figure(task, found, 60, "Steps of the numerical example: MIMO and SISO VRFT"), "steps")

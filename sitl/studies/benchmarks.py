@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from mimopilot.tuning.design.refine import model_reference_cost
-from mimopilot.tuning.loop import LoopController, closed_loop
+from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
 from numpy.typing import NDArray

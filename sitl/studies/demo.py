@@ -25,8 +25,9 @@ from mimopilot.sitl.mavlink.simulator_api import lockstep
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.tuning.design.cascade import tune
-from mimopilot.tuning.gains import MATRICES, Gains
+from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.spec import load_spec
 
 from mimopilot.common.console import print_table
@@ -194,7 +195,7 @@ def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
             continue  # zero in every set
         for label, values in sets:
             matrix = values[name] if isinstance(values, dict) else getattr(values, name)
-            found = {} if isinstance(values, dict) else values.provenance.get("standard_deviation", {})
+            found = {} if isinstance(values, dict) else values.provenance.standard_deviation
             spread = [f" ({v:.4f})" for v in np.ravel(found[name])] if name in found else [""] * 4
             numbers = [f"{float(v):.4f}".replace("-0.0000", "0.0000") for v in np.ravel(matrix)]
             rows.append([f"{name}  {label}", *(number + s for number, s in zip(numbers, spread, strict=True))])

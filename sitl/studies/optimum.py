@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.native import NativeController, NativeLibrary
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import Scenario
@@ -21,9 +20,11 @@ from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.analysis.doublet_prediction import moment_rms
 from mimopilot.tuning.design.constrained_least_squares import MISSED, descend
 from mimopilot.tuning.design.refine_manoeuvre import OTHER_AXIS, typical_sizes
+from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.inertia import RigidBody
+from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel
 from numpy.typing import NDArray
 
@@ -84,7 +85,7 @@ class Task:
         spans = [stop - start for start, stop in (task.window for task in self.doublets)]
         try:
             flights = self.fly(gains)
-        except CodegenError:  # a gain outside of the range of its parameter
+        except TuningError:  # a gain outside of the range of its parameter
             samples = 2 * sum(spans)
             return np.full(samples, np.sqrt(LOST / samples)), [-1.0] * LIMITS
         errors = []
@@ -127,7 +128,7 @@ def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
         def at(values: Signal, start: Gains = start, scale: Signal = scale) -> Gains:
             parts = np.split(values * scale, len(FREE))
             matrices = {name: part.reshape(2, 2) for name, part in zip(FREE, parts, strict=True)}
-            return replace(start, certificate=None, provenance={"method": "optimum"}, **matrices)  # type: ignore[arg-type]
+            return replace(start, certificate=None, provenance=Provenance("optimum"), **matrices)  # type: ignore[arg-type]
 
         def examine(points: Signal, at: Callable[[Signal], Gains] = at) -> tuple[Signal, Signal]:
             every = [task.examine(at(values)) for values in points]

@@ -11,12 +11,12 @@ from mimopilot.codegen import budget
 from mimopilot.codegen.budget import Figure, cycles, different_rows, processor_in_the_loop, stack_bytes, step_costs
 from mimopilot.codegen.cortex_m4 import RAM, RAM_SIZE, EmulatedController, build_image, load_emulated, run_in_qemu
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.toolchain import CXX_FLAGS
 from mimopilot.codegen.vectors import random_inputs
 from mimopilot.sitl.physics.airframe import FOLDER
-from mimopilot.tuning.gains import load_gains
-from mimopilot.tuning.parameters import to_array
+from mimopilot.tuning.gains_file import load_gains
 
 from tests.conftest import assert_one_clear_line
 

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mimopilot.codegen.layout import OUTPUT
+from mimopilot.codegen.layout import OUTPUT, to_array
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, WARNINGS, find_compiler
 from mimopilot.codegen.vectors import random_inputs
-from mimopilot.tuning.parameters import to_array
 
 BIN = Path(sys.executable).parent
 HERE = Path(__file__).parent

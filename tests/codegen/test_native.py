@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mimopilot.codegen.errors import CodegenError
-from mimopilot.codegen.layout import INPUT
+from mimopilot.codegen.layout import INPUT, to_array
 from mimopilot.codegen.native import NativeController, NativeLibrary, build_native, load_native
 from mimopilot.codegen.vectors import random_inputs, reference_outputs
 from mimopilot.tuning.controller import Controller
-from mimopilot.tuning.gains import MATRICES, Limits
-from mimopilot.tuning.parameters import to_array
+from mimopilot.tuning.gains import Limits
+from mimopilot.tuning.parameters import MATRICES
 
 TS = 0.004
 HOLD = 25

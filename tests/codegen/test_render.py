@@ -14,6 +14,7 @@ from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.literals import float_literal
 from mimopilot.codegen.render import TARGETS, TEMPLATES, render, write_tree
 from mimopilot.codegen.toolchain import find_compiler
+from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS
 
 from mimopilot.common.files import sha256
@@ -244,7 +245,7 @@ def test_parameter_names_fit_a_vehicle():
 
 
 def test_a_gain_out_of_its_range_is_refused_by_name(gains):
-    with pytest.raises(CodegenError, match=r"MIMO_RP_RR: got 99 s, expected 0.0001 to 5"):
+    with pytest.raises(TuningError, match=r"MIMO_RP_RR: got 99 s, expected 0.0001 to 5"):
         render(gains.with_elements({"RP_RR": 99.0}))
 
 
@@ -260,7 +261,7 @@ def test_a_gain_out_of_its_range_is_refused_by_name(gains):
 def test_a_name_that_a_vehicle_would_garble_is_refused(gains, monkeypatch, name, reason):
     odd = dataclasses.replace(EXCITATION[0], name=name)
     monkeypatch.setattr("mimopilot.tuning.parameters.EXCITATION", (odd,))
-    with pytest.raises(CodegenError, match=f"{name}: {reason}"):
+    with pytest.raises(TuningError, match=f"{name}: {reason}"):
         render(gains)
 
 

@@ -4,8 +4,8 @@ import os
 import socket
 
 import pytest
-from mimopilot.tuning.errors import TuningError
 
+from mimopilot.common.errors import InputFileError
 from mimopilot.common.files import MAX_TEXT_BYTES, inside, read_bytes, read_text, seal, sha256, unseal, write_atomically
 
 
@@ -30,7 +30,7 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path, monkeypatch):
         "sparse": "10737418240 bytes, expected at most 1048576",
     }
     for name, words in expected.items():
-        with pytest.raises(TuningError, match=rf"{name}: cannot read the gains file: .*{words}"):
+        with pytest.raises(InputFileError, match=rf"{name}: cannot read the gains file: .*{words}"):
             read_bytes(tmp_path / name, "gains file")
     (tmp_path / "full").write_bytes(b"x" * MAX_TEXT_BYTES)
     (tmp_path / "link").symlink_to("full")
@@ -38,7 +38,7 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path, monkeypatch):
     (tmp_path / "marked").write_bytes("\ufeffa = 1".encode())
     assert read_text(tmp_path / "marked", "gains file") == "a = 1"
     (tmp_path / "full").write_bytes(b"x" * (MAX_TEXT_BYTES + 1))
-    with pytest.raises(TuningError, match=f"{MAX_TEXT_BYTES + 1} bytes"):
+    with pytest.raises(InputFileError, match=f"{MAX_TEXT_BYTES + 1} bytes"):
         read_bytes(tmp_path / "full", "gains file")
 
 

@@ -8,9 +8,10 @@ import tomllib
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import gains_from_toml, gains_to_toml
+from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml
+from mimopilot.tuning.provenance import Provenance
 
+from mimopilot.common.errors import InputFileError
 from mimopilot.common.toml import MAX_DEPTH, MAX_SHOWN, MAX_WORD, parse_toml, read_toml, shown, toml_entries
 from tests.conftest import assert_one_clear_line
 
@@ -37,7 +38,7 @@ MONSTERS = {
 @pytest.mark.parametrize("name", MONSTERS)
 def test_a_text_that_no_parser_should_see_is_refused_in_one_line(name):
     text, message = MONSTERS[name]
-    with pytest.raises(TuningError) as caught:
+    with pytest.raises(InputFileError) as caught:
         parse_toml(text, "file")
     assert message in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
@@ -59,10 +60,10 @@ def test_what_only_looks_like_a_monster_is_read():
 def test_as_deep_as_the_bound_is_read_and_one_deeper_is_not():
     lists = MAX_DEPTH - 1  # and the table that they stand in
     assert parse_toml("a = " + "[" * lists + "]" * lists, "file")
-    with pytest.raises(TuningError, match="nest deeper"):
+    with pytest.raises(InputFileError, match="nest deeper"):
         parse_toml("a = " + "[" * MAX_DEPTH + "]" * MAX_DEPTH, "file")
     assert parse_toml(".".join("a" * MAX_DEPTH) + " = 1", "file")
-    with pytest.raises(TuningError, match="nest deeper"):
+    with pytest.raises(InputFileError, match="nest deeper"):
         parse_toml(".".join("a" * (MAX_DEPTH + 1)) + " = 1", "file")
     assert parse_toml("a = " + "9" * MAX_WORD, "file") == {"a": int("9" * MAX_WORD)}
 
@@ -88,10 +89,9 @@ def test_what_is_written_reads_back_to_the_same(table):
 def test_odd_names_survive_the_way_through_a_gains_file(gains, mimopilot, tmp_path):
     odd = {'a "quoted" = key': 1, "a.b": {"": "empty", "line\nbreak": [{"ü ]": "\U0001f681\u2028"}]}, "'": math.inf}
     odd |= {"k" * 300: "long", "\x7f\\": "back\\slash", "when": datetime.datetime(2026, 1, 2, 3, 4)}
-    written = dataclasses.replace(gains, provenance=odd, certificate={"matrices.sha256": "x", **odd})
+    written = dataclasses.replace(gains, provenance=Provenance.from_table(odd))
     read = gains_from_toml(gains_to_toml(written), "file")
-    assert read.provenance == odd
-    assert read.certificate == {"matrices.sha256": "x", **odd}
+    assert read.provenance.details == odd
     written.save(tmp_path / "odd.gains.toml")
     done = mimopilot("convert", "odd.gains.toml", "px4_sih", "--out", "bench.gains.toml")
     assert done.returncode == 0, done.stderr
@@ -99,8 +99,8 @@ def test_odd_names_survive_the_way_through_a_gains_file(gains, mimopilot, tmp_pa
 
 
 def test_half_of_a_surrogate_pair_from_a_file_name_is_written_as_the_sign_for_it(gains):
-    text = gains_to_toml(dataclasses.replace(gains, provenance={"log": "x\udcff.ulg"}))
-    assert gains_from_toml(text, "file").provenance == {"log": "x\ufffd.ulg"}
+    text = gains_to_toml(dataclasses.replace(gains, provenance=Provenance(log="x\udcff.ulg")))
+    assert gains_from_toml(text, "file").provenance.log == "x\ufffd.ulg"
 
 
 @given(st.text() | st.integers() | st.lists(st.text()))

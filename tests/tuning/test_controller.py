@@ -4,10 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from mimopilot.tuning.controller import Controller, filtered_derivative, inverse_eigenvalues, rebuild_rate_setpoint
+from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.estimation.vrft import regressors
 from mimopilot.tuning.gains import Limits
+from mimopilot.tuning.law import Filters, inverse_eigenvalues, rate_matrices, rebuild_rate_setpoint, regressors
 
 N = 400
 
@@ -31,9 +31,9 @@ def fly(gains, seed=0):
 
 @pytest.mark.parametrize("cutoff", [0.0, 30.0])
 def test_the_regressor_is_the_flown_difference_equation(gains, cutoff):
-    gains = dataclasses.replace(unlimited(gains), derivative_cutoff_hz=cutoff)
+    gains = dataclasses.replace(unlimited(gains), filters=Filters(0.004, cutoff))
     u, r_i, y_i = fly(gains)
-    x = regressors("PIDF", r_i - y_i, y_i, r_i, gains.Ts, cutoff)
+    x = regressors("PIDF", r_i - y_i, y_i, r_i, gains.filters)
     B = np.hstack([gains.Kp_i, gains.Ki_i, gains.Kd_i, gains.Kff_i])
     assert x @ B.T == pytest.approx(u, abs=1e-10)
 
@@ -70,7 +70,7 @@ def test_a_controller_that_is_not_minimum_phase_is_refused_with_its_eigenvalues(
 def test_the_poles_of_the_inverse_are_those_of_the_closed_form(gains):
     diagonal = dataclasses.replace(gains, Ki_i=np.diag([0.25, 0.2]), Kp_i=np.diag([0.15, 0.13]), Kff_i=np.zeros((2, 2)))
     expected = [0.15 / (0.15 + 0.004 * 0.25), 0.13 / (0.13 + 0.004 * 0.2)]
-    got = inverse_eigenvalues(diagonal.Kp_i, diagonal.Ki_i, diagonal.Kff_i, 0.004)
+    got = inverse_eigenvalues(rate_matrices(diagonal), diagonal.filters)
     assert sorted(got.real) == pytest.approx(sorted(expected), rel=1e-12)
 
 
@@ -90,6 +90,7 @@ def test_a_singular_controller_is_refused(gains):
 
 def test_the_derivative_of_a_ramp_settles_on_its_slope():
     ramp = 3.0 * 0.004 * np.arange(500)[:, None]
-    assert filtered_derivative(ramp, 0.004, 30.0)[-1] == pytest.approx(3.0, rel=1e-9)
-    assert filtered_derivative(ramp, 0.004, 0.0)[1:] == pytest.approx(3.0, rel=1e-9)
-    assert filtered_derivative(ramp, 0.004, 30.0)[0] == 0
+    filtered, plain = (-regressors("D", ramp, ramp, ramp, Filters(0.004, cutoff)) for cutoff in (30.0, 0.0))
+    assert filtered[-1] == pytest.approx(3.0, rel=1e-9)
+    assert plain[1:] == pytest.approx(3.0, rel=1e-9)
+    assert filtered[0] == 0

@@ -145,8 +145,8 @@ def test_commands_are_read_at_any_rate_and_only_where_they_are_thrust_fractions(
 
 def test_a_tuning_says_that_it_does_not_know_the_motors(logs):
     log, spec = logs["adam0_nominal"], thesis(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
-    assert NO_MOTORS in tune(dataclasses.replace(log, motors=None), spec).provenance["warnings"]
-    assert NO_MOTORS not in tune(log, spec).provenance["warnings"]
+    assert NO_MOTORS in tune(dataclasses.replace(log, motors=None), spec).provenance.warnings
+    assert NO_MOTORS not in tune(log, spec).provenance.warnings
 
 
 def test_motors_at_their_ends_are_told_with_the_amplitude_that_avoids_it():

@@ -127,7 +127,7 @@ class Truth:
         y = p.C[:2] @ x[:n]
         angle = p.C[2:] @ x[:n]
         integral, slope, last = x[n : n + 2], x[n + 2 : n + 4], x[n + 4 :]
-        a = g.derivative_pole
+        a = g.filters.derivative_pole
         r = -g.Kp_o @ angle
         e = r - y
         new_integral = integral + g.Ts * g.Ki_i @ e
@@ -144,7 +144,7 @@ class Truth:
         """L at u of the whole cascade, written out from the difference equation."""
         z = np.exp(1j * omega * g.Ts)[:, None, None]
         G = self.plant.frequency_response(omega)
-        a = g.derivative_pole
+        a = g.filters.derivative_pole
         error = g.Kp_i + g.Ts * g.Ki_i * z / (z - 1)
         damping = g.Kd_i * (1 - a) * (z - 1) / (g.Ts * (z - a))
         return (error + damping) @ G[:, :2] + (error + g.Kff_i) @ g.Kp_o @ G[:, 2:]

@@ -9,7 +9,6 @@ counts: once the loop has become small it must stay small, or a mode of the fram
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -17,10 +16,11 @@ from mimopilot.tuning.analysis import margins
 from mimopilot.tuning.analysis.closed_loop import (
     CascadeLoop,
     cascade_loop,
-    inner_controllers,
     model_spectral_radius,
+    rate_controller,
     singular_values,
 )
+from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Certificate, Thresholds, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
@@ -28,7 +28,6 @@ from mimopilot.tuning.plant.frequency_response import COHERENT, DRAWS, MIN_FREQU
 from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
-from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS, Thresholds
 from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
@@ -46,50 +45,8 @@ DENSE = 0.05
 #: The identified model calls a loop unstable from this spectral radius on: a mode that grows by e in 8 s at 250 Hz.
 GROWING = 1.0005
 
-CERTIFIED = "certified"
-THIN = "stable, thin margin"
-NOT_CERTIFIED = "not certified"
-UNSTABLE = "unstable"
-
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Certificate:
-    """What the log says of a gain set.
-
-    Attributes
-    ----------
-    verdict : str
-        ``certified``, ``stable, thin margin``, ``not certified`` or ``unstable``.
-    reason : str
-        Why, and the assumptions made outside of the band.
-    figures : mapping
-        ``Ms``, ``Ms_error`` (two standard errors), ``delta``, ``delta_error``, ``distance`` of the determinant to
-        0, ``disk_margin``, and by axis ``gain_margin_db``, ``gain_margin`` (``exact``, ``at least``, ``not known``),
-        ``phase_margin_deg``, ``phase_margin_error_deg`` (two standard errors), ``delay_margin_ms``;
-        ``simultaneous_gain_db`` and ``simultaneous_phase_deg`` for all axes at once.
-    band : tuple of 2 float, rad/s
-        Where the response is known.
-    thresholds : mapping
-        `Thresholds` of the verdict.
-    log_sha256 : str
-        What it was made from.
-    """
-
-    verdict: str
-    reason: str
-    figures: Mapping[str, Any]
-    band: tuple[float, float]
-    thresholds: Mapping[str, float]
-    log_sha256: str
-
-    def bound_to(self, gains: Gains) -> Gains:
-        """The gains with this certificate, sealed: editing either voids it."""
-        table = asdict(self)
-        table["band"] = list(self.band)
-        return gains.with_certificate(table)
 
 
 def certify(
@@ -120,23 +77,23 @@ def certify(
         the response leaves a loop open that is unstable around it, the verdict is ``unstable``.
     """
 
-    def verdict(text: str, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
-        identified = model() if text == NOT_CERTIFIED else None
+    def verdict(text: Verdict, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
+        identified = model() if text == Verdict.NOT_CERTIFIED else None
         if identified is not None:
             radius = model_spectral_radius(gains, identified)
             if radius > GROWING:
-                text = UNSTABLE
+                text = Verdict.UNSTABLE
                 reason = f"around the model identified from the log the spectral radius is {radius:.4f}; {reason}"
         return Certificate(text, reason, figures, band, thresholds.model_dump(), log_sha256)
 
     try:
         body = rigid_body(plant)
     except TuningError as error:
-        return verdict(NOT_CERTIFIED, str(error), {}, (0.0, 0.0))
+        return verdict(Verdict.NOT_CERTIFIED, str(error), {}, (0.0, 0.0))
     known = plant.at(plant.known_run())
     if len(known.omega) < MIN_FREQUENCIES:
         reason = f"the excitation reaches fewer than {MIN_FREQUENCIES} frequencies in a row"
-        return verdict(NOT_CERTIFIED, reason, {}, (0.0, 0.0))
+        return verdict(Verdict.NOT_CERTIFIED, reason, {}, (0.0, 0.0))
     band = (float(known.omega[0]), float(known.omega[-1]))
     above = float(loop_above(gains, known)[-1])
     dense, nominal, draws = _loops(gains, known)
@@ -149,29 +106,29 @@ def certify(
     # The count is one where the loop is below 1 at the band's end and in charge at its beginning: else it may turn on.
     closed = above + _outer_loop_above(gains, known) < 1 and _left_at_the_beginning(gains, known) < 1
     if beyond and not closed:
-        return verdict(NOT_CERTIFIED, beyond, figures, band)
+        return verdict(Verdict.NOT_CERTIFIED, beyond, figures, band)
     if any(normal.windings(nominal)) and doubtful > DRAWS / 2:
         where = "the rate loop alone" if normal.windings(nominal)[0] else "the whole cascade"
-        return verdict(UNSTABLE, f"the determinant goes round 0: {where} is unstable", {}, band)
+        return verdict(Verdict.UNSTABLE, f"the determinant goes round 0: {where} is unstable", {}, band)
     if beyond:
-        return verdict(NOT_CERTIFIED, beyond, figures, band)
+        return verdict(Verdict.NOT_CERTIFIED, beyond, figures, band)
     doubt = _doubt(gains, plant, known, body)
     if doubt:
-        return verdict(NOT_CERTIFIED, doubt, figures, band)
+        return verdict(Verdict.NOT_CERTIFIED, doubt, figures, band)
     if doubtful:
         reason = f"too close to the limit to tell: {doubtful} of {DRAWS} plants that the log allows are unstable"
-        return verdict(NOT_CERTIFIED, reason, figures, band)
+        return verdict(Verdict.NOT_CERTIFIED, reason, figures, band)
     assumed = (
         f"assumed: above {band[1]:.0f} rad/s the plant falls at least like an integrator; "
         f"below {band[0]:.1f} rad/s the integral term acts as there"
     )
     short = _short_of(figures, thresholds.Ms, thresholds.phase_deg)
     if not short:
-        return verdict(CERTIFIED, assumed, figures, band)
+        return verdict(Verdict.CERTIFIED, assumed, figures, band)
     too_short = _short_of(figures, thresholds.thin_Ms, thresholds.thin_phase_deg)
     if too_short:
-        return verdict(NOT_CERTIFIED, "; ".join(["the margin is too thin", *too_short]), figures, band)
-    return verdict(THIN, "; ".join([*short, assumed]), figures, band)
+        return verdict(Verdict.NOT_CERTIFIED, "; ".join(["the margin is too thin", *too_short]), figures, band)
+    return verdict(Verdict.THIN, "; ".join([*short, assumed]), figures, band)
 
 
 def _short_of(figures: Mapping[str, Any], Ms: float, phase_deg: float) -> list[str]:
@@ -317,14 +274,13 @@ def _doubt(gains: Gains, plant: PlantResponse, known: PlantResponse, body: Rigid
 def loop_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
     """What the rate loop's gain may still reach above each frequency of the plant, (K,); of a stack (sets, K).
 
-    The supremum over w > w_k of sigma_max(G(w_k)) (w_k / w) sigma_max(C_e + C_d)(w). A rate is the integral of the
+    The supremum over w > w_k of sigma_max(G(w_k)) (w_k / w) sigma_max(C_y)(w). A rate is the integral of the
     moment over the inertia, behind motors and filters, so |G| falls at least like 1/w; that it does not grow would be
     weaker, but then a filtered D counts with its gain at the Nyquist frequency, where no vehicle answers. That w |G|
     does not rise is also what takes the noise off: from its highest value on it is fitted by such a sequence.
     """
     grid = np.concatenate([plant.omega, np.linspace(plant.omega[-1], np.pi / gains.Ts, 200)[1:]])
-    C_e, C_d = inner_controllers(gains, grid)
-    falling = singular_values(C_e + C_d)[0] / grid
+    falling = singular_values(rate_controller(gains, grid)[1])[0] / grid
     highest = np.maximum.accumulate(falling[..., ::-1], axis=-1)[..., ::-1][..., : len(plant.omega)]
     gain: Signal = singular_values(plant.G_i)[0] * plant.omega
     top = int(np.argmax(gain))
@@ -383,8 +339,7 @@ def _peak_beyond(gains: Gains, plant: PlantResponse, end: float) -> float:
 
 def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]:
     """sigma_max of the rate loop, (K,), and the RMS of the error's norm: two deviations of an element."""
-    C_e, C_d = inner_controllers(gains, plant.omega)
-    controller = C_e + C_d
+    controller = rate_controller(gains, plant.omega)[1]
     gain = singular_values(controller @ plant.G_i)[0]
     # Independent errors of the elements: C E has the covariance sum |C_ij|^2 dev_jk^2.
     spread = np.sqrt(np.abs(controller) ** 2 @ plant.deviation() ** 2)
@@ -392,13 +347,14 @@ def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]
 
 
 def _outer_loop_above(gains: Gains, plant: PlantResponse) -> float:
-    """What the attitude path (C_e + Kff) Kp_o G_o may still add to the loop's gain above the plant's band.
+    """What the attitude path C_r Kp_o G_o may still add to the loop's gain above the plant's band.
 
     G_o falls at least like 1/w^2 there, see `loop_above`.
     """
     grid = np.linspace(plant.omega[-1], np.pi / gains.Ts, 200)
-    C_e, _ = inner_controllers(gains, grid)
-    path = np.linalg.norm((C_e + gains.Kff_i) @ gains.Kp_o, ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
+    path = np.linalg.norm(rate_controller(gains, grid)[0] @ gains.Kp_o, ord=2, axis=(1, 2)) * (
+        plant.omega[-1] / grid
+    ) ** 2
     return float(np.linalg.norm(plant.G_o[-1], ord=2) * path.max())
 
 

@@ -1,7 +1,7 @@
 """The cascade around a measured frequency response: loop transfers and the closed loop.
 
-With the plant's responses G_i (rates) and G_o (angles) to the moment u known at some frequencies, everything
-about the flown difference equation follows there: C_e = Kp + Ts Ki z/(z-1), C_d = Kd (1-a)(z-1)/(Ts (z-a)).
+The plant's responses G_i (rates) and G_o (angles) to the torque u are known at some frequencies; `tuning.law` gives
+the controller's there.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from mimopilot.tuning import law
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
@@ -42,7 +43,7 @@ class CascadeLoop:
     Attributes
     ----------
     L_i : rate loop alone, cut at u.
-    L_u : whole loop, cut at u: (C_e + C_d) G_i + (C_e + Kff) Kp_o G_o.
+    L_u : whole loop, cut at u: C_y G_i + C_r Kp_o G_o, with u = C_r r_i - C_y y_i.
     T_o : from attitude set-point to attitude.
     U_o : from attitude set-point to u.
     """
@@ -53,23 +54,17 @@ class CascadeLoop:
     U_o: Complex
 
 
-def inner_controllers(gains: Gains | GainStack, omega: Signal) -> tuple[Complex, Complex]:
-    """C_e and C_d at frequencies omega (rad/s), (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
-    z = np.exp(1j * omega * gains.Ts)[:, None, None]
-    a = gains.derivative_pole
-    C_e = gains.Kp_i + gains.Ts * gains.Ki_i * z / (z - 1)
-    C_d = gains.Kd_i * (1 - a) * (z - 1) / (gains.Ts * (z - a))
-    return C_e, C_d
-
-
 def whole_loop(gains: Gains | GainStack, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
-    """L_i and L_u as in `CascadeLoop`, and the attitude path (C_e + Kff) Kp_o, (K, 2, 2) each; of a stack
-    (sets, K, 2, 2).
-    """
-    C_e, C_d = inner_controllers(gains, plant.omega)
-    forward = (C_e + gains.Kff_i) @ gains.Kp_o
-    L_i = (C_e + C_d) @ plant.G_i
+    """L_i and L_u as in `CascadeLoop`, and the attitude path C_r Kp_o, (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
+    C_r, C_y = rate_controller(gains, plant.omega)
+    forward = C_r @ gains.Kp_o
+    L_i = C_y @ plant.G_i
     return L_i, L_i + forward @ plant.G_o, forward
+
+
+def rate_controller(gains: Gains | GainStack, omega: Signal) -> tuple[Complex, Complex]:
+    """C_r and C_y of u = C_r r - C_y y at frequencies omega (rad/s), (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
+    return law.rate_response(law.rate_matrices(gains), gains.filters, omega)
 
 
 def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
@@ -88,23 +83,24 @@ def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
     plant : StateSpace
         From torque to body rates; the angles are their integrals.
     """
-    n, Ts, a = len(plant.A), gains.Ts, gains.derivative_pole
-    start = np.eye(n + 8)
-    state, rate, slope, integral, angle = np.split(start, [n, n + 2, n + 4, n + 6])
+    flown = law.state_space(law.rate_matrices(gains), gains.filters)
+    n, m = len(plant.A), len(flown.A)
+    start = np.eye(n + m + 4)
+    state, memory, rate, angle = np.split(start, [n, n + m, n + m + 2])
     now = plant.C @ state
-    angle = angle + Ts / 2 * (now + rate)
-    slope = a * slope + (1 - a) / Ts * (now - rate)
+    angle = angle + gains.Ts / 2 * (now + rate)
     radius = 0.0
-    for wanted in (np.zeros_like(now), -gains.Kp_o @ angle):
-        summed = integral + Ts * gains.Ki_i @ (wanted - now)
-        torque = gains.Kp_i @ (wanted - now) - gains.Kd_i @ slope + gains.Kff_i @ wanted + summed
-        step = np.vstack([plant.A @ state + plant.B @ torque, now, slope, summed, angle])
-        if not wanted.any():  # nobody looks at the angle
-            step = step[:-2, :-2]
-        if not np.any(gains.Ki_i):  # the integrals stand still
-            moving = np.r_[0 : n + 4, n + 6 : len(step)]
-            step = step[np.ix_(moving, moving)]
-        radius = max(radius, float(np.abs(np.linalg.eigvals(step)).max()))
+    for setpoint in (np.zeros_like(now), -gains.Kp_o @ angle):
+        signals = {law.ERROR: setpoint - now, law.RATE: now, law.SETPOINT: setpoint}
+        torque = flown.C @ memory + sum(flown.D[signal] @ values for signal, values in signals.items())
+        ahead = flown.A @ memory + sum(flown.B[signal] @ values for signal, values in signals.items())
+        step = np.vstack([plant.A @ state + plant.B @ torque, ahead, now, angle])
+        kept = np.ones(len(step), bool)
+        if not setpoint.any():  # the rate loop alone: the angle is not fed back
+            kept[-2:] = False
+        # A filter whose output is not used, such as an integral without a gain, is no part of the loop.
+        kept[n : n + m] = np.any(flown.C, axis=0)
+        radius = max(radius, float(np.abs(np.linalg.eigvals(step[np.ix_(kept, kept)])).max()))
     return radius
 
 

@@ -3,11 +3,27 @@
 from __future__ import annotations
 
 import numpy as np
+from mimopilot.tuning import law
 from numpy.typing import NDArray
 
 from mimopilot.common.compiled import compiled
 
 Signal = NDArray[np.float64]
+
+
+#: Numbers of the signals that a term acts on.
+ERROR, RATE, SETPOINT = range(3)
+_SIGNALS = {law.ERROR: ERROR, law.RATE: RATE, law.SETPOINT: SETPOINT}
+
+
+def law_terms(filters: law.Filters) -> Signal:
+    """The terms of the law as numbers, (4, 5): signal, sign, direct gain, zero and pole of the filter."""
+    numbers = []
+    for term in law.TERMS.values():
+        shape = term.filter(filters)
+        response = (1.0, 0.0, 0.0) if shape is None else (shape.direct, shape.zero, shape.pole)
+        numbers.append([float(_SIGNALS[term.signal]), float(term.sign), *response])
+    return np.array(numbers)
 
 
 @compiled
@@ -40,8 +56,8 @@ def kept(room, soft):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def fly(A, B, C, trim, motors, setpoint, gains, limits, Ts, pole, soft, angles, moments):  # type: ignore[no-untyped-def]
-    """The flown difference equation, axis by axis and gain set by gain set, without noise.
+def fly(A, B, C, trim, motors, setpoint, gains, terms, limits, Ts, soft, angles, moments):  # type: ignore[no-untyped-def]
+    """The law of `tuning.law` with its limits, axis by axis and gain set by gain set, without noise.
 
     The plant is the linear one around hover, which holds the rotors' lag. Rotors whose speed lags behind commands that
     are thrust fractions, f = w^2, make another moment where commands are large; what a linear lag would have to be
@@ -58,11 +74,12 @@ def fly(A, B, C, trim, motors, setpoint, gains, limits, Ts, pole, soft, angles, 
     setpoint : (N,) array, rad
         Of the axis that moves.
     gains : (K, 5, 2, 2) array
-        Kp_o, Kp_i, Ki_i, Kd_i, Kff_i of every set.
+        Kp_o, then the matrices of `terms`, of every set.
+    terms : (4, 5) array
+        See `law_terms`.
     limits : (3, 2) array
         Of rates, moments and integral.
-    Ts, pole : float
-        Period (s) and derivative pole.
+    Ts : float, s
     soft : float
         Moment over which the anti-windup's switch is drawn out: the flown one, 0, makes angles jump where gains change
         by nothing, and no descent gets past that.
@@ -74,10 +91,11 @@ def fly(A, B, C, trim, motors, setpoint, gains, limits, Ts, pole, soft, angles, 
     level = hover - mixer @ trim
     for moving in range(2):
         for k in range(len(gains)):
-            Kp_o, Kp_i, Ki_i, Kd_i, Kff_i = gains[k]
+            Kp_o = gains[k, 0]
             state, ahead = np.zeros(len(A)), np.zeros(len(A))
             angle, rate, now = np.zeros(2), np.zeros(2), np.zeros(2)
-            integral, slope, wanted, moment = np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2)
+            integral, wanted, moment = np.zeros(2), np.zeros(2), np.zeros(2)
+            filtered, before, signals = np.zeros((len(terms), 2)), np.zeros((len(terms), 2)), np.zeros((3, 2))
             part, rest, commands = np.zeros(n), np.zeros(n), np.zeros(n)
             speed, acting, equivalent, room = np.sqrt(hover), np.zeros(2), np.zeros(2), np.inf
             for t in range(len(setpoint)):
@@ -86,16 +104,28 @@ def fly(A, B, C, trim, motors, setpoint, gains, limits, Ts, pole, soft, angles, 
                     for j in range(len(A)):
                         now[i] += C[i, j] * state[j]
                     angle[i] += Ts / 2 * (now[i] + rate[i])
-                    slope[i] = pole * slope[i] + (1 - pole) / Ts * (now[i] - rate[i])
                 for i in range(2):
                     demand = Kp_o[i, moving] * setpoint[t] - Kp_o[i, 0] * angle[0] - Kp_o[i, 1] * angle[1]
                     wanted[i] = min(max(demand, -limits[0, i]), limits[0, i])
+                for j in range(2):
+                    signals[ERROR, j], signals[RATE, j], signals[SETPOINT, j] = wanted[j] - now[j], now[j], wanted[j]
+                for q in range(len(terms)):
+                    source, size, zero, pole = int(terms[q, 0]), terms[q, 2], terms[q, 3], terms[q, 4]
+                    for j in range(2):
+                        step = signals[source, j] - zero * before[q, j]
+                        before[q, j] = signals[source, j]
+                        # Of an integrator only what it grows by is kept: its sum is `integral`, behind the anti-windup.
+                        filtered[q, j] = step if pole == 1.0 else pole * filtered[q, j] + size * step
                 for i in range(2):
                     direct, growth = 0.0, 0.0
                     for j in range(2):
-                        error = wanted[j] - now[j]
-                        direct += Kp_i[i, j] * error - Kd_i[i, j] * slope[j] + Kff_i[i, j] * wanted[j]
-                        growth += Ts * Ki_i[i, j] * error
+                        added = 0.0
+                        for q in range(len(terms)):
+                            if terms[q, 4] == 1.0:
+                                growth += terms[q, 1] * terms[q, 2] * gains[k, 1 + q, i, j] * filtered[q, j]
+                            else:
+                                added += terms[q, 1] * gains[k, 1 + q, i, j] * filtered[q, j]
+                        direct += added
                     # Moments are counted from the trim, which the flown integral holds.
                     lowest, highest = -limits[1, i] - trim[i], limits[1, i] - trim[i]
                     tried = direct + integral[i] + growth

@@ -52,13 +52,28 @@ class DoubletModel:
         angles, moments : (2, sets, N, 2) arrays, rad, dimensionless
             First index: the axis that moves.
         """
-        from mimopilot.tuning.analysis.compiled_doublet import fly  # takes longer to import than all of the rest
+        from mimopilot.tuning.analysis.compiled_doublet import (  # takes longer to import than all of the rest
+            fly,
+            law_terms,
+        )
 
         gains, plant = stack.stacked(), self.plant
         angles, moments = (np.empty((2, len(gains), len(self.setpoint), 2)) for _ in range(2))
         matrices = (np.ascontiguousarray(matrix) for matrix in (plant.A, plant.B, plant.C))
-        limited = (gains, stack.limits, stack.Ts, stack.derivative_pole, soft)
-        fly(*matrices, self.trim, self._motors, self.setpoint, *limited, angles, moments)
+        terms = law_terms(stack.filters)
+        fly(
+            *matrices,
+            self.trim,
+            self._motors,
+            self.setpoint,
+            gains,
+            terms,
+            stack.limits,
+            stack.filters.Ts,
+            soft,
+            angles,
+            moments,
+        )
         return angles, moments
 
     @cached_property

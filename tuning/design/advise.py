@@ -11,16 +11,17 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from mimopilot.tuning.analysis.certificate import CERTIFIED
 from mimopilot.tuning.analysis.closed_loop import ACCURATE, cascade_loop, doublet_spectrum
+from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.measured import Measured
-from mimopilot.tuning.reference_model import second_order
+from mimopilot.tuning.reference_model import SecondOrder, second_order
 from mimopilot.tuning.spec import TuningSpec
 from numpy.typing import NDArray
 
@@ -173,20 +174,21 @@ def advise(
         )
     spec = spec.model_copy(update={"doublet_s": doublet.period_s})
     for inner, cutoff in watch(list(product(product(bandwidths, DAMPINGS, DELAYS), cutoffs))):
-        task = spec.model_copy(update={"inner": (inner, inner), "derivative_cutoff_hz": cutoff})
+        model = SecondOrder(*inner)
+        task = spec.model_copy(update={"inner": (model, model), "derivative_cutoff_hz": cutoff})
         try:
             gains = tune(experiment, task, measured)
         except TuningError as error:
             candidates.append(Candidate(inner, cutoff, None, "refused", str(error)))
             continue
         verdict, reason = gains.verdict()
-        fit = min(gains.provenance["fit"])
-        figures = dict(gains.certificate or {})["figures"]
+        fit = min(gains.provenance.fit)
+        figures = gains.certificate.figures if gains.certificate else {}
         delta = (figures.get("delta", np.inf), figures.get("delta_error", np.inf))
         candidates.append(
             Candidate(inner, cutoff, gains, verdict, reason, delta, fit, *predict(gains, plant, spec, doublet))
         )
-    good = [candidate for candidate in candidates if candidate.verdict == CERTIFIED]
+    good = [candidate for candidate in candidates if candidate.verdict == Verdict.CERTIFIED]
     if not good:
         raise TuningError(
             f"{experiment.source}: none of {len(candidates)} rate loops is certified; the first: "
@@ -207,7 +209,7 @@ def _slowest_zero(experiment: Experiment, cutoff_hz: float) -> float | None:
             external,
             start,
             segments=experiment.segments,
-            derivative_cutoff_hz=cutoff_hz,
+            filters=Filters(experiment.Ts, cutoff_hz),
         )
         for axis in range(2)
     ]

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from mimopilot.tuning.analysis.certificate import UNSTABLE, certify
+from mimopilot.tuning.analysis.certificate import certify
 from mimopilot.tuning.analysis.closed_loop import refine_outer
 from mimopilot.tuning.analysis.doublet_prediction import doublet_model
-from mimopilot.tuning.controller import rebuild_rate_setpoint
+from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.estimate_checks import examine_band, examine_estimates, examine_saturation
 from mimopilot.tuning.design.positive_integral import with_positive_integral
 from mimopilot.tuning.design.refine_manoeuvre import refine_cascade
@@ -25,8 +25,10 @@ from mimopilot.tuning.estimation.siso import siso_vrft
 from mimopilot.tuning.estimation.vrft import LoopEstimate, vrft
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains, Limits, YawGains
+from mimopilot.tuning.law import Filters, rebuild_rate_setpoint
 from mimopilot.tuning.plant.inertia import RigidBody
 from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.spec import TuningSpec
 from numpy.typing import NDArray
@@ -129,7 +131,7 @@ def estimate(
             (experiment.u, experiment.y_i, chosen.y_i),
             chosen,
             models,
-            derivative_cutoff_hz=base.derivative_cutoff_hz,
+            filters=base.filters,
             weight=spec.weight,
             prior=_prior(experiment, spec, axes),
             pull=spec.pull,
@@ -265,7 +267,7 @@ def tune(
         *found.warnings,
         *examine_saturation(experiment),
         *examine_estimates(experiment.source, found.stretches, found.inner, experiment.Ts),
-        *examine_band(experiment.source, plant, [omega for omega, _, _ in spec.inner]),
+        *examine_band(experiment.source, plant, [model.bandwidth for model in spec.inner]),
     ]
     gains, deviations = found.gains, found.inner_deviations()
     outer_models = spec.models("outer", experiment.Ts)
@@ -295,28 +297,30 @@ def tune(
             warnings.append(f"the gains are not refined for the manoeuvre: {error}")
     if deviations and "Kp_o" not in deviations:
         deviations["Kp_o"] = found.outer_deviation()
-    provenance = {
-        "method": spec.method,
-        "structure": spec.structure,
-        "log": experiment.source,
-        "log_sha256": experiment.sha256,
-        "instrument": found.instruments.name,
-        "weight": spec.weight,
-        "trim": spec.trim,
-        "pull": spec.pull,
-        "refined": spec.refine,
-        **({"manoeuvre": spec.manoeuvre.model_dump(exclude_none=True)} if spec.manoeuvre else {}),
-        "fit": [float(value) for loop in found.inner for value in loop.solution.r_squared],
-        "warnings": warnings,
-        "inner_model": [list(model) for model in spec.inner],
-        "outer_model": [list(model) for model in spec.outer],
-        "window": [found.inner[0].window, found.outer[0].window],
-        "samples": [found.inner[0].samples, found.outer[0].samples],
-        "standard_deviation": {matrix: value.tolist() for matrix, value in deviations.items()},
-    }
+    provenance = Provenance(
+        method=spec.method,
+        log=experiment.source,
+        log_sha256=experiment.sha256,
+        inner_model=spec.inner,
+        outer_model=spec.outer,
+        standard_deviation={matrix: value.tolist() for matrix, value in deviations.items()},
+        fit=tuple(float(value) for loop in found.inner for value in loop.solution.r_squared),
+        warnings=tuple(warnings),
+        details={
+            "structure": spec.structure,
+            "instrument": found.instruments.name,
+            "weight": spec.weight,
+            "trim": spec.trim,
+            "pull": spec.pull,
+            "refined": spec.refine,
+            **({"manoeuvre": spec.manoeuvre.model_dump(exclude_none=True)} if spec.manoeuvre else {}),
+            "window": [found.inner[0].window, found.outer[0].window],
+            "samples": [found.inner[0].samples, found.outer[0].samples],
+        },
+    )
     tuned = _certified(replace(gains, provenance=provenance), measured, spec)
     verdict, reason = tuned.verdict()
-    if verdict == UNSTABLE:
+    if verdict == Verdict.UNSTABLE:
         raise TuningError(
             f"{experiment.source}: the gains that this log gives for these models are unstable, nothing is written: "
             f"{reason}; record a longer or stronger excitation, or ask for a slower rate loop"
@@ -329,7 +333,7 @@ def _certified(gains: Gains, measured: Measured, spec: TuningSpec) -> Gains:
     inner, outer = spec.models("inner", gains.Ts), spec.models("outer", gains.Ts)
     sha256, thresholds = measured.experiment.sha256, spec.certificate
     found = certify(gains, measured.response, inner, outer, sha256, thresholds, lambda: measured.model)
-    return found.bound_to(gains)
+    return gains.with_certificate(found)
 
 
 def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | None = None) -> Gains:
@@ -386,8 +390,7 @@ def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
         Kd_i=zero,
         Kff_i=zero,
         yaw=yaw,
-        Ts=experiment.Ts,
-        derivative_cutoff_hz=flown.derivative_cutoff_hz if cutoff is None and flown else cutoff or 0.0,
+        filters=Filters(experiment.Ts, flown.derivative_cutoff_hz if cutoff is None and flown else cutoff or 0.0),
         limits=limits,
         moment_scale=spec.moment_scale or (flown.moment_scale if flown else None),
     )

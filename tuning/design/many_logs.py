@@ -13,9 +13,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import MATRICES, Gains
+from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.spec import TuningSpec
 from numpy.typing import NDArray
 
@@ -87,7 +88,7 @@ class Repeated:
         """Gains and predicted deviations of a matrix, (n, 4) each, row by row; NaN where none was predicted."""
         gains = np.array([getattr(one, matrix).ravel() for one in self.tuned])
         nothing = np.full((2, 2), np.nan)
-        predicted = [np.ravel(one.provenance["standard_deviation"].get(matrix, nothing)) for one in self.tuned]
+        predicted = [np.ravel(one.provenance.standard_deviation.get(matrix, nothing)) for one in self.tuned]
         return gains, np.array(predicted, np.float64)
 
     def elements(self) -> list[Element]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.loop import LoopController, closed_loop, complementary_sensitivity
+from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Response, Signal, StateSpace
 from scipy.optimize import least_squares
@@ -87,7 +87,7 @@ def refine(controller: LoopController, plant: StateSpace, models: Sequence[Refer
     TuningError
         When the loop is not stable on the identified plant, before or after.
     """
-    if controller.Ts != plant.Ts or any(model.Ts != plant.Ts for model in models) or len(models) != len(plant.C):
+    if {controller.filters.Ts, *(model.Ts for model in models)} != {plant.Ts} or len(models) != len(plant.C):
         raise TuningError("refinement: plant, controller and one reference model an output must share one period")
     _check_stable(plant, controller, "the gains to start from")
     omega = frequency_grid(plant.Ts, FREQUENCIES)

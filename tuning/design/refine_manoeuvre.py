@@ -15,6 +15,7 @@ import numpy as np
 from mimopilot.tuning.analysis.certificate import DENSE, HIGH_FREQUENCY_LOOP, loop_above, sensitivity_peak
 from mimopilot.tuning.analysis.closed_loop import model_spectral_radius, singular_values, whole_loop
 from mimopilot.tuning.analysis.doublet_prediction import DoubletModel, effort, moment_rms
+from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS
 from mimopilot.tuning.design.constrained_least_squares import descend
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gain_stack import GainStack
@@ -22,7 +23,6 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES, PlantResponse
 from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel
-from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS
 from numpy.typing import NDArray
 
 #: Share of the gain that a certificate allows above the band.

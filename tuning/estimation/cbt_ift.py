@@ -12,7 +12,8 @@ from typing import Protocol
 import numpy as np
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import cross_correlation
-from mimopilot.tuning.loop import LoopController
+from mimopilot.tuning.law import Filters, regressors
+from mimopilot.tuning.loop_controller import LoopController
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Signal
 from scipy.linalg import lstsq
@@ -111,7 +112,8 @@ def correlation_based_tuning(
     w = excitation[:, None]
     shaped = [sensitivity(sensitivity(y)) for y in outputs]
     # Regressors of a controller's column: P part of each input, then I part.
-    parts = [*shaped, *(model.Ts * np.cumsum(y, axis=0) for y in shaped)]
+    filters = Filters(model.Ts)
+    parts = [regressors(term, y, y, y, filters) for term in "PI" for y in shaped]
     # cross_correlation gives sums of w(k + tau) x(k): the answer to the past of w is at -tau.
     S = np.stack([cross_correlation(w, part, lags)[lags::-1, 0] for part in parts], axis=-1)
     target = cross_correlation(w, sensitivity(model.response(w)), lags)[lags::-1, 0, 0]
@@ -121,7 +123,7 @@ def correlation_based_tuning(
         wanted[:, j] = target
         column = lstsq(S.reshape(-1, S.shape[-1]), wanted.ravel())[0]
         P[:, j], integral[:, j] = column[:inputs], column[inputs:]
-    return Comparison(LoopController({"P": P, "I": integral}, model.Ts), inputs * repetitions)
+    return Comparison(LoopController({"P": P, "I": integral}, filters), inputs * repetitions)
 
 
 def iterative_feedback_tuning(
@@ -195,7 +197,7 @@ def iterative_feedback_tuning(
         if count + each > most:
             break
         e = reference - y
-        shapes = np.hstack([e, controller.Ts * np.cumsum(e, axis=0)])
+        shapes = regressors("PI", e, e, e, controller.filters)
         gradient = []
         for i in range(still_u.shape[1]):
             for shape in shapes.T:

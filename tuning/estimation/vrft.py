@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from mimopilot.tuning.controller import filtered_derivative
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.regression import Regression, Solution, solve
+from mimopilot.tuning.law import TERMS, Filters, regressors
 from mimopilot.tuning.reference_model import ReferenceModel
 from numpy.typing import NDArray
 
-TERMS = "PIDF"
 Signal = NDArray[np.float64]
 Segments = Sequence[tuple[int, int]]
 
@@ -116,33 +115,6 @@ def filter_by_inverse(signal: Signal, factors: Sequence[ReferenceModel], models:
     return np.column_stack(columns)
 
 
-def regressors(terms: str, e_l: Signal, y_l: Signal, r_l: Signal, Ts: float, derivative_cutoff_hz: float) -> Signal:
-    """The regressor x(k) of the flown difference equation, one column a gain: P, I, D, F as `terms` has them.
-
-    Parameters
-    ----------
-    terms : str
-        Letters of ``PIDF``, in that order.
-    e_l, y_l, r_l : (N, n) arrays
-        Error, output and reference, all filtered by l.
-    Ts : float, s
-        Sampling period.
-    derivative_cutoff_hz : float, Hz
-        Of the flown derivative filter.
-
-    Returns
-    -------
-    (N, n len(terms)) array
-    """
-    columns: dict[str, Callable[[], Signal]] = {
-        "P": lambda: e_l,
-        "I": lambda: Ts * np.cumsum(e_l, axis=0),
-        "D": lambda: -filtered_derivative(y_l, Ts, derivative_cutoff_hz),
-        "F": lambda: r_l,
-    }
-    return np.hstack([columns[term]() for term in terms])
-
-
 def vrft(
     u: Signal,
     y: Signal,
@@ -152,7 +124,7 @@ def vrft(
     *,
     segments: Segments | None = None,
     window: int | None = None,
-    derivative_cutoff_hz: float = 0.0,
+    filters: Filters | None = None,
     settling: int = 0,
     weight: str = "optimal",
     trim: bool = True,
@@ -183,8 +155,8 @@ def vrft(
         initial integrator) is estimated on each.
     window : int, optional
         Lags l of the instrument; see `default_window`.
-    derivative_cutoff_hz : float, Hz
-        Of the flown derivative filter.
+    filters : Filters, optional
+        Of the flown law; by default the models' period and no filter.
     settling : int, samples
         Further samples to drop at the start of each segment.
     weight : str
@@ -216,18 +188,20 @@ def vrft(
     """
     letters = "".join(term for term in TERMS if term in terms)
     if not letters or len(letters) != len(terms) or weight not in ("optimal", "identity"):
-        raise TuningError(f"terms {terms!r}, weight {weight!r}: expected letters of {TERMS}, and optimal or identity")
+        known = "".join(TERMS)
+        raise TuningError(f"terms {terms!r}, weight {weight!r}: expected letters of {known}, and optimal or identity")
     if len(models) != y.shape[1]:
         raise TuningError(f"got {len(models)} reference models for {y.shape[1]} outputs")
     lags = default_window(models) if window is None else window
     Ts = models[0].Ts
+    flown = filters or Filters(Ts)
     drop = settling + sum(model.settling_samples() for model in dict.fromkeys(models))
     needed = drop + 4 * lags
     shaped = prefilter or (lambda signal: signal)
 
     def regressor(output: Signal) -> tuple[Signal, list[ReferenceModel]]:
         e_l, r_l, y_l, factors = virtual_signals(shaped(output), models)
-        return regressors(letters, e_l, y_l, r_l, Ts, derivative_cutoff_hz)[drop:], factors
+        return regressors(letters, e_l, y_l, r_l, flown)[drop:], factors
 
     xs: list[Signal] = []
     us: list[Signal] = []
@@ -248,10 +222,10 @@ def vrft(
             # The constant (trim, initial integrator), filtered like the rest, is regressor and instrument at once:
             # to take its part off all others is the same as to estimate it.
             constant = filter_by(np.ones((stop - start, 1)), factors)[drop:]
-            _take_off(constant, x)
-            _take_off(constant, u_l)
+            _remove_projection(constant, x)
+            _remove_projection(constant, u_l)
             if repeated is not None:
-                _take_off(constant, w)
+                _remove_projection(constant, w)
         for signals, signal in ((xs, x), (us, u_l), (ws, w), (vs, v)):
             signals.append(signal)
     if not xs:
@@ -276,6 +250,6 @@ def vrft(
     )
 
 
-def _take_off(constant: Signal, signal: Signal) -> None:
-    """Take its projection on `constant` (N, 1) off `signal` (N, n), in place."""
+def _remove_projection(constant: Signal, signal: Signal) -> None:
+    """Subtract from `signal` (N, n) its projection on `constant` (N, 1), in place."""
     signal -= constant @ (constant.T @ signal / (constant.T @ constant))

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import cross_correlation
-from mimopilot.tuning.estimation.vrft import Segments, default_window, regressors
+from mimopilot.tuning.estimation.vrft import Segments, default_window
+from mimopilot.tuning.law import Filters, regressors
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Signal
 from scipy.linalg import lstsq
@@ -62,7 +63,7 @@ def flexible_model(
     terms: str = "PID",
     *,
     segments: Segments | None = None,
-    derivative_cutoff_hz: float = 0.0,
+    filters: Filters | None = None,
 ) -> FlexibleModel:
     """Find M(z, eta) with the poles and the delay of `start`, and with it its zeros.
 
@@ -77,7 +78,8 @@ def flexible_model(
     terms : str
         Structure of the controller, letters of ``PID``.
     segments : sequence of (start, stop), optional
-    derivative_cutoff_hz : float, Hz
+    filters : Filters, optional
+        Of the flown law; by default the model's period and no filter.
 
     Raises
     ------
@@ -95,7 +97,7 @@ def flexible_model(
         if b - a < drop + 4 * lags:
             continue
         u_l, y_l, w_l = (start.response(s[a:b] - s[a:b].mean(axis=0)) for s in (u[:, None], y[:, None], external))
-        x = regressors(terms, y_l, -y_l, y_l, start.Ts, derivative_cutoff_hz)
+        x = regressors(terms, y_l, -y_l, y_l, filters or Filters(start.Ts))
         shifted = [lfilter(tap, start.den, np.hstack([u_l, x]), axis=0)[drop:] for tap in taps]
         w = w_l[drop:] - w_l[drop:].mean(axis=0)
         correlated = [cross_correlation(w, signal, lags).reshape(-1, signal.shape[1]) for signal in shifted]

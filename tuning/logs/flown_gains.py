@@ -6,7 +6,10 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from mimopilot.tuning.gains import LIMITS, MATRICES, PARAMETER_PREFIX, Gains, Limits, Triple, YawGains
+from mimopilot.tuning.gains import Gains, Limits, Triple, YawGains
+from mimopilot.tuning.law import Filters
+from mimopilot.tuning.parameters import LIMITS, MATRICES, PREFIX, cutoff_of
+from mimopilot.tuning.provenance import Provenance
 
 SCALE = "SCALE"
 
@@ -42,13 +45,13 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     values = {name: float(str(np.float32(value))) for name, value in parameters.items()}
 
     def find(code: str, fallback: str, factor: float = 1.0) -> float:
-        ours = values.get(PARAMETER_PREFIX + code)
+        ours = values.get(PREFIX + code)
         return ours if ours is not None else factor * values.get(fallback, math.nan)
 
     def gain(name: str, i: int, j: int) -> float:
         code = f"{MATRICES[name]}_{'RPY'[i]}{'RPY'[j]}"
         if i != j:
-            return values.get(PARAMETER_PREFIX + code, 0.0)
+            return values.get(PREFIX + code, 0.0)
         axis = _PX4_AXES[i]
         factor = 1.0 if name == "Kp_o" else values.get(f"MC_{axis}RATE_K", 1.0)
         return find(code, _PX4[name].format(axis=axis), factor)
@@ -62,27 +65,23 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     rates = tuple(f"MC_{axis}RATE_MAX" for axis in _PX4_AXES)
     limits = Limits(
         rate_max=triple("rate_max", rates, math.pi / 180),
-        moment_max=tuple(values.get(f"{PARAMETER_PREFIX}UMAX_{letter}", 1.0) for letter in "RPY"),  # type: ignore[arg-type]
+        moment_max=tuple(values.get(f"{PREFIX}UMAX_{letter}", 1.0) for letter in "RPY"),  # type: ignore[arg-type]
         integral_max=triple("integral_max", _PX4_INTEGRAL, 1.0),
     )
     numbers = [*np.concatenate([m.ravel() for m in matrices.values()]), *vars(yaw).values()]
     numbers += [*limits.rate_max, *limits.moment_max, *limits.integral_max]
     if not np.isfinite(numbers).all():
         return None
-    pole = values.get(PARAMETER_PREFIX + "D_POLE")
-    if pole is None:
-        cutoff = values.get("IMU_DGYRO_CUTOFF", 0.0)
-    else:
-        cutoff = float(f"{-math.log(pole) / (2 * math.pi * Ts):.6g}") if pole > 0 else 0.0
-    scale = [values.get(f"{PARAMETER_PREFIX}{SCALE}_{letter}") for letter in "RPY"]
+    pole = values.get(PREFIX + "D_POLE")
+    cutoff = values.get("IMU_DGYRO_CUTOFF", 0.0) if pole is None else float(f"{cutoff_of(pole, Ts):.6g}")
+    scale = [values.get(f"{PREFIX}{SCALE}_{letter}") for letter in "RPY"]
     if min(*limits.rate_max, *limits.moment_max, *limits.integral_max) <= 0:
         return None
     return Gains(
         **matrices,  # type: ignore[arg-type]
         yaw=yaw,
-        Ts=Ts,
-        derivative_cutoff_hz=cutoff,
+        filters=Filters(Ts, cutoff),
         limits=limits,
         moment_scale=None if None in scale else tuple(scale),  # type: ignore[arg-type]
-        provenance={"method": "flown"},
+        provenance=Provenance("flown"),
     )

@@ -6,8 +6,8 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from mimopilot.tuning.gains import MATRICES
 from mimopilot.tuning.logs.inspection import Inspection
+from mimopilot.tuning.parameters import MATRICES
 
 from mimopilot.common.console import print_table
 

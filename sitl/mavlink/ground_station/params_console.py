@@ -10,8 +10,10 @@ from mimopilot.sitl.mavlink.ground_station.events import shortest
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.ground_station.session import Options, session
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
-from mimopilot.tuning.gains import Gains, load_gains
-from mimopilot.tuning.parameters import PARAMETERS, check_verdict
+from mimopilot.tuning.acceptance import check_verdict
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains_file import load_gains
+from mimopilot.tuning.parameters import PARAMETERS
 
 from mimopilot.common.console import print_json, print_table
 from mimopilot.common.files import write_atomically

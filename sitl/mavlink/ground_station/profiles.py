@@ -16,8 +16,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import single
-from mimopilot.tuning.gains import AXES, AXIS_LETTERS, MATRICES, PARAMETER_PREFIX, Gains
-from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Parameter, check_ranges
+from mimopilot.tuning.acceptance import check_ranges
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameters import (
+    AXES,
+    AXIS_LETTERS,
+    ENABLE,
+    EXCITATION,
+    IDENTITY,
+    MATRICES,
+    PARAMETERS,
+    PREFIX,
+    Parameter,
+)
 from mimopilot.tuning.parameters import Setting as VehicleSetting
 
 #: Largest off-diagonal, as a share of its row's diagonal, that a stock profile may drop unasked.
@@ -197,7 +208,7 @@ def _lost_limits(gains: Gains) -> tuple[str, ...]:
 #: All that our own vehicles have, by name; what their parameters begin with tells the other profiles.
 _OURS: tuple[Parameter | VehicleSetting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
 TABLE = {p.name: p for p in _OURS}
-PREFIXES = {"mimo": PARAMETER_PREFIX, "px4-stock": "MC_", "ardupilot-stock": "ATC_"}
+PREFIXES = {"mimo": PREFIX, "px4-stock": "MC_", "ardupilot-stock": "ATC_"}
 
 
 def out_of_range(name: str, value: float) -> str:

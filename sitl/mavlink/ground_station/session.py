@@ -17,7 +17,7 @@ from mimopilot.sitl.mavlink.ground_station.upload import NoneHeldError, read
 from mimopilot.sitl.mavlink.ground_station.vehicle_contact import TRY_S
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import STOCK_PARAMETERS, check_kind, without_module
 from mimopilot.sitl.mavlink.wire.signing import read_key
-from mimopilot.tuning.gains import PARAMETER_PREFIX
+from mimopilot.tuning.parameters import PREFIX
 
 from mimopilot.common.console import progress_console
 
@@ -88,7 +88,7 @@ class Session:
             return self.run(read(self.talk, names))
         except NoneHeldError as error:
             probe = STOCK_PARAMETERS.get(self.vehicle.autopilot, "")
-            if not probe or not all(name.startswith(PARAMETER_PREFIX) for name in names):
+            if not probe or not all(name.startswith(PREFIX) for name in names):
                 raise
             # A vehicle that does not hear us is silent, too: what its own controller has tells the two apart.
             if self.run(self.talk.ask([probe], "reading"))[probe].absent:

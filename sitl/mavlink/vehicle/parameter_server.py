@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 from mimopilot.codegen.cortex_m4 import EmulatedController
+from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.native import NativeController
 from mimopilot.sitl.autopilot.excitation_injector import AXIS, Injector
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import REAL32, shortest, single
 from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS, identity_parameters, to_array
+from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from pymavlink.dialects.v20 import common as mavlink
 
 #: PARAM_ERROR (345) reasons; pymavlink's own enumeration ends before some of them.
@@ -72,7 +73,7 @@ class ParameterServer:
         store: ParameterStore | None = None,
     ) -> None:
         self.controller, self.injector, self.store = controller, injector, store
-        identity = identity_parameters(gains)
+        identity = gains.identity()
         self.table: tuple[Entry, ...] = (
             *(Entry(p.name, p.minimum, p.maximum, p.writable) for p in PARAMETERS),
             *(Entry(p.name, p.minimum, p.maximum, False) for p in IDENTITY if p.name in identity),

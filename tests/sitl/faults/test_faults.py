@@ -355,7 +355,7 @@ def test_the_limit_cycle_starts_at_the_delay_margin_that_the_certificate_gives(v
     save_flight(tmp_path / "a.ulg", experiment, vehicle.airframe, own)
     gains = tune(read_log(tmp_path / "a.ulg"), load_spec(method="mimo"))
     assert gains.certificate is not None
-    margin = min(gains.certificate["figures"]["delay_margin_ms"].values()) / 1e3
+    margin = min(gains.certificate.figures["delay_margin_ms"].values()) / 1e3
     allowed = int(vehicle.airframe.computing_delay + margin / TS)  # whole periods, the vehicle's own among them
 
     def growth(periods):

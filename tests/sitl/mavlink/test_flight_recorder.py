@@ -1,11 +1,11 @@
 """The log of flights by others: its numbers, and a disk that is full."""
 
 import pytest
+from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.autopilot.flight_modes import Vehicle
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.parameters import to_array
 from pyulog import ULog
 
 TS = 0.004

@@ -6,12 +6,13 @@ import math
 import numpy as np
 import pytest
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import single
 from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, off_diagonals, restoration
-from mimopilot.tuning.gains import MATRICES, Limits
+from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.logs.flown_gains import flown_gains
-from mimopilot.tuning.parameters import PARAMETERS, to_array
+from mimopilot.tuning.parameters import MATRICES, PARAMETERS
 
 
 @pytest.fixture

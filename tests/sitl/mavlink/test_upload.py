@@ -18,7 +18,7 @@ from mimopilot.sitl.mavlink.wire.link import Codec
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.mavlink.wire.signing import Signer, read_key
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.gains import load_gains
+from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameters import PARAMETERS
 
 from tests.conftest import assert_one_clear_line

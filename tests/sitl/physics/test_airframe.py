@@ -9,7 +9,8 @@ from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import FOLDER, known_airframes, load_airframe
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import load_gains
+from mimopilot.tuning.gains_file import load_gains
+from mimopilot.tuning.provenance import Provenance
 
 from tests.conftest import assert_one_clear_line
 
@@ -105,8 +106,8 @@ def test_converted_gains_make_the_same_moment_in_newton_metres_and_keep_their_ce
     edited = dataclasses.replace(certified, Kp_o=1.1 * certified.Kp_o)
     assert edited.with_moment_scale(scale).verdict()[0] == "void"
     assert certified.with_moment_scale((2.08, 2.5, 0.4)).verdict()[0] == "none"  # its figures would be others
-    known = dataclasses.replace(original, provenance={"standard_deviation": {"Kp_i": [[1.0, 2.0], [3.0, 4.0]]}})
-    deviation = known.with_moment_scale(scale).provenance["standard_deviation"]["Kp_i"]
+    known = dataclasses.replace(original, provenance=Provenance(standard_deviation={"Kp_i": [[1.0, 2.0], [3.0, 4.0]]}))
+    deviation = known.with_moment_scale(scale).provenance.standard_deviation["Kp_i"]
     assert deviation == pytest.approx(np.array([[1.0, 2.0], [3.0, 4.0]]) * original.moment_scale[0] / scale[0])
     back = converted.with_moment_scale(original.moment_scale)
     assert back.Kp_i == pytest.approx(original.Kp_i, rel=1e-12)

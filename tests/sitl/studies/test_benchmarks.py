@@ -3,7 +3,8 @@ import pytest
 from mimopilot.sitl.studies.benchmarks import excitation, lv100, numerical_example
 from mimopilot.tuning.design.refine import refine
 from mimopilot.tuning.estimation.vrft import vrft
-from mimopilot.tuning.loop import LoopController, closed_loop
+from mimopilot.tuning.law import Filters
+from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from mimopilot.tuning.plant.pbsid import pbsid
 
 TS = 0.1
@@ -80,7 +81,7 @@ def test_one_lv100_experiment_gives_a_controller_close_to_the_best_there_is(desi
         u_bar = excitation(5000, design, rng)
         assert np.abs(u_bar).max() == 1.0
         u, y = task.run(task.initial, np.zeros_like(u_bar), u_bar, rng)
-        start = LoopController(vrft(u, y, u_bar, task.models, "PI").gains, TS)
+        start = LoopController(vrft(u, y, u_bar, task.models, "PI").gains, Filters(TS))
         model = pbsid(u, y, TS, external=u_bar)
         plain.append(task.cost(start))
         refined.append(task.cost(refine(start, model.plant, task.models).controller))
@@ -95,7 +96,7 @@ def test_the_numerical_example_has_its_closed_form_controller():
     u = excitation(1000, "together", np.random.default_rng(0))
     u, y = task.run(None, np.zeros_like(u), u, np.random.default_rng(0))
     estimate = vrft(u, y, u, task.models, "PI", window=20, weight="identity")
-    first, second = LoopController(estimate.gains, 1.0).polynomial()
+    first, second = LoopController(estimate.gains, Filters(1.0)).polynomial()
     inverse = 0.1 * np.linalg.inv(task.plant.B)
     assert first == pytest.approx(inverse, rel=1e-8)
     assert second == pytest.approx(-0.9048 * inverse, rel=1e-8)

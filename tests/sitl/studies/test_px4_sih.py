@@ -13,7 +13,7 @@ from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.analysis.certificate import CERTIFIED
+from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.logs.reader import read_log
@@ -48,8 +48,8 @@ def test_the_off_diagonals_are_the_inertias_on_the_coupled_vehicle_and_none_on_t
     assert np.abs(symmetric.Kp_i[[0, 1], [1, 0]]).max() < 0.02 * symmetric.Kp_i[0, 0]
     # The integral gain is poorly known, and its interval says so: ten times wider than that of P, relative to it.
     for gains in (coupled, symmetric):
-        wide = np.diag(gains.provenance["standard_deviation"]["Ki_i"]) / np.diag(gains.Ki_i)
-        narrow = np.diag(gains.provenance["standard_deviation"]["Kp_i"]) / np.diag(gains.Kp_i)
+        wide = np.diag(gains.provenance.standard_deviation["Ki_i"]) / np.diag(gains.Ki_i)
+        narrow = np.diag(gains.provenance.standard_deviation["Kp_i"]) / np.diag(gains.Kp_i)
         assert (wide > 10 * narrow).all()
 
 
@@ -81,7 +81,7 @@ def test_advised_gains_beat_the_flown_ones_in_following_and_in_decoupling(logs, 
     monkeypatch.setattr(advisor, "DAMPINGS", (0.7,))
     monkeypatch.setattr(advisor, "DELAYS", (0, 2))
     best = advise(logs["coupled"], spec()).recommended
-    assert best.verdict == CERTIFIED
+    assert best.verdict == Verdict.CERTIFIED
     flown_follow, flown_offaxis = doublets(logs["coupled"].flown)
     follow, offaxis = doublets(best.gains)
     assert (follow < flown_follow).all()

@@ -5,14 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 from mimopilot.sitl.physics.airframe import Frame, load_airframe
-from mimopilot.tuning.analysis.certificate import CERTIFIED, NOT_CERTIFIED, THIN, UNSTABLE, certify, large_again
+from mimopilot.tuning.analysis.certificate import certify, large_again
+from mimopilot.tuning.certificate import Thresholds, Verdict
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.measured import Measured
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import load_spec
-from mimopilot.tuning.thresholds import Thresholds
 
 from tests.tuning.truth import TS, Truth, experiment
 
@@ -88,9 +89,9 @@ def test_no_unstable_set_passes_and_nearly_all_good_ones_are_certified(flights):
     for _, measured, truth in flights.values():
         one, other = judged(measured, truth, 12, rng)
         good, unstable = good + one, unstable + other
-    assert not {CERTIFIED, THIN} & set(unstable)
-    assert unstable.count(UNSTABLE) >= 0.9 * len(unstable)
-    assert good.count(CERTIFIED) >= 0.95 * len(good)
+    assert not {Verdict.CERTIFIED, Verdict.THIN} & set(unstable)
+    assert unstable.count(Verdict.UNSTABLE) >= 0.9 * len(unstable)
+    assert good.count(Verdict.CERTIFIED) >= 0.95 * len(good)
 
 
 @pytest.fixture(scope="module", params=[(25.0, 0.4), (25.0, 0.8), (12.0, 0.4)], ids=str)
@@ -113,9 +114,9 @@ def test_a_mode_of_the_frame_is_seen_and_what_it_makes_thin_or_unstable_is_not_c
         gains = random_set(base, rng)
         found = certify(gains, measured.response, *MODELS, model=lambda: measured.model)
         if truth.spectral_radius(gains) >= 1:
-            assert found.verdict in (UNSTABLE, NOT_CERTIFIED)
+            assert found.verdict in (Verdict.UNSTABLE, Verdict.NOT_CERTIFIED)
         elif truth.margins(gains, 500)[0] > 2.6:
-            assert found.verdict not in (CERTIFIED, THIN)
+            assert found.verdict not in (Verdict.CERTIFIED, Verdict.THIN)
         again = large_again(gains, measured.response)
         named += again is not None and abs(again[0] / omega - 1) < 0.05
     assert named >= 10
@@ -182,12 +183,13 @@ def test_each_verdict_is_given_with_its_reason(flights):
     _, measured, truth = flights["adam0"]
     plant = measured.response
     base = load_airframe("adam0").default_gains()
-    assert certify(base, plant, *MODELS).verdict == CERTIFIED
+    assert certify(base, plant, *MODELS).verdict == Verdict.CERTIFIED
     reversed_axis = base.with_elements({"RP_PP": -0.15})
     assert truth.spectral_radius(reversed_axis) > 1
     found = certify(reversed_axis, plant, *MODELS)
-    assert (found.verdict, "rate loop" in found.reason) == (UNSTABLE, True)
-    for factor, verdict, words in ((1.75, THIN, "is above 1.8"), (2.6, NOT_CERTIFIED, "the margin is too thin")):
+    assert (found.verdict, "rate loop" in found.reason) == (Verdict.UNSTABLE, True)
+    thinner = (1.75, Verdict.THIN, "is above 1.8"), (2.6, Verdict.NOT_CERTIFIED, "the margin is too thin")
+    for factor, verdict, words in thinner:
         outer = base.with_elements({"AP_RR": 6.5 * factor, "AP_PP": 6.5 * factor})
         assert truth.spectral_radius(outer) < 1
         found = certify(outer, plant, *MODELS)
@@ -195,7 +197,7 @@ def test_each_verdict_is_given_with_its_reason(flights):
         assert words in found.reason
     narrow = plant.at(plant.omega < 12)
     found = certify(base, narrow, *MODELS)
-    assert found.verdict == NOT_CERTIFIED
+    assert found.verdict == Verdict.NOT_CERTIFIED
     assert "excitation ends at" in found.reason
     runaway = base.with_elements({"RI_RP": 0.3, "RI_PR": -0.05})
     assert "Ki_i through the measured plant" in certify(runaway, plant, *MODELS).reason
@@ -207,27 +209,27 @@ def test_a_controller_without_an_integral_is_judged_as_well(flights):
     for _, measured, truth in flights.values():
         gains = dataclasses.replace(measured.experiment.flown, Ki_i=np.zeros((2, 2)))
         assert truth.spectral_radius(gains) == pytest.approx(1.0)  # the integrals stand still
-        assert certify(gains, measured.response, *MODELS).verdict in (CERTIFIED, THIN)
+        assert certify(gains, measured.response, *MODELS).verdict in (Verdict.CERTIFIED, Verdict.THIN)
         one = dataclasses.replace(gains, Ki_i=np.diag([0.05, 0.0]))
-        assert certify(one, measured.response, *MODELS).verdict in (CERTIFIED, THIN, NOT_CERTIFIED)
+        assert certify(one, measured.response, *MODELS).verdict != Verdict.UNSTABLE
         bad = dataclasses.replace(gains, Kp_i=gains.Kp_i * np.array([[1.0], [-1.0]]))
-        assert certify(bad, measured.response, *MODELS).verdict not in (CERTIFIED, THIN)
-        assert certify(bad, measured.response, *MODELS, model=lambda m=measured: m.model).verdict == UNSTABLE
+        assert certify(bad, measured.response, *MODELS).verdict not in (Verdict.CERTIFIED, Verdict.THIN)
+        assert certify(bad, measured.response, *MODELS, model=lambda m=measured: m.model).verdict == Verdict.UNSTABLE
 
 
 def test_thresholds_are_settable_stored_and_bound(flights):
     log, measured, _ = flights["adam0"]
     gains = log.flown
     strict = certify_from_log(log, gains, load_spec(certificate={"Ms": 1.2, "phase_deg": 60.0}))
-    assert strict.verdict()[0] == THIN
-    assert strict.certificate["thresholds"]["Ms"] == 1.2
+    assert strict.verdict()[0] == Verdict.THIN
+    assert strict.certificate.thresholds["Ms"] == 1.2
     loose = Thresholds(thin_Ms=9.0, thin_phase_deg=5.0)
     outer = gains.with_elements({"AP_RR": 16.0, "AP_PP": 16.0})
-    assert certify(outer, measured.response, *MODELS).verdict == NOT_CERTIFIED
-    assert certify(outer, measured.response, *MODELS, thresholds=loose).verdict == THIN
+    assert certify(outer, measured.response, *MODELS).verdict == Verdict.NOT_CERTIFIED
+    assert certify(outer, measured.response, *MODELS, thresholds=loose).verdict == Verdict.THIN
     with pytest.raises(TuningError, match="thin_Ms must be at least Ms"):
         load_spec(certificate={"Ms": 3.0})
-    edited = {**strict.certificate, "thresholds": {**strict.certificate["thresholds"], "Ms": 1.8}}
+    edited = dataclasses.replace(strict.certificate, thresholds={**strict.certificate.thresholds, "Ms": 1.8})
     assert dataclasses.replace(strict, certificate=edited).verdict()[0] == "void"
 
 
@@ -236,43 +238,45 @@ def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_op
     base = measured.experiment.flown
     response, model = measured.response, measured.model
     late = response.at(response.omega > 9)
-    assert certify(base, late, *MODELS).verdict == NOT_CERTIFIED
-    assert certify(base, late, *MODELS, model=lambda: model).verdict == NOT_CERTIFIED
+    assert certify(base, late, *MODELS).verdict == Verdict.NOT_CERTIFIED
+    assert certify(base, late, *MODELS, model=lambda: model).verdict == Verdict.NOT_CERTIFIED
     growing = dataclasses.replace(model, B=-model.B)
-    assert certify(base, late, *MODELS, model=lambda: growing).verdict == UNSTABLE
-    assert certify(base, response, *MODELS, model=lambda: growing).verdict == CERTIFIED
+    assert certify(base, late, *MODELS, model=lambda: growing).verdict == Verdict.UNSTABLE
+    assert certify(base, response, *MODELS, model=lambda: growing).verdict == Verdict.CERTIFIED
 
 
 @pytest.mark.parametrize(
     "edit",
     [
         lambda g: dataclasses.replace(g, Kp_o=g.Kp_o * 1.0001),
-        lambda g: dataclasses.replace(g, Ts=0.0041),
-        lambda g: dataclasses.replace(g, derivative_cutoff_hz=31.0),
+        lambda g: dataclasses.replace(g, filters=dataclasses.replace(g.filters, Ts=0.0041)),
+        lambda g: dataclasses.replace(g, filters=Filters(g.Ts, 31.0)),
         lambda g: dataclasses.replace(g, moment_scale=(2.5, 2.5, 0.3)),
         lambda g: dataclasses.replace(g, limits=dataclasses.replace(g.limits, moment_max=(0.9, 1.0, 1.0))),
         lambda g: dataclasses.replace(g, yaw=dataclasses.replace(g.yaw, Kp_i=0.51)),
         *(
-            lambda g, name=name, value=value: dataclasses.replace(g, certificate={**g.certificate, name: value})
+            lambda g, name=name, value=value: dataclasses.replace(
+                g, certificate=dataclasses.replace(g.certificate, **{name: value})
+            )
             for name, value in (
-                ("verdict", "stable, thin margin"),
+                ("verdict", Verdict.THIN),
                 ("reason", "none"),
-                ("band", [0.1, 700.0]),
+                ("band", (0.1, 700.0)),
                 ("log_sha256", "0"),
                 ("figures", {}),
             )
         ),
-        lambda g: dataclasses.replace(g, certificate={k: v for k, v in g.certificate.items() if k != "seal"}),
+        lambda g: dataclasses.replace(g, certificate=dataclasses.replace(g.certificate, seal="")),
     ],
 )
 def test_whatever_is_edited_voids_the_certificate(flights, tmp_path, edit):
-    from mimopilot.tuning.gains import load_gains
+    from mimopilot.tuning.gains_file import load_gains
 
     log = flights["adam0"][0]
     examined = certify_from_log(log, log.flown)
     examined.save(tmp_path / "x.gains.toml")
     loaded = load_gains(tmp_path / "x.gains.toml")
-    assert loaded.verdict()[0] == CERTIFIED
+    assert loaded.verdict()[0] == Verdict.CERTIFIED
     edit(loaded).save(tmp_path / "y.gains.toml")
     assert load_gains(tmp_path / "y.gains.toml").verdict()[0] == "void"
 

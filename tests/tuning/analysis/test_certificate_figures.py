@@ -9,34 +9,24 @@ import control
 import numpy as np
 import pytest
 from mimopilot.sitl.physics.airframe import Frame, load_airframe
-from mimopilot.tuning.analysis.certificate import (
-    CERTIFIED,
-    DENSE,
-    GROWING,
-    NOT_CERTIFIED,
-    THIN,
-    UNSTABLE,
-    certify,
-    large_again,
-    loop_above,
-    sensitivity_peak,
-)
+from mimopilot.tuning.analysis.certificate import DENSE, GROWING, certify, large_again, loop_above, sensitivity_peak
 from mimopilot.tuning.analysis.closed_loop import cascade_loop, model_spectral_radius
+from mimopilot.tuning.certificate import Thresholds, Verdict
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import gains_from_toml, gains_to_toml
+from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml
+from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import DRAWS, PlantResponse
 from mimopilot.tuning.plant.measured import Measured
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import TuningSpec
 from mimopilot.tuning.statespace import StateSpace
-from mimopilot.tuning.thresholds import Thresholds
 
 from tests.tuning.truth import TS, Truth, delay, experiment, series
 
 MODELS = ((second_order(20, 0.4, 0, TS),) * 2, (second_order(10, 0.7, 0, TS),) * 2)
 RIGID = ("adam0", "adam0_boom", "adam0_nominal", "adam0_perturbed", "antr", "px4_sih")
-PASSED = (CERTIFIED, THIN)
+PASSED = (Verdict.CERTIFIED, Verdict.THIN)
 #: ANT-R hovers at 14 % of its thrust, where more torque is no longer linear; the rates of PX4's are noisy.
 GOOD = {"antr": {"amplitude": 0.05}, "px4_sih": {"seconds": 40.0}}
 
@@ -113,7 +103,7 @@ def test_no_unstable_set_passes_and_well_damped_ones_do(name):
     plant = flown(name).response
     assert [g for g in unstable if certify(g, plant, *MODELS).verdict in PASSED] == []
     if name in RIGID:
-        certified = [certify(g, plant, *MODELS).verdict == CERTIFIED for g in damped]
+        certified = [certify(g, plant, *MODELS).verdict == Verdict.CERTIFIED for g in damped]
         assert sum(certified) >= 0.95 * len(damped)
 
 
@@ -124,7 +114,7 @@ def test_a_stronger_and_a_longer_flight_do_not_turn_well_damped_sets_down():
         plant = Measured(log).response
         assert plant.known()[0]
         assert plant.known_run()[0] > 0
-        assert sum(certify(g, plant, *MODELS).verdict == CERTIFIED for g in damped) >= 11
+        assert sum(certify(g, plant, *MODELS).verdict == Verdict.CERTIFIED for g in damped) >= 11
 
 
 @pytest.mark.parametrize(
@@ -145,7 +135,7 @@ def test_a_mode_of_the_frame_is_never_certified_and_is_named(frame):
         peak = bending.margins(gains)[0] if stable else np.inf
         found = certify(gains, plant, *MODELS)
         if peak > 1.8:
-            assert found.verdict != CERTIFIED
+            assert found.verdict != Verdict.CERTIFIED
         if peak > 2.6:
             assert found.verdict not in PASSED
         place = re.search(r"at (\d+) rad/s \((\d+) Hz\) the loop's gain may reach", found.reason)
@@ -185,7 +175,7 @@ def test_a_loop_that_is_unstable_below_the_excitation_is_not_certified():
     )
     assert truth("adam0_perturbed").spectral_radius(gains) > 1.0005
     certificate = certify(gains, flown("adam0_perturbed").response, *MODELS)
-    assert certificate.verdict == NOT_CERTIFIED
+    assert certificate.verdict == Verdict.NOT_CERTIFIED
     assert "excitation begins at 1.3 rad/s, where the sensitivity is still" in certificate.reason
 
 
@@ -275,7 +265,9 @@ def plain(kp=0.15, outer=4.0, ki=0.0, kd=0.0):
     """P, or PI with D, the same on both axes."""
     one, zero = np.eye(2), np.zeros((2, 2))
     return dataclasses.replace(
-        defaults(), Kp_o=outer * one, Kp_i=kp * one, Ki_i=ki * one, Kd_i=kd * one, Kff_i=zero, derivative_cutoff_hz=30.0
+        defaults(),
+        **{"Kp_o": outer * one, "Kp_i": kp * one, "Ki_i": ki * one, "Kd_i": kd * one, "Kff_i": zero},
+        filters=Filters(0.004, 30.0),
     )
 
 
@@ -328,7 +320,7 @@ def test_a_peak_beyond_the_band_counts_with_its_error():
 # Outside of the band
 
 
-@pytest.mark.parametrize(("reached", "verdict"), [(0.45, CERTIFIED), (0.55, NOT_CERTIFIED)])
+@pytest.mark.parametrize(("reached", "verdict"), [(0.45, Verdict.CERTIFIED), (0.55, Verdict.NOT_CERTIFIED)])
 def test_above_the_band_the_loop_may_reach_a_half(reached, verdict):
     """15 / s: where the excitation ends at 15 / 0.45 rad/s it may reach 0.45 above."""
     gains, omega = plain(), grid(60.0)
@@ -336,7 +328,7 @@ def test_above_the_band_the_loop_may_reach_a_half(reached, verdict):
     assert loop_above(gains, plant) == pytest.approx(15 / plant.omega, rel=1e-9)
     found = certify(gains, plant, *MODELS)
     assert found.verdict == verdict
-    if verdict == NOT_CERTIFIED:
+    if verdict == Verdict.NOT_CERTIFIED:
         end = f"excitation ends at {plant.omega[-1]:.0f} rad/s"
         assert f"{end}, where the loop's gain may still reach 0.55" in found.reason
 
@@ -370,22 +362,22 @@ def test_where_the_attitude_path_alone_is_large_above_the_band_nothing_is_certif
     omega = grid(30.0)
     gains, plant = plain(kp=0.3 * omega[-1] / 100, outer=0.8 / 0.3 * omega[-1]), integrating(omega)
     found = certify(gains, plant, *MODELS)
-    assert found.verdict == NOT_CERTIFIED
+    assert found.verdict == Verdict.NOT_CERTIFIED
     assert "where the whole cascade's gain may still reach 1" in found.reason
 
 
-@pytest.mark.parametrize(("sensitivity", "verdict"), [(0.45, CERTIFIED), (0.55, NOT_CERTIFIED)])
+@pytest.mark.parametrize(("sensitivity", "verdict"), [(0.45, Verdict.CERTIFIED), (0.55, Verdict.NOT_CERTIFIED)])
 def test_where_the_excitation_begins_the_loop_must_be_in_charge(sensitivity, verdict):
     """S = s^2 / (s^2 + 15 s + 60)."""
     w = np.linspace(1.0, 30.0, 20000)
     start = w[np.searchsorted(np.abs(w**2 / (60 - w**2 + 15j * w)), sensitivity)]
     found = certify(plain(), integrating(grid(60.0, start)), *MODELS)
     assert found.verdict == verdict
-    if verdict == NOT_CERTIFIED:
+    if verdict == Verdict.NOT_CERTIFIED:
         assert f"excitation begins at {start:.1f} rad/s, where the sensitivity is still 0.55" in found.reason
 
 
-@pytest.mark.parametrize(("Ki", "verdict"), [(0.2, CERTIFIED), (-0.01, NOT_CERTIFIED)])
+@pytest.mark.parametrize(("Ki", "verdict"), [(0.2, Verdict.CERTIFIED), (-0.01, Verdict.NOT_CERTIFIED)])
 def test_an_integral_that_runs_away_below_the_excitation_is_not_certified(Ki, verdict):
     found = certify(plain(ki=Ki), integrating(grid(60.0)), *MODELS)
     assert found.verdict == verdict
@@ -394,11 +386,11 @@ def test_an_integral_that_runs_away_below_the_excitation_is_not_certified(Ki, ve
 
 def test_too_little_that_is_known_is_said():
     found = certify(plain(), integrating(np.arange(1.0, 8.0)), *MODELS)
-    assert (found.verdict, found.band) == (NOT_CERTIFIED, (0.0, 0.0))
+    assert (found.verdict, found.band) == (Verdict.NOT_CERTIFIED, (0.0, 0.0))
     assert "fewer than 8 frequencies in a row" in found.reason
     apart = integrating(np.array([*np.arange(1.0, 6.0), *np.arange(20.0, 25.0), *np.arange(50.0, 55.0)]))
     found = certify(plain(), apart, *MODELS)
-    assert found.verdict == NOT_CERTIFIED
+    assert found.verdict == Verdict.NOT_CERTIFIED
     assert "the excitation reaches fewer than 8 frequencies in a row" in found.reason
 
 
@@ -444,7 +436,7 @@ def test_a_loop_about_its_limit_is_noise_and_one_well_above_is_a_mode(ratio, cou
 
 def test_a_mode_is_not_certified_and_what_to_do_is_said():
     found = certify(plain(), with_peak(157.0, 0.6), *MODELS)
-    assert found.verdict == NOT_CERTIFIED
+    assert found.verdict == Verdict.NOT_CERTIFIED
     assert "at 157 rad/s (25 Hz) the loop's gain may reach 0.60 again" in found.reason
     assert "a mode of the frame" in found.reason
 
@@ -454,17 +446,17 @@ def test_a_mode_is_not_certified_and_what_to_do_is_said():
 
 def test_each_verdict_is_given_with_its_reason():
     plant, base, exactly = flown("adam0").response, defaults(), truth("adam0")
-    assert certify(base, plant, *MODELS).verdict == CERTIFIED
+    assert certify(base, plant, *MODELS).verdict == Verdict.CERTIFIED
     reversed_axis = base.with_elements({"RP_PP": -0.15})
     assert exactly.spectral_radius(reversed_axis) > 1
     found = certify(reversed_axis, plant, *MODELS)
-    assert (found.verdict, "rate loop" in found.reason) == (UNSTABLE, True)
+    assert (found.verdict, "rate loop" in found.reason) == (Verdict.UNSTABLE, True)
     fast_outer = base.with_elements({"AP_RR": 30.0, "AP_PP": 30.0})
     assert exactly.spectral_radius(fast_outer) > 1
     found = certify(fast_outer, plant, *MODELS)
-    assert (found.verdict, "whole cascade" in found.reason) == (UNSTABLE, True)
+    assert (found.verdict, "whole cascade" in found.reason) == (Verdict.UNSTABLE, True)
     found = certify(base, plant.at(plant.omega < 12), *MODELS)
-    assert found.verdict == NOT_CERTIFIED
+    assert found.verdict == Verdict.NOT_CERTIFIED
     assert "excitation ends at" in found.reason
 
 
@@ -477,11 +469,11 @@ def test_a_set_that_some_of_the_plants_make_unstable_is_too_close_to_tell():
         low, high = (middle, high) if exactly.spectral_radius(scaled(base, outer=middle)) < 1 else (low, middle)
     doubtful = dataclasses.replace(plant, root=15 * plant.root)
     found = certify(scaled(base, outer=0.99 * low), doubtful, *MODELS)
-    assert found.verdict == NOT_CERTIFIED
+    assert found.verdict == Verdict.NOT_CERTIFIED
     count = re.search(rf"too close to the limit to tell: (\d+) of {DRAWS} plants", found.reason)
     assert count
     assert 0 < int(count[1]) < DRAWS
-    assert certify(scaled(base, outer=1.6 * low), plant, *MODELS).verdict == UNSTABLE
+    assert certify(scaled(base, outer=1.6 * low), plant, *MODELS).verdict == Verdict.UNSTABLE
 
 
 def noisy_body():
@@ -526,15 +518,15 @@ def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_op
 
     wide, narrow = integrating(grid(60.0)), integrating(grid(20.0))
     growing = late_model(1.05)
-    assert certified(wide, growing).verdict == CERTIFIED
+    assert certified(wide, growing).verdict == Verdict.CERTIFIED
     assert not asked  # it costs seconds, and changes nothing
     found = certified(narrow, growing)
-    assert found.verdict == UNSTABLE
+    assert found.verdict == Verdict.UNSTABLE
     assert re.match(r"around the model identified .* spectral radius is 1\.05\d\d; excitation ends at", found.reason)
     calm = StateSpace(np.eye(2), 100 * TS * np.eye(2), np.eye(2), np.zeros((2, 2)), TS)
     assert model_spectral_radius(gains, calm) < 1
-    assert certified(narrow, calm).verdict == NOT_CERTIFIED
-    assert certified(narrow, None).verdict == NOT_CERTIFIED
+    assert certified(narrow, calm).verdict == Verdict.NOT_CERTIFIED
+    assert certified(narrow, None).verdict == Verdict.NOT_CERTIFIED
     assert len(asked) == 3
     assert GROWING < 1.001
 
@@ -561,12 +553,12 @@ def test_a_tuned_set_keeps_its_verdict_in_its_file_and_another_threshold_is_stor
     log = flown("adam0").experiment
     spec = TuningSpec(certificate=Thresholds(Ms=1.1, thin_Ms=3.0))
     tuned = certify_from_log(log, defaults(), spec)
-    assert tuned.verdict()[0] == THIN
-    assert tuned.certificate["thresholds"]["Ms"] == 1.1
-    assert tuned.certificate["log_sha256"] == log.sha256
+    assert tuned.verdict()[0] == Verdict.THIN
+    assert tuned.certificate.thresholds["Ms"] == 1.1
+    assert tuned.certificate.log_sha256 == log.sha256
     read = gains_from_toml(gains_to_toml(tuned), "x")
     assert read.verdict() == tuned.verdict()
-    assert certify_from_log(log, defaults()).verdict()[0] == CERTIFIED
+    assert certify_from_log(log, defaults()).verdict()[0] == Verdict.CERTIFIED
     assert dataclasses.replace(tuned, certificate=None).verdict()[0] == "none"
     other_unit = dataclasses.replace(tuned, moment_scale=(25.0, 25.0, 2.7))
     assert other_unit.verdict()[0] == "void"

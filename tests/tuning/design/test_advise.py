@@ -5,7 +5,7 @@ from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.analysis.certificate import CERTIFIED
+from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.advise import Doublet, advise, predict
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
@@ -56,10 +56,10 @@ def test_the_recommended_model_follows_better_than_the_thesis_one_and_is_certifi
     assert found.zero is None
     assert len(candidates) == 8
     thesis = next(c for c in candidates if c.inner == (20.0, 0.4, 0))
-    assert best.verdict == CERTIFIED
+    assert best.verdict == Verdict.CERTIFIED
     assert np.hypot(*best.follow_deg) < 0.6 * np.hypot(*thesis.follow_deg)
     for other in candidates:
-        if other.verdict == CERTIFIED and np.hypot(*other.follow_deg) <= np.hypot(*best.follow_deg):
+        if other.verdict == Verdict.CERTIFIED and np.hypot(*other.follow_deg) <= np.hypot(*best.follow_deg):
             assert np.hypot(*other.effort) >= np.hypot(*best.effort)
 
 

@@ -116,6 +116,6 @@ def test_a_vibration_is_no_reason_to_refuse_and_is_told(log):
     t = np.arange(len(log.u)) * log.Ts
     tone = 3.0 * np.sin(2 * np.pi * 110 * t)[:, None] * np.ones(2)
     gains = tune(dataclasses.replace(log, y_i=log.y_i + tone), thesis())
-    told = [text for text in gains.provenance["warnings"] if "a vibration" in text]
+    told = [text for text in gains.provenance.warnings if "a vibration" in text]
     assert told
     assert "of what is below 40 Hz" in told[0]

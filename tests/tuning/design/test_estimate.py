@@ -134,7 +134,7 @@ def test_an_inner_controller_that_cannot_be_inverted_falls_back_loudly(log):
     assert np.diag(found.gains.Kp_o) == pytest.approx(4.5, rel=0.15)
     tuned = tune(negatively_damped(log), thesis(refine=False))
     assert Measured(log).body.least(tuned.Ki_i) > 0
-    kept, slow = tuned.provenance["warnings"][:2]
+    kept, slow = tuned.provenance.warnings[:2]
     assert "the log asks for integral gains that run away" in kept
     assert "to forget where it began" in slow
 

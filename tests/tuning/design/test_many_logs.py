@@ -9,8 +9,9 @@ from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.design.many_logs import PAIRS, find_logs
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import MATRICES, load_gains
+from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.parameters import MATRICES
 
 from tests.conftest import assert_one_clear_line
 
@@ -52,7 +53,7 @@ def test_a_campaign_tunes_each_log_as_if_it_were_alone_and_sums_them_up(logs, mi
     for (matrix, pair), one in elements.items():
         i, j = divmod(PAIRS.index(pair), 2)
         values = np.array([getattr(gains, matrix)[i, j] for gains in sets])
-        deviations = [gains.provenance["standard_deviation"][matrix][i][j] for gains in sets]
+        deviations = [gains.provenance.standard_deviation[matrix][i][j] for gains in sets]
         assert one["mean"] == pytest.approx(values.mean(), rel=1e-12)
         assert one["deviation"] == pytest.approx(values.std(ddof=1), rel=1e-9)
         assert one["predicted"] == pytest.approx(np.mean(deviations), rel=1e-12)

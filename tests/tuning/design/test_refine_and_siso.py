@@ -3,7 +3,8 @@ import pytest
 from mimopilot.tuning.design.refine import frequency_grid, refine
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.siso import siso_vrft, whitening_filter
-from mimopilot.tuning.loop import LoopController, closed_loop, complementary_sensitivity
+from mimopilot.tuning.law import Filters
+from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 from mimopilot.tuning.plant.pbsid import pbsid
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
@@ -19,7 +20,7 @@ def test_refinement_finds_a_controller_that_reaches_the_model_with_derivative_on
     num = 0.5 * np.array([c[0], c[1], 0.0])
     den = np.polymul(np.polymul([1, -0.9], [1, -1]), [1, 0]) + np.r_[0.0, num] + np.r_[0.0, 0.5 * d * np.poly([1, 1])]
     model = ReferenceModel(tuple(num), tuple(den), 0, TS)
-    start = LoopController({t: np.array([[v]]) for t, v in (("P", 0.1), ("I", 2.0), ("D", 0.0001))}, TS)
+    start = LoopController({t: np.array([[v]]) for t, v in (("P", 0.1), ("I", 2.0), ("D", 0.0001))}, Filters(TS))
     found = refine(start, PLANT, [model])
     assert found.after < 1e-12 < found.before
     assert found.controller.matrix == pytest.approx(np.array([[kp, ki, kd]]), rel=1e-5)
@@ -27,7 +28,7 @@ def test_refinement_finds_a_controller_that_reaches_the_model_with_derivative_on
 
 def test_the_state_space_of_the_loop_has_the_frequency_response_of_the_formula():
     controller = LoopController(
-        {t: np.array([[v]]) for t, v in zip("PIDF", (0.2, 4.0, 0.0004, 0.05), strict=True)}, TS, derivative_cutoff_hz=30
+        {t: np.array([[v]]) for t, v in zip("PIDF", (0.2, 4.0, 0.0004, 0.05), strict=True)}, Filters(TS, 30.0)
     )
     omega = frequency_grid(TS, 50)
     T = closed_loop(PLANT, controller).frequency_response(omega)[:, 1:, :1]
@@ -36,7 +37,7 @@ def test_the_state_space_of_the_loop_has_the_frequency_response_of_the_formula()
 
 
 def test_refinement_from_gains_that_are_not_stable_is_refused():
-    wild = LoopController({"P": np.array([[10.0]])}, TS)
+    wild = LoopController({"P": np.array([[10.0]])}, Filters(TS))
     with pytest.raises(TuningError, match="not stable"):
         refine(wild, PLANT, [ReferenceModel((0.1,), (1.0, -0.9), 0, TS)])
 

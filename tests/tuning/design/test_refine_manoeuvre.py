@@ -66,12 +66,12 @@ def test_refined_gains_follow_three_times_better_with_the_effort_that_was_asked(
 
 def test_refined_gains_are_stable_with_the_margin_they_are_kept_to_and_say_what_they_are_for(sets):
     refined = sets["refined"]
-    figures = refined.certificate["figures"]
+    figures = refined.certificate.figures
     assert refined.verdict()[0] in ("certified", "stable, thin margin")
     assert figures["Ms"] + figures["Ms_error"] <= 2.5
-    assert refined.provenance["manoeuvre"]["amplitude_deg"] == DOUBLET["amplitude_deg"]
+    assert refined.provenance.details["manoeuvre"]["amplitude_deg"] == DOUBLET["amplitude_deg"]
     # VRFT's deviations are those of other gains.
-    assert refined.provenance["standard_deviation"] == {}
+    assert refined.provenance.standard_deviation == {}
     assert np.linalg.eigvalsh(refined.Ki_i + refined.Ki_i.T)[0] > 0
 
 
@@ -82,13 +82,13 @@ def test_refined_siso_gains_stay_diagonal(sets):
 
 
 def test_the_model_needs_no_more_effort_than_was_allowed(log, sets):
-    allowed = sets["refined"].provenance["manoeuvre"]["effort"]
+    allowed = sets["refined"].provenance.details["manoeuvre"]["effort"]
     needed = effort(sets["refined"], doublet_model(Measured(log), Manoeuvre(**DOUBLET)))
     assert np.all(np.array(needed) <= np.array(allowed) * 1.001)
 
 
 def test_the_same_log_gives_the_same_gains(log, sets):
-    again = tune(log, thesis(manoeuvre=sets["refined"].provenance["manoeuvre"]))
+    again = tune(log, thesis(manoeuvre=sets["refined"].provenance.details["manoeuvre"]))
     assert again.elements() == sets["refined"].elements()
 
 

@@ -32,7 +32,7 @@ def test_intervals_of_adam_0_cover_the_noise_free_estimate():
     for seed in range(RUNS):
         found = estimate(seed)
         for name, hit in hits.items():
-            deviation = np.array(found.provenance["standard_deviation"][name])
+            deviation = np.array(found.provenance.standard_deviation[name])
             hit.append(np.abs(getattr(found, name) - getattr(exact, name)) < Z * deviation)
     coverage = {name: np.mean(hit, axis=0) for name, hit in hits.items()}
     assert coverage["Kp_o"].min() >= 0.90

@@ -9,6 +9,7 @@ from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
 from mimopilot.tuning.excitation import prbs
+from mimopilot.tuning.law import Filters
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import TuningSpec
 from scipy.signal import cont2discrete, lfilter
@@ -77,9 +78,9 @@ def test_the_advisor_tries_lower_derivative_filters_than_the_flown_one_unless_to
     monkeypatch.setattr(advisor, "DELAYS", (0,))
     log = experiment("adam0")
     assert [c.cutoff_hz for c in advise(log, thesis()).candidates] == [30.0, 10.0, 5.0]
-    eight = dataclasses.replace(log, flown=dataclasses.replace(log.flown, derivative_cutoff_hz=8.0))
+    eight = dataclasses.replace(log, flown=dataclasses.replace(log.flown, filters=Filters(log.flown.Ts, 8.0)))
     found = advise(eight, thesis())
     assert [c.cutoff_hz for c in found.candidates] == [8.0, 5.0]
     for c in found.candidates:
         assert c.gains.derivative_cutoff_hz == c.cutoff_hz
-        assert c.delta[0] == c.gains.certificate["figures"]["delta"]
+        assert c.delta[0] == c.gains.certificate.figures["delta"]

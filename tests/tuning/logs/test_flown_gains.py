@@ -40,7 +40,7 @@ def test_our_own_parameters_come_first():
     assert gains.Kp_i[0] == pytest.approx([0.12, 0.01])
     assert gains.Kp_i[1, 1] == pytest.approx(0.30)
     assert gains.limits.rate_max[0] == 7.0
-    assert gains.derivative_pole == pytest.approx(0.5, rel=1e-5)
+    assert gains.filters.derivative_pole == pytest.approx(0.5, rel=1e-5)
     assert gains.moment_scale == (2.5, 2.5, 2.5)
 
 

@@ -4,8 +4,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.law import Filters
 from mimopilot.tuning.logs.reader import read_log
-from mimopilot.tuning.loop import LoopController, closed_loop
+from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.pbsid import fit, identify_rates, pbsid, pbsid_by_response
 from mimopilot.tuning.statespace import StateSpace
@@ -21,7 +22,7 @@ PLANT = StateSpace(
     np.zeros((2, 2)),
     TS,
 )
-CONTROLLER = LoopController({"P": np.diag([0.4, 0.2])}, TS)
+CONTROLLER = LoopController({"P": np.diag([0.4, 0.2])}, Filters(TS))
 
 
 def closed_loop_data(samples, noise=0.1, seed=0):
@@ -71,7 +72,7 @@ def test_without_noise_the_plant_is_exact():
 
 def test_a_direct_term_needs_the_external_signal_in_closed_loop():
     plant = StateSpace(0.8 * np.eye(2), np.eye(2), np.eye(2), np.array([[0.5, 0.1], [0.0, 0.3]]), TS)
-    loop = closed_loop(plant, LoopController({"P": 0.3 * np.eye(2)}, TS))
+    loop = closed_loop(plant, LoopController({"P": 0.3 * np.eye(2)}, Filters(TS)))
     rng = np.random.default_rng(1)
     u_bar, v = rng.choice([-1.0, 1.0], (20000, 2)), rng.standard_normal((20000, 2))
     signals = loop.simulate(np.hstack([0 * v, u_bar, v]))

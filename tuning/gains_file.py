@@ -1,0 +1,155 @@
+"""Gains as a readable TOML file, ``*.gains.toml``; its keys come from the parameter table."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mimopilot.tuning.certificate import Certificate
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.gains import SCHEMA_1, Gains, Limits, YawGains
+from mimopilot.tuning.law import Filters
+from mimopilot.tuning.parameters import ROWS, Row, Shape, rows
+from mimopilot.tuning.provenance import Provenance
+
+from mimopilot.common.errors import Error
+from mimopilot.common.files import write_atomically
+from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text, toml_entries, toml_value
+
+SCHEMA = 2
+#: Tables and entries beside the parameter table's keys.
+SECTIONS = ("roll_pitch", "yaw", "limits")
+OTHERS = ("schema", "moment_scale", "certificate", "provenance")
+#: What the file says beside a key.
+NOTES = {"Ts": "s", "derivative_cutoff_hz": "0: no filter"}
+
+
+def load_gains(path: str | Path) -> Gains:
+    """Read a ``*.gains.toml`` file, of schema 2 or 1.
+
+    Raises
+    ------
+    Error
+        When the file is missing, is not TOML, lacks a matrix, or holds a number that is not finite.
+    """
+    return _gains(read_toml(Path(path), "gains file"), str(path))
+
+
+def gains_from_toml(text: str, where: str) -> Gains:
+    """Parse the text of a gains file; `where` names it in messages. See `load_gains`."""
+    return _gains(parse_toml(text, where), where)
+
+
+def save_gains(gains: Gains, path: Path) -> None:
+    """Write a gains file, atomically."""
+    write_atomically(path, gains_to_toml(gains))
+
+
+def _gains(table: dict[str, Any], where: str) -> Gains:
+    schema = table.get("schema")
+    if isinstance(schema, bool) or schema not in (1, SCHEMA):
+        raise TuningError(
+            f"{where}: schema: got {shown(schema)}, expected {SCHEMA} (or 1, an older one); not a mimopilot gains file?"
+        )
+    known = {*OTHERS, *SECTIONS, *(row.key for row in rows(Shape.POLE, Shape.SCALAR))}
+    for key in sorted(set(table) - known):
+        raise TuningError(f"{where}: {shown_text(key)}: unknown entry; known: {', '.join(sorted(known))}")
+    for name in ("certificate", "provenance"):
+        if not isinstance(table.get(name, {}), dict):
+            raise TuningError(f"{where}: {name}: got {shown(table[name])}, expected a table")
+    try:
+        parts: dict[Shape, dict[str, Any]] = {shape: {} for shape in Shape}
+        for row in ROWS:
+            parts[row.shape][row.key] = _entry(table, row)
+        certificate = Certificate.from_table(table["certificate"]) if "certificate" in table else None
+        if certificate is not None and schema == 1:
+            certificate = replace(certificate, seal=SCHEMA_1)
+        scale = _get(table, "moment_scale", "")
+        return Gains(
+            **parts[Shape.MATRIX],
+            yaw=YawGains(**parts[Shape.YAW]),
+            filters=Filters(**parts[Shape.POLE], **parts[Shape.SCALAR]),
+            limits=Limits(**parts[Shape.AXES]),
+            moment_scale=None if scale == "unknown" else _triple(scale, "moment_scale"),
+            certificate=certificate,
+            provenance=Provenance.from_table(table.get("provenance", {})),
+        )
+    except (Error, OverflowError) as error:
+        raise TuningError(f"{where}: {error}") from error
+
+
+def _entry(table: dict[str, Any], row: Row) -> Any:
+    """What the file holds for a row, or the row's default."""
+    section = _get(table, row.section, "") if row.section else table
+    if row.default is not None and isinstance(section, dict) and row.key not in section:
+        return (row.default,) * 3 if row.shape is Shape.AXES else row.default
+    value = _get(section, row.key, row.section)
+    where = f"{row.section}.{row.key}" if row.section else row.key
+    if row.shape is Shape.MATRIX:
+        return _matrix(value, where)
+    return _triple(value, where) if row.shape is Shape.AXES else _number(value, where)
+
+
+def _get(table: Any, key: str, section: str) -> Any:
+    if not isinstance(table, dict) or key not in table:
+        name = f"{section}.{key}" if section else key
+        raise TuningError(f"{name}: missing; every entry must be given, there are no default gains")
+    return table[key]
+
+
+def _number(value: Any, where: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TuningError(f"{where}: got {shown(value)}, expected a number")
+    return float(value)
+
+
+def _matrix(rows: Any, where: str) -> Any:
+    well_formed = (
+        isinstance(rows, list)
+        and len(rows) == 2
+        and all(isinstance(row, list) and len(row) == 2 for row in rows)
+        and all(isinstance(v, int | float) and not isinstance(v, bool) for row in rows for v in row)
+    )
+    if not well_formed:
+        raise TuningError(f"{where}: got {shown(rows)}, expected a 2x2 list of numbers, roll then pitch")
+    return np.array(rows, dtype=np.float64)
+
+
+def _triple(value: Any, where: str) -> tuple[float, float, float]:
+    if (
+        not isinstance(value, list)
+        or len(value) != 3
+        or not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value)
+    ):
+        raise TuningError(f"{where}: got {shown(value)}, expected three numbers: roll, pitch, yaw")
+    return (float(value[0]), float(value[1]), float(value[2]))
+
+
+def gains_to_toml(gains: Gains) -> str:
+    """Text of the gains file: every float is printed so that reading it back gives the same bits."""
+
+    def line(row: Row) -> str:
+        value = gains.of(row)
+        note = f"  # {NOTES[row.key]}" if row.key in NOTES else ""
+        plain = np.asarray(value, dtype=np.float64).tolist()
+        return f"{row.key} = {toml_value(plain)}{note}"
+
+    scale = toml_value(list(gains.moment_scale)) if gains.moment_scale else '"unknown"'
+    lines = [
+        "# mimopilot gains. Row: output; column: error; roll then pitch. Positive Kd damps.",
+        "# r_i = Kp_o (r_o - y_o);  u = Kp_i (r_i - y_i) + I - Kd_i dy_i/dt + Kff_i r_i,  I += Ts Ki_i (r_i - y_i)",
+        f"schema = {SCHEMA}",
+        *map(line, rows(Shape.SCALAR)),
+        *map(line, rows(Shape.POLE)),
+        f"moment_scale = {scale}  # N m that u = 1 stands for: roll, pitch, yaw",
+    ]
+    for shape, head in ((Shape.MATRIX, ""), (Shape.YAW, ""), (Shape.AXES, "  # roll, pitch, yaw")):
+        lines += ["", f"[{rows(shape)[0].section}]{head}", *map(line, rows(shape))]
+    tables = {"certificate": gains.certificate, "provenance": gains.provenance}
+    for name, content in tables.items():
+        entries = content.as_table() if content is not None else {}
+        if entries:
+            lines += ["", f"[{name}]", *toml_entries(entries)]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,365 @@
+"""The linear part of the flown control law, once, as data.
+
+    r = Kp_o (r_o - y_o)                                attitude controller: rate setpoint
+    u = Kp e + Ki I(e) - Kd D(y) + Kff r + u_bar        rate controller, e = r - y
+
+Each term is a gain matrix, the signal that it acts on and a first-order filter. Everything that tuning knows of the
+law is derived from `TERMS`: the regressors of VRFT, the inverse, the frequency response, the state space and what
+predictions fly. The generated C++ and its reference, `tuning.controller`, are written by hand; the tests compare the
+response of the compiled C++ with `response`, for every parameter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from mimopilot.tuning.errors import NotMinimumPhaseError
+from mimopilot.tuning.parameters import pole_of
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, schur
+from scipy.signal import lfilter
+
+Signal = NDArray[np.float64]
+Response = NDArray[np.complex128]
+
+#: Signals of the rate controller that a term can act on.
+ERROR, RATE, SETPOINT = "error", "rate", "setpoint"
+#: How much of the unknown initial state is left when the inverse counts as settled.
+SETTLED = 0.01
+
+
+@dataclass(frozen=True)
+class Filters:
+    """What the law depends on beside its gains.
+
+    Attributes
+    ----------
+    Ts : float, s
+        Control period.
+    derivative_cutoff_hz : float, Hz
+        Cut-off f_d of the derivative's first-order filter; 0 means no filter.
+    """
+
+    Ts: float
+    derivative_cutoff_hz: float = 0.0
+
+    @property
+    def derivative_pole(self) -> float:
+        """Pole a = exp(-2 pi f_d Ts) of the derivative filter; 0 when f_d = 0."""
+        return pole_of(self.derivative_cutoff_hz, self.Ts)
+
+
+@dataclass(frozen=True)
+class Filter:
+    """H(z) = gain (z - zero) / (divisor (z - pole)), zero = 1 for a difference and 0 otherwise.
+
+    As a state x of its own: y(k) = h s(k) + x(k), x(k+1) = pole x(k) + h (pole - zero) s(k), h = gain / divisor.
+    """
+
+    gain: float
+    pole: float
+    difference: bool = False
+    divisor: float = 1.0
+
+    @property
+    def zero(self) -> float:
+        """The zero of H."""
+        return float(self.difference)
+
+    @property
+    def direct(self) -> float:
+        """H at infinity: what a sample does to the output at once."""
+        return self.gain / self.divisor
+
+    @property
+    def memory(self) -> float:
+        """What a sample adds to the state."""
+        return self.direct * (self.pole - self.zero)
+
+    def run(self, signal: Signal) -> Signal:
+        """The filter on every column of `signal` (N, n), from rest; a difference begins with 0."""
+        moved = np.diff(signal, axis=0, prepend=signal[:1]) if self.difference else signal
+        moved = moved / self.divisor
+        if self.pole == 1:
+            return np.asarray(self.gain * np.cumsum(moved, axis=0), dtype=np.float64)
+        return np.asarray(lfilter([self.gain], [1, -self.pole], moved, axis=0), dtype=np.float64)
+
+    def times(self, matrix: Signal, z: Response) -> Response:
+        """``matrix`` H(z)."""
+        product: Response = matrix * self.gain * (z - self.zero) / (self.divisor * (z - self.pole))
+        return product
+
+
+@dataclass(frozen=True)
+class Term:
+    """One term of the rate controller.
+
+    Attributes
+    ----------
+    matrix : str
+        Name of its gain matrix in `tuning.gains.Gains`.
+    signal : str
+        What it acts on: `ERROR`, `RATE` or `SETPOINT`.
+    sign : int
+        With which it is added to u.
+    filter : callable
+        `Filters` -> its `Filter`; None: it acts on the signal itself.
+    """
+
+    matrix: str
+    signal: str
+    sign: int = 1
+    filter: Callable[[Filters], Filter | None] = lambda filters: None
+
+
+def _integral(filters: Filters) -> Filter:
+    return Filter(gain=filters.Ts, pole=1.0)
+
+
+def _derivative(filters: Filters) -> Filter:
+    a = filters.derivative_pole
+    return Filter(gain=1 - a, pole=a, difference=True, divisor=filters.Ts)
+
+
+#: Letter -> term of the rate controller, in the order in which its regressors and its sums stand.
+TERMS = {
+    "P": Term("Kp_i", ERROR),
+    "I": Term("Ki_i", ERROR, filter=_integral),
+    "D": Term("Kd_i", RATE, -1, _derivative),
+    "F": Term("Kff_i", SETPOINT),
+}
+
+
+class Matrices(Protocol):
+    """A gain set, or several stacked: matrices (..., 2, 2) by the names of `TERMS`, and the filters."""
+
+    @property
+    def filters(self) -> Filters:
+        """What the law depends on beside its gains."""
+
+
+def rate_matrices(gains: Matrices) -> dict[str, Signal]:
+    """Letter -> matrix of the rate controller."""
+    return {letter: getattr(gains, term.matrix) for letter, term in TERMS.items()}
+
+
+def regressors(letters: str, error: Signal, rate: Signal, setpoint: Signal, filters: Filters) -> Signal:
+    """The regressor x(k) of u(k) = B x(k), term by term.
+
+    Parameters
+    ----------
+    letters : str
+        Letters of `TERMS`, in that order.
+    error, rate, setpoint : (N, n) arrays
+    filters : Filters
+
+    Returns
+    -------
+    (N, n len(letters)) array
+    """
+    signals = {ERROR: error, RATE: rate, SETPOINT: setpoint}
+    columns = []
+    for letter in letters:
+        term = TERMS[letter]
+        shape = term.filter(filters)
+        filtered = signals[term.signal] if shape is None else shape.run(signals[term.signal])
+        columns.append(filtered if term.sign > 0 else -filtered)
+    return np.hstack(columns)
+
+
+def rate_response(matrices: Mapping[str, Signal], filters: Filters, omega: Signal) -> tuple[Response, Response]:
+    """Frequency response of the rate controller: u = C_r r - C_y y.
+
+    Parameters
+    ----------
+    matrices : mapping
+        Letter -> (..., n_u, n_y) matrix.
+    filters : Filters
+    omega : (K,) array, rad/s
+
+    Returns
+    -------
+    C_r, C_y : (..., K, n_u, n_y) arrays
+    """
+    z = np.exp(1j * np.asarray(omega) * filters.Ts)[:, None, None]
+    of_r: Any = np.zeros_like(z)
+    of_y: Any = np.zeros_like(z)
+    for letter, term in TERMS.items():
+        if letter in matrices:
+            shape, matrix = term.filter(filters), term.sign * matrices[letter]
+            part = matrix if shape is None else shape.times(matrix, z)
+            of_r = of_r + part if term.signal in (ERROR, SETPOINT) else of_r
+            of_y = of_y + part if term.signal == ERROR else of_y - part if term.signal == RATE else of_y
+    return of_r, of_y
+
+
+@dataclass(frozen=True, eq=False)
+class StateSpaceLaw:
+    """The rate controller as w(k+1) = A w + B_e e + B_y y + B_r r, u = C w + D_e e + D_y y + D_r r.
+
+    Each filtered term has a state for each of its n inputs.
+
+    Attributes
+    ----------
+    A, C : (m, m) and (n_u, m) arrays
+    B, D : dict
+        Signal -> (m, n) and (n_u, n) arrays.
+    """
+
+    A: Signal
+    B: dict[str, Signal]
+    C: Signal
+    D: dict[str, Signal]
+
+
+def state_space(matrices: Mapping[str, Signal], filters: Filters) -> StateSpaceLaw:
+    """The rate controller in state space.
+
+    Parameters
+    ----------
+    matrices : mapping
+        Letter -> (n_u, n) matrix.
+    filters : Filters
+    """
+    n_u, n = np.shape(next(iter(matrices.values())))
+    D = {signal: np.zeros((n_u, n)) for signal in (ERROR, RATE, SETPOINT)}
+    poles: list[Signal] = []
+    inputs: list[tuple[str, Signal]] = []
+    outputs: list[Signal] = []
+    for letter, term in TERMS.items():
+        if letter not in matrices:
+            continue
+        shape, matrix = term.filter(filters), term.sign * np.asarray(matrices[letter], float)
+        D[term.signal] = D[term.signal] + (matrix if shape is None else shape.direct * matrix)
+        if shape is not None:
+            poles.append(shape.pole * np.eye(n))
+            inputs.append((term.signal, shape.memory * np.eye(n)))
+            outputs.append(matrix)
+    none = np.zeros((n, n))
+    B = {signal: np.vstack([np.zeros((0, n)), *(b if s == signal else none for s, b in inputs)]) for signal in D}
+    A = block_diag(*poles) if poles else np.zeros((0, 0))
+    return StateSpaceLaw(A, B, np.hstack([np.zeros((n_u, 0)), *outputs]), D)
+
+
+def inverse_eigenvalues(matrices: Mapping[str, Signal], filters: Filters) -> Any:
+    """Poles of the inverse rate controller; with an integral alone the eigenvalues of I - Ts Ki (Kp + Ts Ki + Kff)^-1.
+
+    Raises
+    ------
+    NotMinimumPhaseError
+        When the controller has no inverse.
+    """
+    return np.linalg.eigvals(_inverse(matrices, filters)[0])
+
+
+def _inverse(matrices: Mapping[str, Signal], filters: Filters) -> tuple[Signal, Signal, Signal]:
+    """A and B of the inverse from u to e, in the coordinates of the terms' parts of u, and its direct gain."""
+    direct: Any = 0.0
+    poles, pushes = [], []
+    for letter, term in TERMS.items():
+        if letter in matrices and term.signal != RATE:
+            shape, matrix = term.filter(filters), matrices[letter]
+            direct = direct + (matrix if shape is None else shape.direct * matrix)
+            if shape is not None:
+                poles.append(shape.pole * np.eye(len(matrix)))
+                pushes.append(shape.memory * matrix)
+    if np.linalg.cond(direct) > 1e12:
+        raise NotMinimumPhaseError(
+            f"the rate controller has no inverse: its direct gain from the setpoint, {direct.tolist()}, is singular"
+        )
+    inverse = np.linalg.inv(direct)
+    n = len(direct)
+    B = np.vstack([np.zeros((0, n)), *(push @ inverse for push in pushes)])
+    return block_diag(*poles) - np.hstack([B] * len(poles)) if poles else np.zeros((0, 0)), B, inverse
+
+
+def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Signal, int]:
+    """Rate setpoint with which the rate controller would have made `u`: C_i^-1 u, (3.32)-(3.34) of the thesis.
+
+    The inverse is solved by the Schur form of its state matrix, one first-order filter a state.
+
+    Parameters
+    ----------
+    gains : Gains
+        Of which the rate controller is used.
+    u : (N, 2) array
+        Torque (normalised) applied to the plant, excitation included: the virtual controller makes all of it.
+    rates : (N, 2) array, rad/s
+        Measured body rates.
+
+    Returns
+    -------
+    r_i : (N, 2) array, rad/s
+        The setpoint; its first samples hold the transient of the unknown initial integrator.
+    settling : int, samples
+        After so many samples that transient is below 1 %.
+
+    Raises
+    ------
+    NotMinimumPhaseError
+        When the inverse is unstable, with its eigenvalues, or does not exist.
+    """
+    matrices, filters = rate_matrices(gains), gains.filters
+    A, B, inverse = _inverse(matrices, filters)
+    eigenvalues = np.linalg.eigvals(A)
+    # An integrator that is not used (a zero row of Ki) leaves its state at rest: an eigenvalue of exactly 1.
+    at_rest = np.isclose(eigenvalues, 1.0, rtol=0, atol=1e-12)
+    unstable = np.abs(eigenvalues[~at_rest]) >= 1
+    if np.any(unstable) or (at_rest.any() and np.linalg.matrix_rank(B) + at_rest.sum() > len(A)):
+        raise NotMinimumPhaseError(
+            "the rate controller cannot be inverted, it is not minimum phase: eigenvalues of the inverse "
+            f"{', '.join(f'{v:.6g}' for v in eigenvalues)}, expected inside the unit circle; "
+            f"Ki_i = {matrices['I'].round(6).tolist()} should be positive definite"
+        )
+    known = u
+    for letter, term in TERMS.items():  # what of u the measured rates alone have made
+        if term.signal != ERROR:
+            known = known - regressors(letter, rates, rates, rates, filters) @ matrices[letter].T
+    n = u.shape[1]
+    triangle, basis = schur(A, output="complex")
+    drive = (known @ B.T) @ basis.conj()
+    states = np.zeros_like(drive)
+    for i in reversed(range(len(A))):  # upper triangular: the last state depends on itself alone
+        coupled = drive[:, i].copy()
+        for j in range(i + 1, len(A)):
+            coupled[1:] += triangle[i, j] * states[:-1, j]
+        states[:, i] = lfilter([1], [1, -triangle[i, i]], coupled)
+    parts = (states @ basis.T).real.reshape(len(u), -1, n).sum(axis=1)
+    previous = np.vstack([np.zeros((1, n)), parts[:-1]])
+    error = (known - previous) @ inverse.T
+    moving = np.abs(eigenvalues[~at_rest])
+    slowest = float(moving.max()) if len(moving) else 0.0
+    settling = int(np.ceil(np.log(SETTLED) / np.log(slowest))) if 0 < slowest < 1 else 0
+    return error + rates, settling
+
+
+def response(gains: Any, omega: Signal) -> Response:
+    """Frequency response of the whole law, for small signals.
+
+    Parameters
+    ----------
+    gains : Gains
+    omega : (K,) array, rad/s
+
+    Returns
+    -------
+    (K, 6, 12) array
+        From attitude setpoint (rad), attitude (rad), body rates (rad/s) and excitation, three axes each, to rate
+        setpoint (rad/s) and torque (normalised).
+    """
+
+    def whole(name: str) -> Signal:
+        return block_diag(getattr(gains, name), getattr(gains.yaw, name))
+
+    attitude, eye, none = whole("Kp_o"), np.eye(3), np.zeros((3, 3))
+    matrices = {letter: whole(term.matrix) for letter, term in TERMS.items()}
+    found = np.zeros((len(omega), 6, 12), np.complex128)
+    found[:, :3] = np.hstack([attitude, -attitude, none, none])
+    of_r, of_y = rate_response(matrices, gains.filters, omega)
+    found[:, 3:] = of_r @ found[:, :3]
+    found[:, 3:, 6:9] -= of_y
+    found[:, 3:, 9:] = eye
+    return found
