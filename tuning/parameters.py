@@ -151,7 +151,7 @@ class Row:
     @property
     def dimensions(self) -> str:
         """Of the C++ member."""
-        return {Shape.MATRIX: "[2][2]", Shape.AXES: "[kAxes]"}.get(self.shape, "")
+        return {Shape.MATRIX: "[2][2]", Shape.AXES: "[3]"}.get(self.shape, "")
 
     def element(self, value: float, Ts: float) -> float:
         """What the controller runs on, of a value of the gains file."""

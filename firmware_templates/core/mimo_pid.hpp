@@ -17,6 +17,7 @@
 
 namespace mimopilot {
 
+constexpr int kAxes = 3;            // roll, pitch, yaw
 constexpr int32_t kHoldSamples = 25;  // an invalid input is replaced by its last good value for so long
 constexpr float kMaxRate = 100.0F;    // rad/s, range of a credible body rate
 constexpr float kMaxAngle = 12.566371F;  // rad, 4 pi, range of a credible angle or set-point

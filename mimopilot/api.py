@@ -1,0 +1,427 @@
+"""What `import mimopilot` offers: one function for each thing that the command line does.
+
+Paths may be `str` or `Path`. Every function raises `mimopilot.Error` for what its caller can correct, and gives the
+same bits as the command of its name.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mimopilot.common.blas import reproducible
+from mimopilot.sitl.physics.airframe import Airframe
+from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.gains import Gains, Triple
+
+if TYPE_CHECKING:
+    from mimopilot.sitl.flight.metrics import Performance
+    from mimopilot.sitl.flight.scenario import Scenario
+    from mimopilot.sitl.flight.simulator import Flight
+    from mimopilot.sitl.mavlink.ground_station.upload import UploadOutcome
+    from mimopilot.tuning.design.advise import Advice
+    from mimopilot.tuning.logs.columns import Columns
+    from mimopilot.tuning.logs.inspection import Inspection
+    from mimopilot.tuning.reference_model import ContinuousModel
+    from mimopilot.tuning.spec import TuningSpec
+
+PathLike = str | Path
+Log = PathLike | Experiment
+GainSet = PathLike | Gains
+Model = tuple[float, float] | tuple[float, float, int] | "ContinuousModel"
+
+
+@reproducible
+def read_log(path: PathLike, columns: PathLike | None = None) -> Experiment:
+    """Read an experiment from a flight log.
+
+    Parameters
+    ----------
+    path : str or Path
+        PX4 ULog, ArduPilot dataflash, CSV or MATLAB file.
+    columns : str or Path, optional
+        Names, units and signs of the columns of a CSV or MATLAB file (TOML).
+
+    Returns
+    -------
+    Experiment
+        The signals in SI units; what is doubtful about the log is in its `warnings`.
+    """
+    from mimopilot.tuning.logs.reader import read_log as read
+
+    return read(Path(path), _columns(columns))
+
+
+@reproducible
+def inspect(path: PathLike, columns: PathLike | None = None) -> Inspection:
+    """Say what is in a log, and whether gains can be tuned from it; see `read_log`."""
+    from mimopilot.tuning.logs.inspection import inspect_log
+
+    return inspect_log(Path(path), _columns(columns))
+
+
+@reproducible
+def tune(
+    log: Log,
+    *,
+    inner: Model | None = None,
+    outer: Model | None = None,
+    spec: PathLike | TuningSpec | None = None,
+    repeat: Log | None = None,
+    columns: PathLike | None = None,
+    **options: Any,
+) -> Gains:
+    """Find the gains of the attitude cascade from one flight.
+
+    Parameters
+    ----------
+    log : str, Path or Experiment
+        Flight with excitation.
+    inner, outer : tuple, optional
+        Reference models of the rate and the attitude loop: (omega rad/s, damping, delay samples).
+    spec : str, Path or TuningSpec, optional
+        Specification; TOML where it is a path. What is given here outranks it.
+    repeat : str, Path or Experiment, optional
+        Second flight of the same experiment, for the instrument ``repeated``.
+    columns : str or Path, optional
+        As in `read_log`.
+    **options
+        Further entries of `tuning.spec.TuningSpec`: ``method``, ``structure``, ``instrument``, ``window``...
+
+    Returns
+    -------
+    Gains
+        With their certificate, standard deviations and warnings.
+    """
+    from mimopilot.tuning.design.cascade import tune as tune_cascade
+
+    task = _spec(spec, {"inner": inner, "outer": outer, **options})
+    second = None if repeat is None else _experiment(repeat, columns)
+    return tune_cascade(_experiment(log, columns), task, repeat=second)
+
+
+@reproducible
+def certify(
+    log: Log, gains: GainSet, *, spec: PathLike | TuningSpec | None = None, columns: PathLike | None = None
+) -> Gains:
+    """Say whether a loop will be stable, from a flight of the vehicle under any gains.
+
+    Parameters
+    ----------
+    log : str, Path or Experiment
+    gains : str, Path or Gains
+        Set to examine.
+    spec : str, Path or TuningSpec, optional
+        Whose ``certificate`` says which margins are needed.
+    columns : str or Path, optional
+        As in `read_log`.
+
+    Returns
+    -------
+    Gains
+        The same set with its new certificate: see `Gains.verdict` and `Gains.certificate`.
+    """
+    from mimopilot.tuning.design.cascade import certify_from_log
+
+    return certify_from_log(_experiment(log, columns), _gains(gains), _spec(spec, {}))
+
+
+@reproducible
+def advise(
+    log: Log,
+    *,
+    outer: Model | None = None,
+    spec: PathLike | TuningSpec | None = None,
+    columns: PathLike | None = None,
+) -> Advice:
+    """Scan models of the rate loop and derivative filters; recommend one.
+
+    Parameters
+    ----------
+    log : str, Path or Experiment
+    outer : tuple, optional
+        Attitude loop: (omega rad/s, damping, delay samples).
+    spec, columns
+        As in `tune`.
+
+    Returns
+    -------
+    Advice
+        Its `recommended` candidate holds tuned and certified gains.
+    """
+    from mimopilot.tuning.design.advise import advise as scan
+
+    return scan(_experiment(log, columns), _spec(spec, {"outer": outer}))
+
+
+def load_gains(path: PathLike) -> Gains:
+    """Read a gains file, ``*.gains.toml``; `Gains.save` writes one."""
+    from mimopilot.tuning.gains_file import load_gains as load
+
+    return load(path)
+
+
+def generate(
+    gains: GainSet,
+    out: PathLike,
+    *,
+    target: str = "native",
+    px4_api: str = "crtp",
+    force: bool = False,
+    uncertified: bool = False,
+) -> list[Path]:
+    """Emit the C++ controller with its gains, parameter table, build files and tests.
+
+    Parameters
+    ----------
+    gains : str, Path or Gains
+    out : str or Path
+        Folder to write to.
+    target : str
+        ``native``, ``px4`` or ``cortex-m4``.
+    px4_api : str
+        PX4's module interface: ``crtp`` up to v1.17, ``descriptor`` later.
+    force : bool
+        Overwrite files that mimopilot did not generate.
+    uncertified : bool
+        Accept gains whose stability is in doubt.
+
+    Returns
+    -------
+    list of Path
+        All files of the tree, also those that were up to date.
+    """
+    from mimopilot.codegen.render import render, write_tree
+    from mimopilot.tuning.acceptance import check_verdict
+
+    loaded = _gains(gains)
+    check_verdict(loaded, allow=uncertified)
+    files = render(loaded, target, px4_api)
+    write_tree(files, Path(out), force)
+    return [Path(out) / name for name in files]
+
+
+def load_airframe(name_or_path: PathLike) -> Airframe:
+    """An airframe that comes with mimopilot, by name, or that of a TOML file."""
+    from mimopilot.sitl.physics.airframe import load_airframe as load
+
+    return load(str(name_or_path)).airframe
+
+
+def fly(
+    airframe: PathLike | Airframe,
+    gains: GainSet | None = None,
+    scenario: PathLike | Scenario = "doublet",
+    *,
+    axis: str | None = None,
+    amplitude_deg: float | None = None,
+    period_s: float | None = None,
+    tail_s: float | None = None,
+    faults: Iterable[str] = (),
+    seed: int = 0,
+    noise: bool = True,
+    on: Literal["native", "cortex-m4"] = "native",
+) -> Flight:
+    """Fly the generated C++ in process.
+
+    Parameters
+    ----------
+    airframe : str, Path or Airframe
+        Name, TOML file, or an airframe.
+    gains : str, Path or Gains, optional
+        By default the airframe's own.
+    scenario : str, Path or Scenario
+        ``doublet``, ``step``, ``hover``, a scenario file (TOML), or a scenario.
+    axis : str, optional
+        ``roll`` (the default) or ``pitch``.
+    amplitude_deg, period_s, tail_s : float, optional
+        Of the manoeuvre; 22.5 degrees, 0.42 s and 1.5 s by default.
+    faults : iterable of str
+        ``KIND[:TARGET][=SIZE]@AT[+DURATION]``.
+    seed : int
+        Of the measurement noise.
+    noise : bool
+        False: exact measurements.
+    on : str
+        ``native``, or ``cortex-m4``: the vehicle's processor, emulated.
+
+    Returns
+    -------
+    Flight
+        See `performance` for its figures and `plot_flight`.
+    """
+    from mimopilot.codegen.cortex_m4 import load_emulated
+    from mimopilot.sitl.autopilot.autopilot import Autopilot
+    from mimopilot.sitl.errors import SitlError
+    from mimopilot.sitl.flight.scenario import Scenario, scenario_of
+    from mimopilot.sitl.flight.simulator import fly as fly_scenario
+
+    if on not in ("native", "cortex-m4"):
+        raise SitlError(f"on: got {on!r}, expected native or cortex-m4")
+    body, controller = vehicle(airframe, gains)
+    task = (
+        scenario
+        if isinstance(scenario, Scenario)
+        else scenario_of(str(scenario), axis, amplitude_deg, period_s, tail_s, list(faults), controller.Ts)
+    )
+    processor = load_emulated(controller) if on == "cortex-m4" else None
+    return fly_scenario(body, Autopilot(body, controller, processor), task, seed, noise)
+
+
+def performance(flight: Flight, gains: GainSet) -> Performance:
+    """Figures of a flight over its manoeuvre, against the reference models that the gains were made for."""
+    from mimopilot.sitl.flight.metrics import performance as figures
+
+    return figures(flight, *_gains(gains).reference_models(flight.scenario.axis))
+
+
+@reproducible
+def experiment(
+    airframe: PathLike | Airframe,
+    out: PathLike | None = None,
+    *,
+    gains: GainSet | None = None,
+    seconds_per_axis: float = 20.0,
+    amplitude: float | None = None,
+    bandwidth: float = 50.0,
+    seed: int = 0,
+    excitation_seed: int | None = None,
+) -> Experiment:
+    """Fly a simulated experiment with a PRBS added to the torque on roll, then on pitch.
+
+    Parameters
+    ----------
+    airframe, gains
+        As in `fly`.
+    out : str or Path, optional
+        Where its log is written (ULog).
+    seconds_per_axis : float, s
+    amplitude : float, optional
+        Of the injected torque (normalised); by default 0.15, or less where the motors have little room.
+    bandwidth : float, rad/s
+        Of the injected torque.
+    seed : int
+        Of the measurement noise, and of the excitation where `excitation_seed` is not given.
+    excitation_seed : int, optional
+        Of the excitation.
+
+    Returns
+    -------
+    Experiment
+        As read from the log.
+    """
+    from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, check_survived, default_amplitude
+    from mimopilot.tuning.logs.reader import read_log as read
+
+    body, controller = vehicle(airframe, gains)
+    strength = default_amplitude(body) if amplitude is None else amplitude
+    plan = ExperimentPlan(body, controller, seconds_per_axis, strength, bandwidth, excitation_seed)
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "flight.ulg" if out is None else Path(out)
+        check_survived(plan.record(path, seed))
+        return read(path)
+
+
+def upload(
+    gains: GainSet,
+    connect: str,
+    *,
+    profile: str = "mimo",
+    moment_scale: Triple | Literal["flown"] | None = None,
+    dry_run: bool = False,
+    force_armed: bool = False,
+    uncertified: bool = False,
+    drop_off_diagonals: bool = False,
+    timeout: float = 12.0,
+    snapshot: PathLike | None = None,
+    signing_key: PathLike | None = None,
+    system: int = 0,
+) -> UploadOutcome:
+    """Write gains to a vehicle: all of them, each read back, or the old ones again.
+
+    Parameters
+    ----------
+    gains : str, Path or Gains
+    connect : str
+        ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
+    profile : str
+        ``mimo``: our module. ``px4-stock``, ``ardupilot-stock``: the diagonal, in their controllers.
+    moment_scale : tuple of 3 float (N m), or ``flown``, optional
+        Unit of torque of a vehicle that does not publish it.
+    dry_run, force_armed, uncertified, drop_off_diagonals : bool
+        As the command's options.
+    timeout : float, s
+        Abort after this many seconds without a message.
+    snapshot : str or Path, optional
+        Where the old values are saved; by default a new file in the working folder, or beside the gains file.
+    signing_key : str or Path, optional
+        Sign with this key.
+    system : int
+        The vehicle's system number; 0: the only one there is.
+
+    Returns
+    -------
+    UploadOutcome
+        ``verified`` when every value was read back.
+    """
+    from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+    from mimopilot.sitl.mavlink.ground_station.transaction import transact
+    from mimopilot.tuning.acceptance import check_verdict
+
+    loaded = _gains(gains)
+    check_verdict(loaded, allow=uncertified)
+    source = Path("gains") if isinstance(gains, Gains) else Path(gains)
+    options = LinkOptions(
+        connect,
+        system,
+        timeout,
+        Path(signing_key) if signing_key else None,
+        force_armed,
+        dry_run,
+        yes=True,
+        snapshot=Path(snapshot) if snapshot else None,
+        stem=source.with_name(source.name.removesuffix(".toml").removesuffix(".gains")),
+    )
+    return transact(make_plan(loaded, profile, drop_off_diagonals), options, loaded, moment_scale)
+
+
+def vehicle(airframe: PathLike | Airframe, gains: GainSet | None = None) -> tuple[Airframe, Gains]:
+    """An airframe and the gains that fly it, by default its own."""
+    from mimopilot.sitl.errors import SitlError
+    from mimopilot.sitl.physics.airframe import load_airframe as load
+
+    if isinstance(airframe, Airframe):
+        if gains is None:
+            raise SitlError(f"gains: an airframe that is no file ({airframe.name}) has none of its own; give them")
+        return airframe, _gains(gains)
+    loaded = load(str(airframe))
+    return loaded.airframe, loaded.default_gains() if gains is None else _gains(gains)
+
+
+def _experiment(log: Log, columns: PathLike | None) -> Experiment:
+    from mimopilot.tuning.logs.reader import read_log as read
+
+    return log if isinstance(log, Experiment) else read(Path(log), _columns(columns))
+
+
+def _gains(gains: GainSet) -> Gains:
+    return gains if isinstance(gains, Gains) else load_gains(gains)
+
+
+def _columns(path: PathLike | None) -> Columns | None:
+    from mimopilot.tuning.logs.columns import load_columns
+
+    return None if path is None else load_columns(Path(path))
+
+
+def _spec(spec: PathLike | TuningSpec | None, overrides: Mapping[str, Any]) -> TuningSpec:
+    from mimopilot.tuning.spec import load_spec
+
+    given = {name: value for name, value in overrides.items() if value is not None}
+    if spec is None or isinstance(spec, str | Path):
+        return load_spec(None if spec is None else Path(spec), **given)
+    return load_spec(None, **{**{name: getattr(spec, name) for name in spec.model_fields_set}, **given})
