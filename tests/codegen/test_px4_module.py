@@ -417,7 +417,7 @@ def test_acro_flies_as_stabilized_and_says_so(program):
 
 
 def test_other_gains_compile_and_fly_their_own_numbers(gains, tmp_path):
-    other = dataclasses.replace(gains, Ts=0.002, moment_scale=None)
+    other = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, Ts=0.002), moment_scale=None)
     program = build(other, "crtp", tmp_path)
     start = ["gyro_interval 2000", *AIRBORNE, *["gyro 2000 0.1 -0.2 0.3"] * 20]
     inputs = np.zeros(19, INPUT)
