@@ -12,7 +12,8 @@ import cffi
 import numpy as np
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows, to_array
-from mimopilot.codegen.render import TEMPLATES, interface_hash, render, write_tree
+from mimopilot.codegen.render import interface_hash, render, write_tree
+from mimopilot.codegen.targets import TEMPLATES
 from mimopilot.codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
 from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray

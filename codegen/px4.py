@@ -16,8 +16,6 @@ from mimopilot.tuning.parameters import (
     Setting,
 )
 
-APIS = ("crtp", "descriptor")
-
 #: Our unit -> PX4's; one that is not here is in none of PX4's lists.
 _UNITS = {"1/s": "1/s", "s": "s", "rad": "rad", "rad/s": "rad/s", "norm": "norm", "N m": "Nm"}
 

@@ -15,7 +15,8 @@ import jinja2
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
 from mimopilot.codegen.literals import float_literal
-from mimopilot.codegen.px4 import APIS, entries
+from mimopilot.codegen.px4 import entries
+from mimopilot.codegen.targets import DESCRIPTION, TEMPLATES, Target, find_target
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
 from mimopilot.codegen.vectors import emitted_vectors
 from mimopilot.tuning.acceptance import check_ranges
@@ -25,18 +26,10 @@ from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, Row, Shape
 
 from mimopilot.common.files import inside, read_text, sha256, write_atomically
 
-TEMPLATES = Path(__file__).resolve().parent.parent / "firmware_templates"
 #: What defines the C interface, beside the parameter table.
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
 MANIFEST = "manifest.json"
 MANIFEST_SCHEMA = 1
-
-#: Target -> the folders of firmware_templates that it is made of. ``package`` is the root of the output.
-TARGETS = {
-    "native": ("core", "native", "package"),
-    "px4": ("core", "native", "px4", "package"),
-    "cortex-m4": ("core", "native", "cortex_m4", "package"),
-}
 
 
 def generator_version() -> str:
@@ -54,7 +47,7 @@ def interface_hash() -> int:
     return int.from_bytes(digest.digest()[:4], "big")
 
 
-def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict[str, str]:
+def render(gains: Gains, target: str = "native", **options: str) -> dict[str, str]:
     """Every file of an output tree, by its path in that tree; the same gains give the same bytes.
 
     Parameters
@@ -62,9 +55,9 @@ def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict
     gains : Gains
         What to emit.
     target : str
-        A key of `TARGETS`.
-    px4_api : str
-        Which of PX4's module interfaces, for the target px4: ``crtp`` (up to v1.17) or ``descriptor`` (later).
+        Name of a target, see `codegen.targets`.
+    **options : str
+        Options of the target, such as ``px4_api``.
 
     Returns
     -------
@@ -74,12 +67,12 @@ def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict
     Raises
     ------
     CodegenError
-        When the target or the interface is unknown, or a gain is out of its parameter's range.
+        When the target or the value of an option is unknown.
+    TuningError
+        When a gain is out of its parameter's range.
     """
-    if target not in TARGETS:
-        raise CodegenError(f"target: got {target!r}, expected one of {', '.join(sorted(TARGETS))}")
-    if px4_api not in APIS:
-        raise CodegenError(f"px4-api: got {px4_api!r}, expected one of {', '.join(APIS)}")
+    kind = find_target(target)
+    chosen = kind.chosen(options)
     check_names()
     check_ranges(gains)
     environment = jinja2.Environment(
@@ -88,11 +81,11 @@ def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict
         autoescape=False,
         loader=jinja2.FileSystemLoader(TEMPLATES),
     )
-    context = _context(gains, target) | {"px4_api": px4_api}
+    context = _context(gains, kind) | chosen
     files: dict[str, str] = {}
-    for folder in TARGETS[target]:
+    for folder in kind.folders:
         for path in sorted((TEMPLATES / folder).rglob("*")):
-            if not path.is_file() or "__pycache__" in path.parts:
+            if not path.is_file() or path.name == DESCRIPTION:
                 continue
             name = path.relative_to(TEMPLATES).as_posix().removeprefix("package/")
             template = path.relative_to(TEMPLATES).as_posix()
@@ -104,7 +97,7 @@ def render(gains: Gains, target: str = "native", px4_api: str = APIS[0]) -> dict
     return dict(sorted(files.items()))
 
 
-def _context(gains: Gains, target: str) -> dict[str, Any]:
+def _context(gains: Gains, target: Target) -> dict[str, Any]:
     literal = {code: float_literal(value) for code, value in gains.elements().items()}
 
     def initialiser(row: Row) -> str:

@@ -70,7 +70,7 @@ if TYPE_CHECKING:
     from mimopilot.tuning.experiment import Experiment as Experiment
     from mimopilot.tuning.gains import Gains as Gains
 
-__all__ = sorted(_PUBLIC)  # noqa: PLE0605
+__all__ = sorted(_PUBLIC)
 
 
 def __getattr__(name: str) -> Any:

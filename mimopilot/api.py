@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
     from mimopilot.tuning.design.advise import Advice
     from mimopilot.tuning.logs.columns import Columns
     from mimopilot.tuning.logs.inspection import Inspection
-    from mimopilot.tuning.reference_model import ContinuousModel
     from mimopilot.tuning.spec import TuningSpec
 
 PathLike = str | Path
@@ -199,7 +197,7 @@ def generate(
 
     loaded = _gains(gains)
     check_verdict(loaded, allow=uncertified)
-    files = render(loaded, target, px4_api)
+    files = render(loaded, target, px4_api=px4_api)
     write_tree(files, Path(out), force)
     return [Path(out) / name for name in files]
 

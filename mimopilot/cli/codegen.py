@@ -41,7 +41,7 @@ def generate(
     warning = check_verdict(loaded, allow=uncertified)
     if warning:
         print(f"mimopilot: warning: {gains}: {warning}", file=sys.stderr)
-    files = render(loaded, target, px4_api)
+    files = render(loaded, target, px4_api=px4_api)
     written = write_tree(files, out, force)
     print(f"{out}: {len(files)} files, {len(written)} written, {len(files) - len(written)} unchanged")
 

@@ -12,10 +12,9 @@ Result = TypeVar("Result")
 
 @lru_cache(maxsize=1)
 def _libraries() -> Any:
-    from threadpoolctl import ThreadpoolController
-
     import numpy as np  # noqa: F401
     import scipy.linalg  # noqa: F401
+    from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
 

@@ -96,7 +96,7 @@ def parameters_header(entries: dict[str, dict]) -> str:
 
 def build(gains, api: str, folder: Path) -> Path:
     """Emit, compile with our warnings as errors and PX4's flags, and link with the host program."""
-    files = render(gains, "px4", api)
+    files = render(gains, "px4", px4_api=api)
     write_tree(files, folder / "tree")
     (folder / "generated").mkdir(exist_ok=True)
     (folder / "generated" / "generated_parameters.hpp").write_text(parameters_header(definitions(files)))

@@ -13,8 +13,9 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 from mimopilot.codegen.errors import CodegenError
-from mimopilot.codegen.px4 import APIS, yaml_number
-from mimopilot.codegen.render import TEMPLATES, render
+from mimopilot.codegen.px4 import yaml_number
+from mimopilot.codegen.render import render
+from mimopilot.codegen.targets import TEMPLATES, targets
 from mimopilot.codegen.toolchain import find_compiler
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 
@@ -132,16 +133,16 @@ def test_what_needs_no_px4_includes_none(name):
 
 def test_an_unknown_interface_is_refused(gains):
     with pytest.raises(CodegenError, match="px4-api: got 'v9', expected one of crtp, descriptor"):
-        render(gains, "px4", "v9")
+        render(gains, "px4", px4_api="v9")
 
 
 def templated(api, gains):
     """The files of px4/ that are not plain copies of a template."""
-    files = render(gains, "px4", api)
+    files = render(gains, "px4", px4_api=api)
     return {name: text for name, text in files.items() if (TEMPLATES / f"{name}.jinja").is_file() and "px4/" in name}
 
 
-@pytest.mark.parametrize("api", APIS)
+@pytest.mark.parametrize("api", targets()["px4"].options["px4_api"])
 def test_the_rendered_files_are_the_golden_ones(gains, api, request):
     files = templated(api, gains)
     folder = GOLDEN / f"px4-{api}"
@@ -161,7 +162,7 @@ def test_the_rendered_files_are_the_golden_ones(gains, api, request):
 
 
 def test_the_interfaces_differ_in_the_module_alone(gains):
-    crtp, descriptor = (render(gains, "px4", api) for api in APIS)
+    crtp, descriptor = (render(gains, "px4", px4_api=api) for api in ("crtp", "descriptor"))
     different = {name for name in crtp if crtp[name] != descriptor[name]}
     assert different == {f"{MODULE}/mc_mimo_pid.cpp", f"{MODULE}/mc_mimo_pid.hpp", "px4/README.md", "manifest.json"}
     assert json.loads(crtp["manifest.json"])["gains_sha256"] == json.loads(descriptor["manifest.json"])["gains_sha256"]
