@@ -7,7 +7,7 @@ same bits as the command of its name.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -134,6 +134,7 @@ def advise(
     outer: Model | None = None,
     spec: PathLike | TuningSpec | None = None,
     columns: PathLike | None = None,
+    watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
 ) -> Advice:
     """Scan models of the rate loop and derivative filters; recommend one.
 
@@ -144,6 +145,8 @@ def advise(
         Attitude loop: (omega rad/s, damping, delay samples).
     spec, columns
         As in `tune`.
+    watch : callable
+        Wraps the iteration over the grid, for a progress bar.
 
     Returns
     -------
@@ -152,7 +155,7 @@ def advise(
     """
     from mimopilot.tuning.design.advise import advise as scan
 
-    return scan(_experiment(log, columns), _spec(spec, {"outer": outer}))
+    return scan(_experiment(log, columns), _spec(spec, {"outer": outer}), watch=watch)
 
 
 def load_gains(path: PathLike) -> Gains:

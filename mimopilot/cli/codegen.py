@@ -1,22 +1,23 @@
-"""The commands of this room."""
+"""Commands of code generation."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from mimopilot.cli.options import GainsArgument, JsonOption, UncertifiedOption, warn
+
 
 def register(app: typer.Typer) -> None:
-    """Add this room's commands to the front door."""
+    """Add these commands to the command line."""
     app.command(epilog="Example: mimopilot generate my.gains.toml --target native --out firmware")(generate)
     app.command(epilog="Example: mimopilot pil my.gains.toml --rows 10000 --json")(pil)
 
 
 def generate(
-    gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
+    gains: GainsArgument,
     out: Annotated[
         Path, typer.Option(help="Folder to write to; changed files are replaced, nothing is deleted, no link followed.")
     ],
@@ -29,8 +30,8 @@ def generate(
     px4_api: Annotated[
         str, typer.Option(help="PX4's module interface: crtp, up to v1.17, or descriptor, later.")
     ] = "crtp",
-    force: Annotated[bool, typer.Option("--force", help="Write over what mimopilot did not generate, too.")] = False,
-    uncertified: Annotated[bool, typer.Option("--uncertified", help="Emit gains whose stability is in doubt.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite files that mimopilot did not generate.")] = False,
+    uncertified: UncertifiedOption = False,
 ) -> None:
     """Emit the C++ controller with its gains, parameter table, build files and tests."""
     from mimopilot.codegen.render import render, write_tree
@@ -38,21 +39,20 @@ def generate(
     from mimopilot.tuning.gains_file import load_gains
 
     loaded = load_gains(gains)
-    warning = check_verdict(loaded, allow=uncertified)
-    if warning:
-        print(f"mimopilot: warning: {gains}: {warning}", file=sys.stderr)
+    doubt = check_verdict(loaded, allow=uncertified)
+    warn(gains, [doubt] if doubt else [])
     files = render(loaded, target, px4_api=px4_api)
     written = write_tree(files, out, force)
     print(f"{out}: {len(files)} files, {len(written)} written, {len(files) - len(written)} unchanged")
 
 
 def pil(
-    gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
+    gains: GainsArgument,
     rows: Annotated[int, typer.Option(min=1, max=1_000_000, help="Control periods to run.")] = 10_000,
     emulator: Annotated[str, typer.Option(help="unicorn (the processor) or qemu (a board, from reset).")] = "unicorn",
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Run the controller on an emulated Cortex-M4F beside the host, compare every bit, and print what a step costs."""
+    """Run the controller on an emulated Cortex-M4F and on the host, compare every bit, and print what a step costs."""
     from mimopilot.codegen.budget import processor_in_the_loop
     from mimopilot.codegen.errors import CodegenError
     from mimopilot.common.console import print_json, print_table

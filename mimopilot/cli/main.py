@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
+from typing import Annotated
 
-# Before numpy is loaded: worker processes whose BLAS threads wait for those of the others take six times as long, and
-# results to the last bit must not depend on the number of cores.
+# Before numpy is loaded: worker processes whose BLAS threads wait for those of the others take six times as long.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
 
 import typer
@@ -16,14 +16,30 @@ from mimopilot.common.errors import Error
 
 app = typer.Typer(
     name="mimopilot",
-    help="From one flight to tuned, tested C++ for a multirotor's roll and pitch.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
 for group in (studies, bench, campaign, tuning, codegen, vehicle):
     group.register(app)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"mimopilot {version('mimopilot')}")
+        raise typer.Exit
+
+
+@app.callback(help="From one flight to tuned, tested C++ for a multirotor's roll and pitch.")
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
+    ] = False,
+) -> None:
+    """Options of the command itself."""
 
 
 def main() -> None:

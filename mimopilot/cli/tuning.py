@@ -1,17 +1,37 @@
-"""The commands of this room."""
+"""Commands of tuning: what a log holds, gains from it, and whether they are stable."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mimopilot.cli.options import (
+    ColumnsOption,
+    JsonOption,
+    LogArgument,
+    OuterOption,
+    check_not_given,
+    warn,
+)
+from mimopilot.common.console import print_json, print_table, progress_console
+
+if TYPE_CHECKING:
+    from mimopilot.tuning.design.advise import Candidate
+    from mimopilot.tuning.experiment import Experiment
+    from mimopilot.tuning.gains import Gains
+    from mimopilot.tuning.logs.columns import Columns
+    from mimopilot.tuning.spec import TuningSpec
+
+#: Candidates that `advise` prints; ``--json`` has all.
+SHOWN = 24
+
 
 def register(app: typer.Typer) -> None:
-    """Add this room's commands to the front door."""
+    """Add these commands to the command line."""
     app.command(epilog="Example: mimopilot inspect flight.ulg")(inspect)
     app.command(epilog="Example: mimopilot identify flight.ulg --order 4 --out plant.toml")(identify)
     app.command(
@@ -20,16 +40,6 @@ def register(app: typer.Typer) -> None:
     )(tune)
     app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
     app.command(epilog="Example: mimopilot advise flight.ulg --outer 10,0.7,0 --out my.gains.toml")(advise)
-
-
-LOG = Annotated[Path, typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, CSV or MATLAB file.")]
-COLUMNS = Annotated[
-    Path | None, typer.Option(help="Names, units and signs of the columns of a CSV or MATLAB file (TOML).")
-]
-
-
-#: Candidates that `advise` prints; ``--json`` has all.
-SHOWN = 24
 
 
 def tune(
@@ -41,7 +51,7 @@ def tune(
     inner: Annotated[
         str | None, typer.Option(help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 30,0.7,0 by default.")
     ] = None,
-    outer: Annotated[str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY; 10,0.7,0.")] = None,
+    outer: OuterOption = None,
     doublet: Annotated[
         str | None,
         typer.Option(help="Refine all gains for a doublet: DEGREES,SECONDS (whole length), such as 22.5,0.42."),
@@ -65,15 +75,14 @@ def tune(
     spec: Annotated[
         Path | None, typer.Option(help="Specification (TOML): the above, and what the log does not say.")
     ] = None,
-    columns: COLUMNS = None,
+    columns: ColumnsOption = None,
     campaign: Annotated[
         bool, typer.Option("--campaign", help="Tune each of many logs, and show how gains and certificates spread.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Find the gains of the attitude cascade from one flight."""
-    from mimopilot.common.console import print_json
-    from mimopilot.tuning.design.cascade import tune as tune_cascade
+    import mimopilot as mp
     from mimopilot.tuning.errors import TuningError
     from mimopilot.tuning.logs.columns import load_columns
     from mimopilot.tuning.parameters import MATRICES
@@ -90,18 +99,17 @@ def tune(
         window=window,
     )
     if campaign:
-        if repeat is not None:
-            raise TuningError("--repeat: belongs to one log, --campaign tunes many; leave it out")
+        check_not_given("belongs to one log, --campaign tunes many; leave it out", repeat=repeat)
         tune_campaign(logs, task, out, load_columns(columns) if columns else None, as_json)
         return
     if len(logs) > 1:
         raise TuningError(f"{len(logs)} logs: gains are tuned from one; --campaign tunes each by itself")
     log = logs[0]
     experiment = read_warned(log, columns)
-    gains = tune_cascade(experiment, task, repeat=read_warned(repeat, columns) if repeat else None)
+    gains = mp.tune(experiment, spec=task, repeat=read_warned(repeat, columns) if repeat else None)
     gains.save(out)
     deviations = gains.provenance.standard_deviation
-    print_warnings(log, (warning for warning in gains.provenance.warnings if warning not in experiment.warnings))
+    warn(log, (warning for warning in gains.provenance.warnings if warning not in experiment.warnings))
     if as_json:
         matrices: dict[str, Any] = {name: getattr(gains, name).tolist() for name in MATRICES}
         found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}
@@ -113,9 +121,8 @@ def tune(
     print(f"written to {out}")
 
 
-def tune_campaign(logs: list[Path], task: Any, out: Path, columns: Any, as_json: bool) -> None:
+def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Columns | None, as_json: bool) -> None:
     """`tune --campaign`: every log by itself, and the distributions."""
-    from mimopilot.common.console import print_json, print_table
     from mimopilot.common.parallel import cores
     from mimopilot.tuning.design.many_logs import find_logs, tune_all
 
@@ -139,23 +146,20 @@ def tune_campaign(logs: list[Path], task: Any, out: Path, columns: Any, as_json:
 
 
 def certify(
-    log: LOG,
+    log: LogArgument,
     gains: Annotated[Path, typer.Option(help="Gains file to examine.")],
     out: Annotated[Path | None, typer.Option(help="Write the gains with their certificate to this file.")] = None,
     spec: Annotated[
         Path | None, typer.Option(help="Specification (TOML) whose [certificate] says what margins are needed.")
     ] = None,
-    columns: COLUMNS = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    columns: ColumnsOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Say whether a loop will be stable, from a flight of the vehicle under any gains. Exit code 1: not shown."""
-    from mimopilot.common.console import print_json
+    import mimopilot as mp
     from mimopilot.tuning.certificate import ACCEPTED
-    from mimopilot.tuning.design.cascade import certify_from_log
-    from mimopilot.tuning.gains_file import load_gains
-    from mimopilot.tuning.spec import load_spec
 
-    examined = certify_from_log(read_warned(log, columns), load_gains(gains), load_spec(spec))
+    examined = mp.certify(read_warned(log, columns), gains, spec=spec)
     if out is not None:
         examined.save(out)
     if as_json:
@@ -167,26 +171,23 @@ def certify(
 
 
 def advise(
-    log: LOG,
-    outer: Annotated[str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY; 10,0.7,0.")] = None,
+    log: LogArgument,
+    outer: OuterOption = None,
     spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
-    columns: COLUMNS = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    columns: ColumnsOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Scan bandwidth, damping and delay of the rate loop's model, and derivative filters; recommend one and say why."""
-    import math
-
     from rich.progress import track
 
-    from mimopilot.common.console import print_json, print_table, progress_console
-    from mimopilot.tuning.design.advise import advise as scan
+    import mimopilot as mp
     from mimopilot.tuning.spec import load_spec, parse_model
 
     task = load_spec(spec, outer=parse_model(outer) if outer else None)
-    found = scan(
+    found = mp.advise(
         read_warned(log, columns),
-        task,
+        spec=task,
         watch=lambda grid: track(list(grid), "tuning", console=progress_console(), transient=True),
     )
     best = found.recommended
@@ -194,7 +195,7 @@ def advise(
     if out is not None:
         best.gains.save(out)
 
-    def shown(candidate: Any) -> dict[str, Any]:
+    def shown(candidate: Candidate) -> dict[str, Any]:
         return {name: value for name, value in vars(candidate).items() if name != "gains"}
 
     if as_json:
@@ -225,12 +226,12 @@ def advise(
     )
 
 
-def print_certificate(gains: Any) -> None:
+def print_certificate(gains: Gains) -> None:
     """Verdict, reason and margins of a certified set."""
-    from mimopilot.common.console import print_table
     from mimopilot.tuning.analysis.margins import AXES
 
     certificate = gains.certificate
+    assert certificate is not None
     figures = certificate.figures
     print(f"{certificate.verdict}: {certificate.reason}")
     if not figures:
@@ -257,18 +258,16 @@ def print_certificate(gains: Any) -> None:
 
 
 def inspect(
-    log: LOG,
-    columns: COLUMNS = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    log: LogArgument,
+    columns: ColumnsOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Show what is in a flight log, and whether gains can be tuned from it."""
-    from mimopilot.common.console import print_json
-    from mimopilot.tuning.logs.columns import load_columns
-    from mimopilot.tuning.logs.inspection import inspect_log
+    import mimopilot as mp
     from mimopilot.tuning.logs.inspection_report import as_mapping, print_inspection
 
-    found = inspect_log(log, load_columns(columns) if columns else None)
-    print_warnings(log, found.warnings)
+    found = mp.inspect(log, columns)
+    warn(log, found.warnings)
     if as_json:
         print_json(as_mapping(found))
     else:
@@ -276,16 +275,15 @@ def inspect(
 
 
 def identify(
-    log: LOG,
+    log: LogArgument,
     order: Annotated[int | None, typer.Option(help="States; by default those that fit the measured response.")] = None,
     past: Annotated[int, typer.Option(help="Past window, samples.")] = 20,
     future: Annotated[int | None, typer.Option(help="Future window, samples; the past window by default.")] = None,
     out: Annotated[Path | None, typer.Option(help="Where the state space is written: FILE.toml.")] = None,
-    columns: COLUMNS = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    columns: ColumnsOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Identify the plant from control moment to body rates (PBSID, closed loop)."""
-    from mimopilot.common.console import print_json, print_table
     from mimopilot.common.files import write_atomically
     from mimopilot.tuning.plant.frequency_response import measured_plant
     from mimopilot.tuning.plant.pbsid import identify_rates, model_toml
@@ -330,25 +328,17 @@ def identify(
         print(f"written to {out}")
 
 
-def read_warned(log: Path, columns: Path | None) -> Any:
-    """The experiment in a log; what is wrong with the log is told on standard error."""
-    from mimopilot.tuning.logs.columns import load_columns
-    from mimopilot.tuning.logs.reader import read_log
+def read_warned(log: Path, columns: Path | None) -> Experiment:
+    """The experiment in a log; warnings about it go to standard error."""
+    import mimopilot as mp
 
-    experiment = read_log(log, load_columns(columns) if columns else None)
-    print_warnings(log, experiment.warnings)
+    experiment = mp.read_log(log, columns)
+    warn(log, experiment.warnings)
     return experiment
 
 
-def print_warnings(log: Path, warnings: Iterable[str]) -> None:
-    """Warnings about a log, a line each, on standard error."""
-    for warning in warnings:
-        print(f"mimopilot: warning: {log}: {warning}", file=sys.stderr)
-
-
-def print_gains(title: str, gains: Any, deviations: Mapping[str, Any]) -> None:
+def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None:
     """The matrices of a set as a table, with standard deviations where they are known."""
-    from mimopilot.common.console import print_table
     from mimopilot.tuning.parameters import MATRICES
 
     rows = []
