@@ -15,6 +15,7 @@ from mimopilot.common.blas import reproducible
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains, Triple
+from mimopilot.tuning.reference_model import ContinuousModel
 
 if TYPE_CHECKING:
     from mimopilot.sitl.flight.metrics import Performance
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 PathLike = str | Path
 Log = PathLike | Experiment
 GainSet = PathLike | Gains
-Model = tuple[float, float] | tuple[float, float, int] | "ContinuousModel"
+Model = tuple[float, float] | tuple[float, float, int] | ContinuousModel
 
 
 @reproducible
