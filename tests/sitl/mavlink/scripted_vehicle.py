@@ -18,16 +18,16 @@ import tty
 
 from mimopilot.sitl.mavlink.ground_station.events import (
     HEARTBEAT,
-    THE_PEER,
-    Ack,
-    Heard,
+    SOLE_PEER,
+    CommandAck,
     Heartbeat,
-    Read,
-    Refusal,
-    RequestOnce,
-    Store,
-    Value,
-    Write,
+    ParameterRefusal,
+    ParameterValue,
+    ReadParameter,
+    Received,
+    RequestMessage,
+    SetParameter,
+    StoreParameters,
 )
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -60,21 +60,24 @@ class ScriptedVehicle:
 
     def value(self, name):
         kind = 6 if self.fault == "integer" and name == self.victim else 9
-        return Value(SYSTEM, COMPONENT, name, self.values[name], kind)
+        return ParameterValue(SYSTEM, COMPONENT, name, self.values[name], kind)
 
     def answer(self, order):
         if self.dead:
             return []
-        if isinstance(order, Store):
+        if isinstance(order, StoreParameters):
             self.stored += 1
-            return [] if self.storage is None else [Ack(SYSTEM, COMPONENT, 245, self.storage)]
-        if order == RequestOnce(SYSTEM, COMPONENT, HEARTBEAT):
+            return [] if self.storage is None else [CommandAck(SYSTEM, COMPONENT, 245, self.storage)]
+        if order == RequestMessage(SYSTEM, COMPONENT, HEARTBEAT):
             return self.heartbeat()
-        if not isinstance(order, Read | Write) or (order.system, order.component) != (SYSTEM, COMPONENT):
+        if not isinstance(order, ReadParameter | SetParameter) or (order.system, order.component) != (
+            SYSTEM,
+            COMPONENT,
+        ):
             return []
         if order.name not in self.values:
             return []  # as PX4 up to 1.17
-        if isinstance(order, Read):
+        if isinstance(order, ReadParameter):
             self.reads += 1
             return [self.value(order.name)]
         return self.write(order.name, float32(order.value))
@@ -93,12 +96,12 @@ class ScriptedVehicle:
     def store(self, name, value):
         hit = name == self.victim
         if self.fault == "echoes" or (self.fault == "echoes one" and hit):
-            return [Value(SYSTEM, COMPONENT, name, value)]
+            return [ParameterValue(SYSTEM, COMPONENT, name, value)]
         if self.fault == "ignores" and hit:
             return [self.value(name)]
         reasons = {"out of range": 2, "denies": 3, "read only": 5}
         if self.fault in reasons and hit:
-            return [Refusal(SYSTEM, COMPONENT, name, reasons[self.fault]), self.value(name)]
+            return [ParameterRefusal(SYSTEM, COMPONENT, name, reasons[self.fault]), self.value(name)]
         if self.fault == "deaf to one" and hit:
             return []
         if self.fault == "clamps" and hit:
@@ -122,7 +125,7 @@ class SimulatedLink:
     """A link with loss, duplicates, reordering and latency each way, in simulated time; see words.Link."""
 
     def __init__(self, vehicle, seed=0, loss=0.0, duplicate=0.0, reorder=0.0, latency=0.05, noise=()):
-        self.vehicles, self.closed, self.time = {THE_PEER: vehicle}, False, 0.0
+        self.vehicles, self.closed, self.time = {SOLE_PEER: vehicle}, False, 0.0
         self.random = random.Random(seed)
         self.loss, self.duplicate, self.reorder, self.latency = loss, duplicate, reorder, latency
         self.order = itertools.count()
@@ -130,7 +133,7 @@ class SimulatedLink:
         self.up = True
         self.noise = noise
         self.log = []
-        self.schedule(self.random.random(), "beat", THE_PEER)
+        self.schedule(self.random.random(), "beat", SOLE_PEER)
         if hasattr(vehicle, "tell"):
             self.schedule(0.0, "tell", None)
 
@@ -159,11 +162,11 @@ class SimulatedLink:
             for target in self.vehicles if to is None else [to]:
                 self.carry("to vehicle", (target, message))
 
-    def say(self, messages, origin=THE_PEER):
+    def say(self, messages, origin=SOLE_PEER):
         for message in messages:
-            self.carry("to ground", Heard(origin, message))
+            self.carry("to ground", Received(origin, message))
             for other in self.noise:
-                self.carry("to ground", Heard(origin, other(message)))
+                self.carry("to ground", Received(origin, other(message)))
 
     def receive(self, until):
         while self.queue and self.queue[0][0] <= until:
@@ -173,7 +176,7 @@ class SimulatedLink:
                 self.say(self.vehicles[message].heartbeat(), message)
                 self.schedule(at + 1.0, "beat", message)
             elif kind == "tell":
-                self.say(self.vehicles[THE_PEER].tell(at))
+                self.say(self.vehicles[SOLE_PEER].tell(at))
                 self.schedule(at + TELL_S, "tell", None)
             elif self.up and kind == "to vehicle":
                 target, order = message
@@ -189,10 +192,10 @@ def encode(message):
     if isinstance(message, Heartbeat):
         mode = 128 if message.armed else 0
         return mavlink.MAVLink_heartbeat_message(message.type, message.autopilot, mode, 0, 4, 3)
-    if isinstance(message, Value):
+    if isinstance(message, ParameterValue):
         # Index 65535: unknown.
         return mavlink.MAVLink_param_value_message(message.name.encode(), message.value, message.kind, 100, 65535)
-    if isinstance(message, Refusal):
+    if isinstance(message, ParameterRefusal):
         return mavlink.MAVLink_param_error_message(255, 190, message.name.encode(), -1, message.reason)
     return mavlink.MAVLink_command_ack_message(message.command, message.result)
 
@@ -202,15 +205,15 @@ def decode(message):
     kind = message.get_type()
     if kind == "PARAM_REQUEST_READ":
         assert message.param_index == -1
-        return Read(message.target_system, message.target_component, message.param_id)
+        return ReadParameter(message.target_system, message.target_component, message.param_id)
     if kind == "PARAM_SET":
         assert message.param_type == 9
-        return Write(message.target_system, message.target_component, message.param_id, message.param_value)
+        return SetParameter(message.target_system, message.target_component, message.param_id, message.param_value)
     if kind == "COMMAND_LONG":
         if message.command == 512:
-            return RequestOnce(message.target_system, message.target_component, message.param1)
+            return RequestMessage(message.target_system, message.target_component, message.param1)
         assert (message.command, message.param1) == (245, 1.0)
-        return Store(message.target_system, message.target_component)
+        return StoreParameters(message.target_system, message.target_component)
     return None
 
 

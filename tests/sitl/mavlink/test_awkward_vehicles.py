@@ -3,19 +3,19 @@
 import pytest
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
-    Attitude,
-    Heard,
+    AttitudeReport,
     Heartbeat,
-    Read,
-    RequestOnce,
-    Store,
-    Value,
-    Write,
-    drive,
+    ParameterValue,
+    ReadParameter,
+    Received,
+    RequestMessage,
+    SetParameter,
+    StoreParameters,
+    run_exchange,
     single,
 )
-from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Conversation
-from mimopilot.sitl.mavlink.ground_station.upload import apply, read
+from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
+from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
 
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, SimulatedLink
 
@@ -55,11 +55,11 @@ def clamps(vehicle):
 def is_written(vehicle):
     """By another station."""
     vehicle.values[VICTIM] = single(0.5)
-    return [Value(1, 1, VICTIM, vehicle.values[VICTIM])]
+    return [ParameterValue(1, 1, VICTIM, vehicle.values[VICTIM])]
 
 
 def is_written_and_written_back(vehicle):
-    return [Value(1, 1, VICTIM, single(0.5)), Value(1, 1, VICTIM, NEW[VICTIM])]
+    return [ParameterValue(1, 1, VICTIM, single(0.5)), ParameterValue(1, 1, VICTIM, NEW[VICTIM])]
 
 
 def arms(vehicle):
@@ -72,10 +72,10 @@ def arms_and_disarms(vehicle):
 
 
 def upload(link, new=NEW, **keywords):
-    talk = Conversation(link.now(), **keywords)
-    drive(talk.meet(), link)
-    held = drive(read(talk, list(OLD)), link)
-    return drive(apply(talk, new, held), link)
+    client = ParameterClient(link.now(), **keywords)
+    run_exchange(client.await_heartbeat(), link)
+    held = run_exchange(read_values(client, list(OLD)), link)
+    return run_exchange(write_and_verify(client, new, held), link)
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5, 1.5, 2.3])
@@ -84,8 +84,8 @@ def upload(link, new=NEW, **keywords):
     [
         (restarts, f"{NAMES[0]}: reads back as 0.1, expected 0.3"),
         (clamps, f"{VICTIM}: reads back as 0.5, expected 2.4"),
-        (is_written, f"{VICTIM}: 0.5, after the vehicle said 2.4"),
-        (is_written_and_written_back, f"{VICTIM}: 0.5, after the vehicle said 2.4"),
+        (is_written, f"{VICTIM}: 0.5, after the vehicle reported 2.4"),
+        (is_written_and_written_back, f"{VICTIM}: 0.5, after the vehicle reported 2.4"),
         (arms, "the vehicle was armed before the last reading"),
         (arms_and_disarms, "the vehicle was armed before the last reading"),
     ],
@@ -100,12 +100,12 @@ def test_what_happens_after_storing_is_no_success_and_is_undone(happens, words, 
 
 def test_a_fixed_value_that_changes_is_noticed_and_is_not_written():
     vehicle = LateVehicle(lambda v: v.values.update(MIMO_TS=0.002), 1.0)
-    link = Witness(vehicle)
+    link = RecordingLink(vehicle)
     outcome = upload(link)
     assert (outcome.state, outcome.held["MIMO_TS"]) == ("mixed", (0.002,))
     assert outcome.reason == "MIMO_TS: reads back as 0.002, expected 0.004"
-    assert link.now() - link.sent(Write)[-1] > 2.3
-    assert all(m.name not in FIXED for _, m in link.log if isinstance(m, Write))
+    assert link.now() - link.sent(SetParameter)[-1] > 2.3
+    assert all(m.name not in FIXED for _, m in link.log if isinstance(m, SetParameter))
     assert {name: vehicle.values[name] for name in NEW} == {name: OLD[name] for name in NEW}
 
 
@@ -115,7 +115,7 @@ def test_a_vehicle_that_was_forced_may_be_armed():
     assert (outcome.state, outcome.armed) == ("verified", True)
 
 
-class Witness(SimulatedLink):
+class RecordingLink(SimulatedLink):
     """Remembers when HEARTBEATs were heard."""
 
     def __init__(self, vehicle, **keywords):
@@ -133,23 +133,23 @@ class Witness(SimulatedLink):
 
 @pytest.mark.parametrize("answers", [0, None])
 def test_the_last_reading_outlasts_what_a_vehicle_saves_by_itself(answers):
-    link = Witness(ScriptedVehicle(OLD, storage=answers))
+    link = RecordingLink(ScriptedVehicle(OLD, storage=answers))
     assert upload(link).state == "verified"
-    last = link.sent(Read)[-len(OLD) :]
-    changed = max(link.sent(Write) + link.sent(Store))
+    last = link.sent(ReadParameter)[-len(OLD) :]
+    changed = max(link.sent(SetParameter) + link.sent(StoreParameters))
     assert last[0] - changed >= 2.3
     assert any(changed + 2.3 <= beat <= last[0] for beat in link.beats)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_no_heartbeat_is_older_than_the_help_says_when_something_is_written(seed):
-    link = Witness(ScriptedVehicle(OLD), seed=seed, loss=0.4, latency=0.1)
+    link = RecordingLink(ScriptedVehicle(OLD), seed=seed, loss=0.4, latency=0.1)
     assert upload(link).state == "verified"
-    for at in link.sent(Write):
+    for at in link.sent(SetParameter):
         assert at - max(beat for beat in link.beats if beat <= at) < 1.5
 
 
-class Terse(ScriptedVehicle):
+class RareHeartbeatVehicle(ScriptedVehicle):
     """Sends its HEARTBEAT once, then only when asked, or never again; ATTITUDE all the time."""
 
     def __init__(self, answers):
@@ -161,24 +161,24 @@ class Terse(ScriptedVehicle):
         return super().heartbeat() if self.beats == 1 else []
 
     def answer(self, order):
-        if isinstance(order, RequestOnce):
+        if isinstance(order, RequestMessage):
             return super().heartbeat() if self.answers else []
         return super().answer(order)
 
     def tell(self, now):
-        return [Attitude(1, 1, 0.0, 0.0)]
+        return [AttitudeReport(1, 1, 0.0, 0.0)]
 
 
 def test_a_heartbeat_that_is_late_is_asked_for():
-    link = Witness(Terse(answers=True))
+    link = RecordingLink(RareHeartbeatVehicle(answers=True))
     assert upload(link).state == "verified"
-    for at in link.sent(Write):
+    for at in link.sent(SetParameter):
         assert at - max(beat for beat in link.beats if beat <= at) < 1.5
 
 
 def test_a_vehicle_whose_heartbeat_ends_is_not_written():
-    vehicle = Terse(answers=False)
-    outcome = upload(Witness(vehicle))
+    vehicle = RareHeartbeatVehicle(answers=False)
+    outcome = upload(RecordingLink(vehicle))
     assert (outcome.state, vehicle.writes) == ("untouched", 0)
     assert "no HEARTBEAT in 13.5 s" in outcome.reason
 
@@ -208,10 +208,10 @@ def test_a_second_vehicle_that_appears_in_the_middle_is_never_written(at):
 def test_what_another_address_says_does_not_pass_for_what_the_vehicle_holds():
     vehicle = ScriptedVehicle(OLD, "deaf to one", victim=VICTIM)
     link = SimulatedLink(vehicle)
-    talk = Conversation(link.now())
-    drive(talk.meet(), link)
+    client = ParameterClient(link.now())
+    run_exchange(client.await_heartbeat(), link)
     for i in range(200):
-        link.schedule(link.time + 0.1 * i, "to ground", Heard(THERE, Value(1, 1, VICTIM, NEW[VICTIM])))
-    answers = drive(talk.tell({VICTIM: NEW[VICTIM]}, "writing", keep_going=True), link)
+        link.schedule(link.time + 0.1 * i, "to ground", Received(THERE, ParameterValue(1, 1, VICTIM, NEW[VICTIM])))
+    answers = run_exchange(client.write({VICTIM: NEW[VICTIM]}, "writing", keep_going=True), link)
     assert answers[VICTIM].value is None
     assert "no answer" in answers[VICTIM].problem

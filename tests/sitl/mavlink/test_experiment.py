@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.connection import express, understand
-from mimopilot.sitl.mavlink.ground_station.events import Value, Write, drive
-from mimopilot.sitl.mavlink.ground_station.experiment import INTEGERS, excite, observe
-from mimopilot.sitl.mavlink.ground_station.experiment_console import Choice, settings
-from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Conversation
+from mimopilot.sitl.mavlink.ground_station.connection import from_mavlink, to_mavlink
+from mimopilot.sitl.mavlink.ground_station.events import ParameterValue, SetParameter, run_exchange
+from mimopilot.sitl.mavlink.ground_station.experiment import INTEGERS, excite, start_monitor
+from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions, settings
+from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.wire.link import Codec
 from mimopilot.tuning.logs.reader import read_log
 from pymavlink.dialects.v20 import common as mavlink
@@ -22,19 +22,19 @@ from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
 from tests.sitl.mavlink.running import PATIENCE_S, Pilot, running_sitl, start
 from tests.sitl.mavlink.scripted_vehicle import SimulatedLink
 
-CHOICE = Choice("both", 8.0, 0.2, 50.0, 3, "hold", 25.0)
+CHOICE = ExcitationOptions("both", 8.0, 0.2, 50.0, 3, "hold", 25.0)
 WANTED = settings(CHOICE, 0.004)
 PLANNED = 2 * 8.0 + 1.0
 
 
 def experiment(vehicle, interrupt_at=None, **link):
     carrier = SimulatedLink(vehicle, **link)
-    talk = Conversation(carrier.now(), integers=INTEGERS, force_armed=True)
+    client = ParameterClient(carrier.now(), integers=INTEGERS, force_armed=True)
     if interrupt_at is not None:
-        vehicle.then[interrupt_at] = lambda _: setattr(talk, "interrupted", True)
-    drive(talk.meet(), carrier)
-    sights = drive(observe(talk, 4), carrier)
-    return drive(excite(talk, sights, WANTED), carrier), carrier
+        vehicle.then[interrupt_at] = lambda _: setattr(client, "interrupted", True)
+    run_exchange(client.await_heartbeat(), carrier)
+    monitor = run_exchange(start_monitor(client, 4), carrier)
+    return run_exchange(excite(client, monitor, WANTED), carrier), carrier
 
 
 def end_of_moments(vehicle):
@@ -75,8 +75,8 @@ def change(**attributes):
         (change(landed=1), "on the ground"),
         (change(tilt=0.44), "tilts by 25 degrees|stopped: tilt"),
         (change(silent={"HEARTBEAT"}), "no HEARTBEAT for 5 s"),
-        (change(silent={30}), "does not tell ATTITUDE any more"),
-        (change(silent={250}), "does not tell DEBUG_VECT any more"),
+        (change(silent={30}), "no longer sends ATTITUDE"),
+        (change(silent={250}), "no longer sends DEBUG_VECT"),
     ],
 )
 def test_whatever_happens_on_the_way_ends_it_soon_and_all_is_put_back(happens, words, careless):
@@ -97,7 +97,7 @@ def test_ctrl_c_stops_the_injection_before_anything_else():
     result, link = experiment(vehicle, interrupt_at=5.0)
     assert (result.complete, result.reason, result.stopped, result.restored) == (False, "interrupted", True, True)
     assert end_of_moments(vehicle) < 5.5
-    first = next(message for at, message in link.log if at >= 5.0 and isinstance(message, Write))
+    first = next(message for at, message in link.log if at >= 5.0 and isinstance(message, SetParameter))
     assert (first.name, first.value) == (AXIS, 0.0)
     assert vehicle.settings == before
 
@@ -106,9 +106,9 @@ def test_a_vehicle_that_cannot_be_reached_any_more_is_told_and_stops_by_itself()
     vehicle = FlyingVehicle()
     link = SimulatedLink(vehicle)
     vehicle.then[5.0] = lambda _: setattr(link, "up", False)
-    talk = Conversation(link.now(), integers=INTEGERS, force_armed=True)
-    drive(talk.meet(), link)
-    result = drive(excite(talk, drive(observe(talk, 4), link), WANTED), link)
+    client = ParameterClient(link.now(), integers=INTEGERS, force_armed=True)
+    run_exchange(client.await_heartbeat(), link)
+    result = run_exchange(excite(client, run_exchange(start_monitor(client, 4), link), WANTED), link)
     assert (result.complete, result.stopped, result.restored) == (False, False, False)
     assert not vehicle.exciting
 
@@ -121,7 +121,7 @@ def test_a_vehicle_that_cannot_be_reached_any_more_is_told_and_stops_by_itself()
         ({"mode": 3 << 16}, "another mode"),
         ({"tilt": 0.4}, "tilts by 23 degrees"),
         ({"silent": {250}}, "our controller does not fly it"),
-        ({"silent": {30, 245}}, "does not tell ATTITUDE, EXTENDED_SYS_STATE"),
+        ({"silent": {30, 245}}, "does not send ATTITUDE, EXTENDED_SYS_STATE"),
     ],
 )
 def test_a_vehicle_that_does_not_hover_under_our_controller_is_left_alone(vehicle, words):
@@ -163,17 +163,17 @@ def test_a_vehicle_that_refuses_a_setting_is_not_started():
 )
 def test_settings_out_of_range_are_refused_before_anything_is_sent(change, words):
     with pytest.raises(SitlError, match=words):
-        settings(Choice(**{**vars(CHOICE), **change}), 0.004)
+        settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
 
 
 @pytest.mark.parametrize("number", [0, 1, 60, 1000000, -1, -(2**31), 2**31 - 1])
 def test_whole_numbers_keep_their_bits_on_the_wire(number):
     codec = Codec()
-    (sent,) = codec.parse(codec.pack(express(Write(1, 1, "MIMO_EX_HMIN", float(number), 6))))
+    (sent,) = codec.parse(codec.pack(to_mavlink(SetParameter(1, 1, "MIMO_EX_HMIN", float(number), 6))))
     assert struct.pack("<f", sent.param_value) == struct.pack("<i", number)
     echo = mavlink.MAVLink_param_value_message(b"MIMO_EX_HMIN", sent.param_value, 6, 1, 0)
     (heard,) = codec.parse(codec.pack(echo))
-    assert understand(heard) == Value(1, 1, "MIMO_EX_HMIN", number, 6)
+    assert from_mavlink(heard) == ParameterValue(1, 1, "MIMO_EX_HMIN", number, 6)
 
 
 # The commands, on `mimopilot sitl`.

@@ -8,19 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
-    THE_PEER,
-    Ack,
-    Heard,
+    SOLE_PEER,
+    CommandAck,
     Heartbeat,
-    Refusal,
-    Store,
-    Value,
-    Write,
-    drive,
+    ParameterRefusal,
+    ParameterValue,
+    Received,
+    SetParameter,
+    StoreParameters,
+    run_exchange,
     single,
 )
-from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, Conversation
-from mimopilot.sitl.mavlink.ground_station.upload import apply, read
+from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, ParameterClient
+from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
 from mimopilot.sitl.mavlink.ground_station.vehicle_contact import LISTEN_S
 
 from tests.sitl.mavlink.scripted_vehicle import FAILING, ScriptedVehicle, SimulatedLink
@@ -33,10 +33,10 @@ RADIO = {"loss": 0.3, "duplicate": 0.1, "reorder": 0.1}
 
 def upload(link, new=NEW, **keywords):
     """Read, then apply; the outcome. A vehicle that cannot be read ends it before anything is written."""
-    talk = Conversation(link.now(), **keywords)
-    drive(talk.meet(), link)
-    held = drive(read(talk, list(new)), link)
-    return drive(apply(talk, new, held), link)
+    client = ParameterClient(link.now(), **keywords)
+    run_exchange(client.await_heartbeat(), link)
+    held = run_exchange(read_values(client, list(new)), link)
+    return run_exchange(write_and_verify(client, new, held), link)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -54,7 +54,7 @@ def test_the_radio_of_these_tests_is_as_bad_as_it_says():
     link = SimulatedLink(vehicle, 0, **RADIO)
     arrived = []
     for i in range(20000):
-        link.send([Write(1, 1, NAMES[0], float(i))])
+        link.send([SetParameter(1, 1, NAMES[0], float(i))])
         link.time += 0.001
     vehicle.answer = lambda order: arrived.append(order.value) or []
     link.receive(1000.0)
@@ -94,7 +94,7 @@ def test_each_fault_on_a_good_link_is_named_and_undone(fault):
     vehicle = ScriptedVehicle(OLD, fault, victim=NAMES[7], after=4)
     link = SimulatedLink(vehicle)
     if fault == "integer":
-        with pytest.raises(SitlError, match=rf"{NAMES[7]}.*no float.*nothing was written"):
+        with pytest.raises(SitlError, match=rf"{NAMES[7]}.*not a float.*nothing was written"):
             upload(link)
         return
     outcome = upload(link)
@@ -109,7 +109,7 @@ def test_each_fault_on_a_good_link_is_named_and_undone(fault):
         "denies": "refused: permission denied",
         "deaf to one": f"{NAMES[7]}: no answer in 12 s",
         "arms": "the vehicle was armed before the last reading",
-        "dies": "nothing was heard from the vehicle for 12 s",
+        "dies": "no message from the vehicle for 12 s",
         "forgets": f"{NAMES[7]}: reads back as",
         "swaps": f"{NAMES[0]}: reads back as",
     }
@@ -191,17 +191,17 @@ def test_ctrl_c_between_any_two_writes_ends_with_the_old_values():
     for count in range(1, 20):
         vehicle = ScriptedVehicle(OLD)
         link = SimulatedLink(vehicle, latency=0.05)
-        talk = Conversation(link.now())
-        drive(talk.meet(), link)
-        held = drive(read(talk, NAMES), link)
+        client = ParameterClient(link.now())
+        run_exchange(client.await_heartbeat(), link)
+        held = run_exchange(read_values(client, NAMES), link)
         answer = vehicle.answer
 
-        def interrupted(order, talk=talk, vehicle=vehicle, answer=answer, count=count):
-            talk.interrupted = vehicle.writes >= count
+        def interrupted(order, client=client, vehicle=vehicle, answer=answer, count=count):
+            client.interrupted = vehicle.writes >= count
             return answer(order)
 
         vehicle.answer = interrupted
-        outcome = drive(apply(talk, NEW, held), link)
+        outcome = run_exchange(write_and_verify(client, NEW, held), link)
         assert (outcome.state, vehicle.values) == ("rolled back", OLD)
         assert "interrupted" in outcome.reason
 
@@ -215,7 +215,7 @@ def test_nothing_new_is_written_to_a_vehicle_that_armed_half_way():
     outcome = upload(link)
     assert outcome.state == "rolled back"
     heard = next(at for at, armed in beats if armed) + link.latency
-    late = [m for at, m in link.log if at > heard and isinstance(m, Write)]
+    late = [m for at, m in link.log if at > heard and isinstance(m, SetParameter)]
     assert late
     assert all(m.value == OLD[m.name] for m in late)
 
@@ -227,21 +227,21 @@ def test_an_armed_vehicle_is_written_when_forced_and_not_otherwise():
         link = SimulatedLink(vehicle)
         outcome = upload(link, force_armed=forced)
         assert outcome.state == state
-        assert any(isinstance(m, Write) for _, m in link.log) == forced
+        assert any(isinstance(m, SetParameter) for _, m in link.log) == forced
 
 
 def test_writing_waits_for_a_heartbeat_when_the_last_one_is_old():
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle)
-    talk = Conversation(link.now())
-    drive(talk.meet(), link)
-    held = drive(read(talk, NAMES), link)
+    client = ParameterClient(link.now())
+    run_exchange(client.await_heartbeat(), link)
+    held = run_exchange(read_values(client, NAMES), link)
     link.time += 60.0  # somebody reads the table; meanwhile it arms
     link.queue.clear()
     vehicle.armed = True
-    link.schedule(link.time + 0.7, "beat", THE_PEER)
-    talk.resume(link.now())
-    outcome = drive(apply(talk, NEW, held), link)
+    link.schedule(link.time + 0.7, "beat", SOLE_PEER)
+    client.resume(link.now())
+    outcome = run_exchange(write_and_verify(client, NEW, held), link)
     assert (outcome.state, vehicle.writes) == ("untouched", 0)
 
 
@@ -250,7 +250,7 @@ def stranger(system, component):
 
     def noise(message):
         changed = message._replace(system=system, component=component)
-        return changed._replace(value=changed.value + 1.0) if isinstance(changed, Value) else changed
+        return changed._replace(value=changed.value + 1.0) if isinstance(changed, ParameterValue) else changed
 
     return noise
 
@@ -262,17 +262,17 @@ def test_the_answers_of_other_vehicles_and_components_are_ignored(speaker):
     assert upload(link, system=1).state == "verified"
     assert vehicle.values == NEW
     deaf = ScriptedVehicle(OLD, "deaf to one", victim=NAMES[3])
-    link = SimulatedLink(deaf, noise=[lambda m: Value(*speaker, NAMES[3], NEW[NAMES[3]])])
+    link = SimulatedLink(deaf, noise=[lambda m: ParameterValue(*speaker, NAMES[3], NEW[NAMES[3]])])
     assert upload(link, system=1).state == "rolled back"
 
 
 def test_another_stations_reading_of_an_old_value_does_not_stop_a_write():
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle, latency=0.05)
-    once = iter([Value(1, 1, NAMES[0], OLD[NAMES[0]])] * 3)
+    once = iter([ParameterValue(1, 1, NAMES[0], OLD[NAMES[0]])] * 3)
     answer = vehicle.answer
     vehicle.answer = lambda order: [
-        *([m] if isinstance(order, Write) and (m := next(once, None)) else []),
+        *([m] if isinstance(order, SetParameter) and (m := next(once, None)) else []),
         *answer(order),
     ]
     assert upload(link).state == "verified"
@@ -302,10 +302,10 @@ def test_a_change_that_the_vehicle_cannot_keep_is_called_that():
 def test_storage_is_acknowledged_refused_or_left_to_the_vehicle(storage, expected, seconds, asked):
     vehicle = ScriptedVehicle(OLD, storage=storage)
     link = SimulatedLink(vehicle, latency=0.01)
-    talk = Conversation(link.now())
-    drive(talk.meet(), link)
+    client = ParameterClient(link.now())
+    run_exchange(client.await_heartbeat(), link)
     begin = link.now()
-    assert drive(talk.store(), link) == expected
+    assert run_exchange(client.store(), link) == expected
     assert link.now() - begin == pytest.approx(seconds)
     assert vehicle.stored == asked
 
@@ -342,7 +342,7 @@ def test_a_round_trip_longer_than_a_try_neither_fails_nor_deceives(latency):
 def test_a_vehicle_that_turns_read_only_half_way_is_read_and_told_exactly():
     vehicle = ScriptedVehicle(OLD)
     store = vehicle.store
-    vehicle.store = lambda name, value: [Refusal(1, 1, name, 5)] if vehicle.writes > 6 else store(name, value)
+    vehicle.store = lambda name, value: [ParameterRefusal(1, 1, name, 5)] if vehicle.writes > 6 else store(name, value)
     outcome = upload(SimulatedLink(vehicle))
     assert (outcome.state, outcome.storage) == ("mixed", "acknowledged")
     assert outcome.held == {name: (value,) for name, value in vehicle.values.items()}
@@ -360,7 +360,7 @@ def test_a_slow_link_is_used_to_its_window_and_no_further():
     assert link.now() - begin < 1.0 + LISTEN_S + 1.1 + AUTOSAVE_S + 0.4
     most = 0
     for at, _ in link.log:
-        most = max(most, sum(at <= t < at + 0.099 for t, m in link.log if not isinstance(m, Store)))
+        most = max(most, sum(at <= t < at + 0.099 for t, m in link.log if not isinstance(m, StoreParameters)))
     assert most <= 12  # ten and a HEARTBEAT or two
 
 
@@ -375,14 +375,14 @@ floats32 = st.floats(width=32)
 words = st.one_of(
     st.builds(lambda s, a: Heartbeat(*s, 12, a), speakers.filter(lambda s: s != (1, 1)), st.booleans()),
     st.builds(
-        lambda s, n, v, k: Value(*s, n, v, k),
+        lambda s, n, v, k: ParameterValue(*s, n, v, k),
         speakers,
         st.sampled_from([*NAMES, "", "OTHER"]),
         floats32,
         st.integers(0, 255),
     ),
-    st.builds(lambda s, n, r: Refusal(*s, n, r), speakers, st.sampled_from([*NAMES, ""]), st.integers(0, 255)),
-    st.builds(lambda s, c, r: Ack(*s, c, r), speakers, st.sampled_from([245, 400]), st.integers(0, 255)),
+    st.builds(lambda s, n, r: ParameterRefusal(*s, n, r), speakers, st.sampled_from([*NAMES, ""]), st.integers(0, 255)),
+    st.builds(lambda s, c, r: CommandAck(*s, c, r), speakers, st.sampled_from([245, 400]), st.integers(0, 255)),
 )
 
 
@@ -393,8 +393,8 @@ def test_whatever_else_is_said_on_the_link_a_success_is_true(noise, seed, fault)
     link = SimulatedLink(vehicle, seed, latency=0.02)
     for i, word in enumerate(noise):
         # Left out: a stray value with the very bits that are hoped for, which cannot be told from an answer.
-        if not (isinstance(word, Value) and word.value == NEW.get(word.name)):
-            link.schedule(0.05 * i, "to ground", Heard(THE_PEER, word))
+        if not (isinstance(word, ParameterValue) and word.value == NEW.get(word.name)):
+            link.schedule(0.05 * i, "to ground", Received(SOLE_PEER, word))
     try:
         outcome = upload(link, tries=6, system=1)
     except SitlError:

@@ -8,7 +8,7 @@ import pytest
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import single
-from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, off_diagonals, restoration
+from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, make_restore_plan, off_diagonal_shares
 from mimopilot.tuning.gains import MATRICES, Limits
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.parameters import PARAMETERS, to_array
@@ -65,7 +65,7 @@ def test_large_off_diagonals_are_not_dropped_unasked(gains, profile):
     with pytest.raises(SitlError, match=rf"R[PD]_RP: the {profile} controller has no off-diagonals, .* 13% of"):
         make_plan(gains, profile)
     plan = make_plan(gains, profile, drop=True)
-    assert plan.dropped == off_diagonals(gains)
+    assert plan.dropped == off_diagonal_shares(gains)
     assert plan.dropped["RP_RP"] == pytest.approx(0.02 / 0.15)
     assert plan.dropped["AP_PR"] == pytest.approx(0.2 / 5.5)
     assert len(plan.dropped) == 10
@@ -73,7 +73,7 @@ def test_large_off_diagonals_are_not_dropped_unasked(gains, profile):
 
 def test_an_off_diagonal_beside_a_zero_counts_as_infinite(diagonal):
     odd = dataclasses.replace(diagonal, Kff_i=np.array([[0.0, 0.001], [0.0, 0.0]]))
-    assert off_diagonals(odd) == {"RF_RP": math.inf}
+    assert off_diagonal_shares(odd) == {"RF_RP": math.inf}
     with pytest.raises(SitlError, match="RF_RP"):
         make_plan(odd, "px4-stock")
 
@@ -113,15 +113,15 @@ def test_every_name_and_value_can_go_over_the_wire(diagonal, profile):
 
 def test_a_snapshot_is_a_whole_set_within_our_ranges(diagonal):
     values = make_plan(diagonal).values
-    plan = restoration(values | {"MIMO_TS": 0.004, "SYS_X": 1e9}, "old.params")
+    plan = make_restore_plan(values | {"MIMO_TS": 0.004, "SYS_X": 1e9}, "old.params")
     assert plan.values == values | {"SYS_X": 1e9}
     assert (plan.fixed, plan.profile) == ({"MIMO_TS": 0.004}, "mimo")
     assert [s.unit for s in plan.settings][:1] == ["1/s"]
     with pytest.raises(SitlError, match=r"old\.params: MIMO_RP_RR: got 99, expected -?[0-9.e-]+ to 5 s"):
-        restoration(values | {"MIMO_RP_RR": 99.0}, "old.params")
+        make_restore_plan(values | {"MIMO_RP_RR": 99.0}, "old.params")
     with pytest.raises(SitlError, match=r"holds 33 of our 35 gains and lacks MIMO_RP_RP and 1 more"):
-        restoration({n: v for n, v in values.items() if n not in ("MIMO_RP_RP", "MIMO_D_POLE")}, "old.params")
-    foreign = restoration({"MC_ROLL_P": 99.0}, "px4.params")
+        make_restore_plan({n: v for n, v in values.items() if n not in ("MIMO_RP_RP", "MIMO_D_POLE")}, "old.params")
+    foreign = make_restore_plan({"MC_ROLL_P": 99.0}, "px4.params")
     assert (foreign.values, foreign.profile) == ({"MC_ROLL_P": 99.0}, "px4-stock")
-    assert restoration({"ATC_ANG_RLL_P": 5.0}, "x").profile == "ardupilot-stock"
-    assert restoration({"WPNAV_SPEED": 5.0}, "x").profile == ""
+    assert make_restore_plan({"ATC_ANG_RLL_P": 5.0}, "x").profile == "ardupilot-stock"
+    assert make_restore_plan({"WPNAV_SPEED": 5.0}, "x").profile == ""

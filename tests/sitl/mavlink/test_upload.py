@@ -11,8 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mimopilot.codegen.render import render
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.connection import Connection, express, understand
-from mimopilot.sitl.mavlink.ground_station.events import Beat, Heartbeat, Read, Refusal, Store, Value, Write
+from mimopilot.sitl.mavlink.ground_station.connection import Connection, from_mavlink, to_mavlink
+from mimopilot.sitl.mavlink.ground_station.events import (
+    GroundHeartbeat,
+    Heartbeat,
+    ParameterRefusal,
+    ParameterValue,
+    ReadParameter,
+    SetParameter,
+    StoreParameters,
+)
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.wire.link import Codec
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
@@ -89,7 +97,7 @@ def test_json_is_one_object_for_success_and_for_failure(mimopilot, certified, ol
     found = json.loads(failed.stdout)
     assert (failed.returncode, found["state"]) == (1, "rolled back")
     assert found["reason"].startswith("MIMO_RI_PR: reads back as")
-    assert_one_clear_line(failed, "MIMO_RI_PR", "the old values were put back and read back", code=1)
+    assert_one_clear_line(failed, "MIMO_RI_PR", "the old values were restored and read back", code=1)
 
 
 @pytest.mark.parametrize("fault", [fault for fault in FAILING if fault not in ("dies", "forgets", "swaps")])
@@ -98,7 +106,7 @@ def test_no_fault_gets_past_the_command(mimopilot, certified, old, new, fault):
     with UdpVehicle(vehicle) as link:
         failed = mimopilot("upload", certified, "--connect", link.url, "--yes", "--timeout", "3")
         assert named(vehicle.values, new) == named(old, new)
-    assert_one_clear_line(failed, "nothing was written" if fault == "integer" else "put back and read back", code=1)
+    assert_one_clear_line(failed, "nothing was written" if fault == "integer" else "restored and read back", code=1)
     assert "verified" not in failed.stdout
 
 
@@ -146,7 +154,7 @@ def test_ctrl_c_and_a_closed_terminal_put_the_old_values_back(certified, old, ne
             _, message = process.communicate(timeout=PATIENCE_S)
         assert process.returncode == 1
         assert "interrupted" in message
-        assert "the old values were put back and read back" in message
+        assert "the old values were restored and read back" in message
         assert named(vehicle.values, new) == named(old, new)
 
 
@@ -175,7 +183,7 @@ def test_values_that_change_while_the_question_stands_are_not_overwritten(certif
             os.write(near, b"y\n")
             _, message = process.communicate(timeout=PATIENCE_S)
         assert (process.returncode, link.vehicle.writes) == (1, 0)
-        assert "changed while the question stood" in message
+        assert "changed while waiting for the answer" in message
     os.close(near)
     os.close(far)
 
@@ -263,7 +271,7 @@ def test_an_older_snapshot_is_never_overwritten(mimopilot, certified, old, new, 
     with UdpVehicle(ScriptedVehicle(old)) as link:
         arguments = ("upload", certified, "--connect", link.url, "--yes")
         assert mimopilot(*arguments, "--snapshot", "mine.params").returncode == 0
-        assert_one_clear_line(mimopilot(*arguments, "--snapshot", "mine.params"), "mine.params", "name another")
+        assert_one_clear_line(mimopilot(*arguments, "--snapshot", "mine.params"), "mine.params", "name another file")
         link.vehicle.values.update(old)
         assert mimopilot(*arguments).returncode == 0
         link.vehicle.values["MIMO_RP_RR"] = 0.5
@@ -290,7 +298,7 @@ def test_what_is_no_url_is_answered_with_the_forms(url):
 def test_mistakes_are_one_clear_line(mimopilot, certified, tmp_path):
     (tmp_path / "empty.params").write_text("")
     for arguments, words, code in [
-        (("upload", certified, "--connect", "tcp:127.0.0.1:9"), ("nobody to ask", "--yes"), 2),
+        (("upload", certified, "--connect", "tcp:127.0.0.1:9"), ("no terminal to ask", "--yes"), 2),
         (("upload", certified, "--connect", "tcp:127.0.0.1:9", "--yes"), ("cannot be opened", "refused"), 1),
         (("upload", certified, "--connect", "/dev/nowhere,57600", "--yes"), ("/dev/nowhere", "cannot be opened"), 1),
         (("upload", certified, "--connect", "udpin:127.0.0.1:9999", "--yes", "--timeout", "3"), ("no HEARTBEAT",), 1),
@@ -376,9 +384,9 @@ def frames():
     codec = Codec()
     words = [
         Heartbeat(1, 1, 12, False),
-        Value(1, 1, "MIMO_RP_RR", 0.125),
-        Value(1, 1, "SIXTEEN_LETTERS_", -1.5),
-        Refusal(1, 1, "MIMO_RP_RR", 2),
+        ParameterValue(1, 1, "MIMO_RP_RR", 0.125),
+        ParameterValue(1, 1, "SIXTEEN_LETTERS_", -1.5),
+        ParameterRefusal(1, 1, "MIMO_RP_RR", 2),
     ]
     return [codec.pack(encode(word)) for word in words]
 
@@ -407,32 +415,37 @@ def test_any_bytes_are_read_without_a_stumble_and_a_whole_frame_is_found_again(c
         codec.signer = Signer(KEY)
     for chunk in chunks:
         for message in codec.parse(chunk):
-            understand(message)
+            from_mavlink(message)
     codec.signer = None
     # A false start may swallow as much as the longest frame; then the parser is back.
-    heard = [understand(message) for _ in range(20) for message in codec.parse(FRAMES[2])]
-    assert heard[-1] == Value(1, 1, "SIXTEEN_LETTERS_", -1.5)
+    heard = [from_mavlink(message) for _ in range(20) for message in codec.parse(FRAMES[2])]
+    assert heard[-1] == ParameterValue(1, 1, "SIXTEEN_LETTERS_", -1.5)
 
 
 def test_random_noise_never_becomes_a_message():
     codec, noise = Codec(255, 190), random.Random(0)
-    heard = [understand(m) for _ in range(300) for m in codec.parse(noise.randbytes(1000))]
+    heard = [from_mavlink(m) for _ in range(300) for m in codec.parse(noise.randbytes(1000))]
     assert [word for word in heard if word is not None] == []
 
 
 @pytest.mark.parametrize(
     "order",
-    [Beat(), Read(1, 1, "SIXTEEN_LETTERS_"), Write(1, 1, "MIMO_RP_RR", 0.1), Store(1, 1)],
+    [
+        GroundHeartbeat(),
+        ReadParameter(1, 1, "SIXTEEN_LETTERS_"),
+        SetParameter(1, 1, "MIMO_RP_RR", 0.1),
+        StoreParameters(1, 1),
+    ],
     ids=lambda order: type(order).__name__,
 )
 def test_what_is_sent_reads_back_as_the_same(order):
-    (message,) = Codec().parse(Codec(255, 190).pack(express(order)))
+    (message,) = Codec().parse(Codec(255, 190).pack(to_mavlink(order)))
     assert (message.get_srcSystem(), message.get_srcComponent()) == (255, 190)
-    if isinstance(order, Write):
+    if isinstance(order, SetParameter):
         assert (message.param_id, message.param_value, message.param_type) == ("MIMO_RP_RR", float32(0.1), 9)
-    elif isinstance(order, Read):
+    elif isinstance(order, ReadParameter):
         assert (message.param_id, message.param_index) == ("SIXTEEN_LETTERS_", -1)
-    elif isinstance(order, Store):
+    elif isinstance(order, StoreParameters):
         assert (message.command, message.param1, message.target_system) == (245, 1.0, 1)
     else:
         assert (message.type, message.autopilot) == (6, 8)

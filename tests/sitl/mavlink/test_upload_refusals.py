@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from mimopilot.sitl.mavlink.ground_station.events import Value
+from mimopilot.sitl.mavlink.ground_station.events import ParameterValue
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 
 from tests.conftest import assert_one_clear_line
@@ -26,7 +26,7 @@ def held_gains(vehicle, new):
     return {name: vehicle.values[name] for name in new}
 
 
-class AtStoring(ScriptedVehicle):
+class StoringVehicle(ScriptedVehicle):
     """Something happens to it as it is told to store; `happens` returns what it says then."""
 
     def __init__(self, values, happens):
@@ -36,7 +36,9 @@ class AtStoring(ScriptedVehicle):
     def answer(self, order):
         answers = super().answer(order)
         return (
-            [*answers, *(self.happens(self) or [])] if self.stored == 1 and type(order).__name__ == "Store" else answers
+            [*answers, *(self.happens(self) or [])]
+            if self.stored == 1 and type(order).__name__ == "StoreParameters"
+            else answers
         )
 
 
@@ -49,7 +51,7 @@ def clamps(vehicle):
 
 
 def is_written(vehicle):
-    return [Value(1, 1, "MIMO_RP_RR", 0.5), Value(1, 1, "MIMO_RP_RR", vehicle.values["MIMO_RP_RR"])]
+    return [ParameterValue(1, 1, "MIMO_RP_RR", 0.5), ParameterValue(1, 1, "MIMO_RP_RR", vehicle.values["MIMO_RP_RR"])]
 
 
 def arms(vehicle):
@@ -62,15 +64,15 @@ def arms(vehicle):
     [
         (restarts, ("MIMO_AP_RR: reads back as 5.25, expected 6.0",)),
         (clamps, ("MIMO_RP_RR: reads back as 0.1, expected 0.15",)),
-        (is_written, ("MIMO_RP_RR: 0.5, after the vehicle said 0.15",)),
+        (is_written, ("MIMO_RP_RR: 0.5, after the vehicle reported 0.15",)),
         (arms, ("the vehicle was armed before the last reading", "although the vehicle was armed")),
     ],
 )
 def test_what_happens_as_a_vehicle_stores_is_exit_1_and_undone(mimopilot, certified, old, new, happens, words):
-    vehicle = AtStoring(old, happens)
+    vehicle = StoringVehicle(old, happens)
     with UdpVehicle(vehicle) as link:
         failed = upload(mimopilot, certified, link)
-    assert_one_clear_line(failed, *words, "the old values were put back and read back", code=1)
+    assert_one_clear_line(failed, *words, "the old values were restored and read back", code=1)
     assert vehicle.values == old
 
 
@@ -85,7 +87,7 @@ def test_storage_that_is_refused_is_told_as_such(mimopilot, certified, old, new,
         vehicle.values.update(old)
         vehicle.fault, vehicle.victim = "echoes one", "MIMO_RP_RR"
         failed = upload(mimopilot, certified, link)
-        assert_one_clear_line(failed, "put back and read back; not stored", f"MAV_RESULT_{said}", code=1)
+        assert_one_clear_line(failed, "restored and read back; not stored", f"MAV_RESULT_{said}", code=1)
 
 
 def test_a_second_vehicle_of_the_same_number_is_never_written(mimopilot, certified, old, new):
@@ -109,7 +111,7 @@ def test_a_second_vehicle_of_the_same_number_is_never_written(mimopilot, certifi
             assert started
             other.__exit__()
         addresses = [f"127.0.0.1:{vehicle.port_number}" for vehicle in (link, other)]
-    assert_one_clear_line(failed, "system 1 is heard from two addresses", *addresses, "put back and read back", code=1)
+    assert_one_clear_line(failed, "system 1 is heard from two addresses", *addresses, "restored and read back", code=1)
     assert first.values == old
     assert (second.writes, second.stored, second.values) == (0, 0, new)
 
