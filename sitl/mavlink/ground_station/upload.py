@@ -75,7 +75,7 @@ def write_and_verify(
 
     Parameters
     ----------
-    talk : Conversation
+    client : ParameterClient
         After `await_heartbeat`.
     new : mapping
         Name -> value in single precision.

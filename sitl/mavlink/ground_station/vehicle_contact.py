@@ -112,7 +112,7 @@ class VehicleContact:
         return self._duplicate or self.contradiction
 
     def check_contradictions(self, on: bool) -> None:
-        """Start or stop to check reported values against those agreed on."""
+        """Start or stop checking reported values against those agreed on."""
         self._agreed = {} if on else None
         self.contradiction = ""
 

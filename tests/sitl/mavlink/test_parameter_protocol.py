@@ -1,4 +1,4 @@
-"""The transaction over simulated links: thousands of bad days, in simulated time."""
+"""The upload over simulated links with loss, faults and interruptions, in simulated time."""
 
 import math
 from itertools import pairwise
@@ -32,7 +32,7 @@ RADIO = {"loss": 0.3, "duplicate": 0.1, "reorder": 0.1}
 
 
 def upload(link, new=NEW, **keywords):
-    """Read, then apply; the outcome. A vehicle that cannot be read ends it before anything is written."""
+    """Read, then write and verify; returns the outcome. Nothing is written if reading fails."""
     client = ParameterClient(link.now(), **keywords)
     run_exchange(client.await_heartbeat(), link)
     held = run_exchange(read_values(client, list(new)), link)
@@ -40,7 +40,7 @@ def upload(link, new=NEW, **keywords):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_bad_radio_loses_nothing(seed):
+def test_an_upload_over_a_lossy_radio_is_verified(seed):
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle, seed, **RADIO)
     outcome = upload(link)
@@ -49,7 +49,7 @@ def test_a_bad_radio_loses_nothing(seed):
     assert vehicle.stored >= 1
 
 
-def test_the_radio_of_these_tests_is_as_bad_as_it_says():
+def test_the_simulated_radio_has_the_stated_loss_and_reordering():
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle, 0, **RADIO)
     arrived = []
@@ -63,11 +63,11 @@ def test_the_radio_of_these_tests_is_as_bad_as_it_says():
     assert late / len(arrived) == pytest.approx(0.1, abs=0.02)
 
 
-def test_no_failing_vehicle_is_ever_reported_as_a_success():
+def test_a_faulty_vehicle_is_never_reported_as_verified():
     states = {}
     for seed in range(200):
         fault = FAILING[seed % len(FAILING)]
-        vehicle = ScriptedVehicle(OLD, fault, victim=NAMES[seed % 20], after=seed % 20)
+        vehicle = ScriptedVehicle(OLD, fault, faulty=NAMES[seed % 20], after=seed % 20)
         link = SimulatedLink(vehicle, seed, **RADIO)
         try:
             outcome = upload(link)
@@ -77,7 +77,7 @@ def test_no_failing_vehicle_is_ever_reported_as_a_success():
             continue
         states.setdefault(fault, set()).add(outcome.state)
         if outcome.state == "verified":
-            # It armed and nobody heard of it in time, or the write that it spoiled was repeated later.
+            # Its arming was not received in time, or the wrong write was repeated later.
             assert fault in ("arms", "swaps")
             assert vehicle.values == NEW
         for name, value in vehicle.values.items():
@@ -90,15 +90,15 @@ def test_no_failing_vehicle_is_ever_reported_as_a_success():
 
 
 @pytest.mark.parametrize("fault", FAILING)
-def test_each_fault_on_a_good_link_is_named_and_undone(fault):
-    vehicle = ScriptedVehicle(OLD, fault, victim=NAMES[7], after=4)
+def test_each_fault_on_a_good_link_is_named_and_rolled_back(fault):
+    vehicle = ScriptedVehicle(OLD, fault, faulty=NAMES[7], after=4)
     link = SimulatedLink(vehicle)
     if fault == "integer":
         with pytest.raises(SitlError, match=rf"{NAMES[7]}.*not a float.*nothing was written"):
             upload(link)
         return
     outcome = upload(link)
-    words = {
+    reasons = {
         "echoes": "reads back as 0.1",
         "echoes one": f"{NAMES[7]}: reads back as",
         "ignores": f"{NAMES[7]}: stays",
@@ -113,7 +113,7 @@ def test_each_fault_on_a_good_link_is_named_and_undone(fault):
         "forgets": f"{NAMES[7]}: reads back as",
         "swaps": f"{NAMES[0]}: reads back as",
     }
-    assert words[fault] in outcome.reason
+    assert reasons[fault] in outcome.reason
     expected = {"dies": "mixed", "forgets": "mixed", "swaps": "mixed"}.get(fault, "rolled back")
     assert outcome.state == expected
     for name, value in vehicle.values.items():
@@ -124,7 +124,7 @@ def test_each_fault_on_a_good_link_is_named_and_undone(fault):
 
 
 @pytest.mark.parametrize("after", range(len(NAMES) + 1))
-def test_a_link_cut_after_any_write_leaves_nothing_untold(after):
+def test_a_link_loss_after_any_write_reports_every_changed_parameter(after):
     vehicle = ScriptedVehicle(OLD, "dies", after=after)
     outcome = upload(SimulatedLink(vehicle))
     if after == len(NAMES):
@@ -132,13 +132,13 @@ def test_a_link_cut_after_any_write_leaves_nothing_untold(after):
         return
     assert outcome.state == "mixed"
     assert sum(value != OLD[name] for name, value in vehicle.values.items()) == after
-    told = {name for name, values in outcome.held.items() if values != (OLD[name],)}
+    reported = {name for name, values in outcome.held.items() if values != (OLD[name],)}
     for name, value in vehicle.values.items():
         assert value in outcome.held[name]
-        assert value == OLD[name] or name in told
+        assert value == OLD[name] or name in reported
 
 
-def test_a_link_cut_at_any_message_leaves_nothing_untold():
+def test_a_link_loss_at_any_message_reports_every_changed_parameter():
     states = set()
     for count in range(40, 480, 4):
         vehicle = ScriptedVehicle(OLD)
@@ -162,26 +162,26 @@ def test_a_link_cut_at_any_message_leaves_nothing_untold():
     assert states == {"verified", "mixed"}
 
 
-def test_a_link_that_comes_back_in_time_ends_with_the_old_values():
+def test_a_link_restored_in_time_ends_with_the_old_values():
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle)
     write = vehicle.write
 
-    def stumble(name, value):
+    def write_with_link_loss(name, value):
         if vehicle.writes == 5 and link.up:
             link.up = False
             link.schedule(link.time + 15.0, "back", None)
         return write(name, value)
 
-    vehicle.write = stumble
+    vehicle.write = write_with_link_loss
     receive = link.receive
 
-    def revive(until):
+    def receive_after_return(until):
         if not link.up and any(kind == "back" and at <= until for at, _, kind, _ in link.queue):
             link.up = True
         return [heard for heard in receive(until) if heard is not None]
 
-    link.receive = revive
+    link.receive = receive_after_return
     outcome = upload(link)
     assert outcome.state == "rolled back", outcome
     assert vehicle.values == OLD
@@ -206,7 +206,7 @@ def test_ctrl_c_between_any_two_writes_ends_with_the_old_values():
         assert "interrupted" in outcome.reason
 
 
-def test_nothing_new_is_written_to_a_vehicle_that_armed_half_way():
+def test_no_new_value_is_written_after_the_vehicle_arms():
     vehicle = ScriptedVehicle(OLD, "arms", after=3)
     link = SimulatedLink(vehicle, latency=0.2)
     beats = []
@@ -220,7 +220,7 @@ def test_nothing_new_is_written_to_a_vehicle_that_armed_half_way():
     assert all(m.value == OLD[m.name] for m in late)
 
 
-def test_an_armed_vehicle_is_written_when_forced_and_not_otherwise():
+def test_an_armed_vehicle_is_written_only_if_forced():
     for forced, state in ((False, "untouched"), (True, "verified")):
         vehicle = ScriptedVehicle(OLD)
         vehicle.armed = True
@@ -230,13 +230,13 @@ def test_an_armed_vehicle_is_written_when_forced_and_not_otherwise():
         assert any(isinstance(m, SetParameter) for _, m in link.log) == forced
 
 
-def test_writing_waits_for_a_heartbeat_when_the_last_one_is_old():
+def test_writing_waits_for_a_heartbeat_if_the_last_one_is_old():
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle)
     client = ParameterClient(link.now())
     run_exchange(client.await_heartbeat(), link)
     held = run_exchange(read_values(client, NAMES), link)
-    link.time += 60.0  # somebody reads the table; meanwhile it arms
+    link.time += 60.0  # the user reads the table; meanwhile the vehicle arms
     link.queue.clear()
     vehicle.armed = True
     link.schedule(link.time + 0.7, "beat", SOLE_PEER)
@@ -245,8 +245,8 @@ def test_writing_waits_for_a_heartbeat_when_the_last_one_is_old():
     assert (outcome.state, vehicle.writes) == ("untouched", 0)
 
 
-def stranger(system, component):
-    """Noise: every answer of the vehicle comes also from another speaker, with another value."""
+def other_sender(system, component):
+    """Noise: another sender repeats every answer of the vehicle, with another value."""
 
     def noise(message):
         changed = message._replace(system=system, component=component)
@@ -255,18 +255,18 @@ def stranger(system, component):
     return noise
 
 
-@pytest.mark.parametrize("speaker", [(7, 1), (1, 42), (255, 190)])
-def test_the_answers_of_other_vehicles_and_components_are_ignored(speaker):
+@pytest.mark.parametrize("sender", [(7, 1), (1, 42), (255, 190)])
+def test_the_answers_of_other_vehicles_and_components_are_ignored(sender):
     vehicle = ScriptedVehicle(OLD)
-    link = SimulatedLink(vehicle, noise=[stranger(*speaker)])
+    link = SimulatedLink(vehicle, noise=[other_sender(*sender)])
     assert upload(link, system=1).state == "verified"
     assert vehicle.values == NEW
-    deaf = ScriptedVehicle(OLD, "deaf to one", victim=NAMES[3])
-    link = SimulatedLink(deaf, noise=[lambda m: ParameterValue(*speaker, NAMES[3], NEW[NAMES[3]])])
+    deaf = ScriptedVehicle(OLD, "deaf to one", faulty=NAMES[3])
+    link = SimulatedLink(deaf, noise=[lambda m: ParameterValue(*sender, NAMES[3], NEW[NAMES[3]])])
     assert upload(link, system=1).state == "rolled back"
 
 
-def test_another_stations_reading_of_an_old_value_does_not_stop_a_write():
+def test_an_old_value_read_by_another_ground_station_does_not_stop_a_write():
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle, latency=0.05)
     once = iter([ParameterValue(1, 1, NAMES[0], OLD[NAMES[0]])] * 3)
@@ -279,7 +279,7 @@ def test_another_stations_reading_of_an_old_value_does_not_stop_a_write():
     assert vehicle.values == NEW
 
 
-def test_a_change_that_the_vehicle_cannot_keep_is_called_that():
+def test_a_change_too_small_for_the_vehicle_is_reported_as_such():
     vehicle = ScriptedVehicle(OLD, "epsilon")
     new = NEW | {NAMES[2]: single(OLD[NAMES[2]] + 6e-8)}
     assert new[NAMES[2]] != OLD[NAMES[2]]
@@ -310,7 +310,7 @@ def test_storage_is_acknowledged_refused_or_left_to_the_vehicle(storage, expecte
     assert vehicle.stored == asked
 
 
-def test_a_missing_parameter_stops_before_anything_is_written():
+def test_a_missing_parameter_stops_the_upload_before_writing():
     vehicle = ScriptedVehicle({name: value for name, value in OLD.items() if name != NAMES[5]})
     link = SimulatedLink(vehicle)
     with pytest.raises(SitlError, match=rf"{NAMES[5]}: no answer in 12 s.*nothing was written"):
@@ -318,7 +318,7 @@ def test_a_missing_parameter_stops_before_anything_is_written():
     assert vehicle.writes == 0
 
 
-def test_a_vehicle_that_is_not_there_is_waited_for_as_long_as_told():
+def test_an_absent_vehicle_is_waited_for_until_the_timeout():
     vehicle = ScriptedVehicle(OLD)
     vehicle.dead = True
     link = SimulatedLink(vehicle)
@@ -328,18 +328,18 @@ def test_a_vehicle_that_is_not_there_is_waited_for_as_long_as_told():
 
 
 @pytest.mark.parametrize("latency", [0.3, 0.6, 1.2])
-def test_a_round_trip_longer_than_a_try_neither_fails_nor_deceives(latency):
+def test_a_round_trip_longer_than_a_try_causes_neither_failure_nor_false_success(latency):
     vehicle = ScriptedVehicle(OLD)
     assert upload(SimulatedLink(vehicle, latency=latency, reorder=0.1)).state == "verified"
     assert vehicle.values == NEW
     for seed in range(60):
         fault = ("echoes", "echoes one", "clamps")[seed % 3]
-        vehicle = ScriptedVehicle(OLD, fault, victim=NAMES[seed % 20])
+        vehicle = ScriptedVehicle(OLD, fault, faulty=NAMES[seed % 20])
         assert upload(SimulatedLink(vehicle, seed, latency=latency, **RADIO)).state == "rolled back"
         assert vehicle.values == OLD
 
 
-def test_a_vehicle_that_turns_read_only_half_way_is_read_and_told_exactly():
+def test_values_of_a_vehicle_that_becomes_read_only_are_reported_exactly():
     vehicle = ScriptedVehicle(OLD)
     store = vehicle.store
     vehicle.store = lambda name, value: [ParameterRefusal(1, 1, name, 5)] if vehicle.writes > 6 else store(name, value)
@@ -349,14 +349,14 @@ def test_a_vehicle_that_turns_read_only_half_way_is_read_and_told_exactly():
     assert sum(values != (OLD[name],) for name, values in outcome.held.items()) == 6
 
 
-def test_a_slow_link_is_used_to_its_window_and_no_further():
+def test_a_slow_link_carries_a_full_window_of_requests_and_no_more():
     vehicle = ScriptedVehicle(OLD)
     link = SimulatedLink(vehicle, latency=0.05)
-    link.receive(1.1)  # its first HEARTBEAT is on the way
+    link.receive(1.1)  # the first HEARTBEAT is in transit
     begin = link.now()
     assert upload(link).state == "verified"
-    # Up to a second until its HEARTBEAT, and who else is there; two windows each of reading, writing and verifying, two
-    # settlings of two round trips, and the storage; then what outlasts its saving: a HEARTBEAT and two windows.
+    # Up to 1 s until its HEARTBEAT, and the listening time; two windows each of reading, writing and verifying; two
+    # waits of two round trips; the storage; then the wait for the autosave, a HEARTBEAT and two windows.
     assert link.now() - begin < 1.0 + LISTEN_S + 1.1 + AUTOSAVE_S + 0.4
     most = 0
     for at, _ in link.log:
@@ -365,36 +365,36 @@ def test_a_slow_link_is_used_to_its_window_and_no_further():
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e39, -3.5e38])
-def test_what_is_not_finite_in_single_precision_never_becomes_a_value(value):
+def test_a_value_that_is_not_finite_in_single_precision_is_refused(value):
     with pytest.raises(SitlError, match="finite in single precision"):
         single(value)
 
 
-speakers = st.sampled_from([(1, 1), (1, 2), (2, 1), (0, 0)])
+senders = st.sampled_from([(1, 1), (1, 2), (2, 1), (0, 0)])
 floats32 = st.floats(width=32)
-words = st.one_of(
-    st.builds(lambda s, a: Heartbeat(*s, 12, a), speakers.filter(lambda s: s != (1, 1)), st.booleans()),
+messages = st.one_of(
+    st.builds(lambda s, a: Heartbeat(*s, 12, a), senders.filter(lambda s: s != (1, 1)), st.booleans()),
     st.builds(
         lambda s, n, v, k: ParameterValue(*s, n, v, k),
-        speakers,
+        senders,
         st.sampled_from([*NAMES, "", "OTHER"]),
         floats32,
         st.integers(0, 255),
     ),
-    st.builds(lambda s, n, r: ParameterRefusal(*s, n, r), speakers, st.sampled_from([*NAMES, ""]), st.integers(0, 255)),
-    st.builds(lambda s, c, r: CommandAck(*s, c, r), speakers, st.sampled_from([245, 400]), st.integers(0, 255)),
+    st.builds(lambda s, n, r: ParameterRefusal(*s, n, r), senders, st.sampled_from([*NAMES, ""]), st.integers(0, 255)),
+    st.builds(lambda s, c, r: CommandAck(*s, c, r), senders, st.sampled_from([245, 400]), st.integers(0, 255)),
 )
 
 
-@given(st.lists(words, max_size=60), st.integers(0, 1000), st.sampled_from(["", *FAILING]))
+@given(st.lists(messages, max_size=60), st.integers(0, 1000), st.sampled_from(["", *FAILING]))
 @settings(max_examples=150, deadline=None)
-def test_whatever_else_is_said_on_the_link_a_success_is_true(noise, seed, fault):
-    vehicle = ScriptedVehicle(OLD, fault, victim=NAMES[seed % 20], after=seed % 20)
+def test_verified_is_true_whatever_other_messages_are_on_the_link(noise, seed, fault):
+    vehicle = ScriptedVehicle(OLD, fault, faulty=NAMES[seed % 20], after=seed % 20)
     link = SimulatedLink(vehicle, seed, latency=0.02)
-    for i, word in enumerate(noise):
-        # Left out: a stray value with the very bits that are hoped for, which cannot be told from an answer.
-        if not (isinstance(word, ParameterValue) and word.value == NEW.get(word.name)):
-            link.schedule(0.05 * i, "to ground", Received(SOLE_PEER, word))
+    for i, message in enumerate(noise):
+        # Except a stray value with exactly the expected bits: it cannot be distinguished from an answer.
+        if not (isinstance(message, ParameterValue) and message.value == NEW.get(message.name)):
+            link.schedule(0.05 * i, "to ground", Received(SOLE_PEER, message))
     try:
         outcome = upload(link, tries=6, system=1)
     except SitlError:

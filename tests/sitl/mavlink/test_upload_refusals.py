@@ -1,4 +1,4 @@
-"""upload and restore against vehicles, storage and files that are not as they should be: what is told, and the code."""
+"""upload and restore with faulty vehicles, storage and files: their messages and exit codes."""
 
 import json
 
@@ -27,16 +27,16 @@ def held_gains(vehicle, new):
 
 
 class StoringVehicle(ScriptedVehicle):
-    """Something happens to it as it is told to store; `happens` returns what it says then."""
+    """`event` happens at the storage command and returns the messages that the vehicle then sends."""
 
-    def __init__(self, values, happens):
+    def __init__(self, values, event):
         super().__init__(values)
-        self.happens, self.before = happens, dict(self.values)
+        self.event, self.before = event, dict(self.values)
 
     def answer(self, order):
         answers = super().answer(order)
         return (
-            [*answers, *(self.happens(self) or [])]
+            [*answers, *(self.event(self) or [])]
             if self.stored == 1 and type(order).__name__ == "StoreParameters"
             else answers
         )
@@ -60,7 +60,7 @@ def arms(vehicle):
 
 
 @pytest.mark.parametrize(
-    ("happens", "words"),
+    ("event", "parts"),
     [
         (restarts, ("MIMO_AP_RR: reads back as 5.25, expected 6.0",)),
         (clamps, ("MIMO_RP_RR: reads back as 0.1, expected 0.15",)),
@@ -68,16 +68,16 @@ def arms(vehicle):
         (arms, ("the vehicle was armed before the last reading", "although the vehicle was armed")),
     ],
 )
-def test_what_happens_as_a_vehicle_stores_is_exit_1_and_undone(mimopilot, certified, old, new, happens, words):
-    vehicle = StoringVehicle(old, happens)
+def test_an_event_during_storage_is_rolled_back_with_exit_code_1(mimopilot, certified, old, new, event, parts):
+    vehicle = StoringVehicle(old, event)
     with UdpVehicle(vehicle) as link:
         failed = upload(mimopilot, certified, link)
-    assert_one_clear_line(failed, *words, "the old values were restored and read back", code=1)
+    assert_one_clear_line(failed, *parts, "the old values were restored and read back", code=1)
     assert vehicle.values == old
 
 
 @pytest.mark.parametrize(("result", "word", "said"), [(2, "denied", "DENIED"), (4, "failed", "FAILED")])
-def test_storage_that_is_refused_is_told_as_such(mimopilot, certified, old, new, result, word, said):
+def test_refused_storage_is_reported(mimopilot, certified, old, new, result, word, said):
     vehicle = ScriptedVehicle(old, storage=result)
     with UdpVehicle(vehicle) as link:
         failed = upload(mimopilot, certified, link, "--json")
@@ -85,12 +85,12 @@ def test_storage_that_is_refused_is_told_as_such(mimopilot, certified, old, new,
         assert (json.loads(failed.stdout)["state"], json.loads(failed.stdout)["storage"]) == ("verified", word)
         assert held_gains(vehicle, new) == new
         vehicle.values.update(old)
-        vehicle.fault, vehicle.victim = "echoes one", "MIMO_RP_RR"
+        vehicle.fault, vehicle.faulty = "echoes one", "MIMO_RP_RR"
         failed = upload(mimopilot, certified, link)
         assert_one_clear_line(failed, "restored and read back; not stored", f"MAV_RESULT_{said}", code=1)
 
 
-def test_a_second_vehicle_of_the_same_number_is_never_written(mimopilot, certified, old, new):
+def test_a_second_vehicle_with_the_same_system_number_is_never_written(mimopilot, certified, old, new):
     first, second = ScriptedVehicle(old), ScriptedVehicle(new)
     with UdpVehicle(first) as link:
         other = UdpVehicle(second)
@@ -117,7 +117,7 @@ def test_a_second_vehicle_of_the_same_number_is_never_written(mimopilot, certifi
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "kind", "profile", "words"),
+    ("autopilot", "kind", "profile", "parts"),
     [
         (3, 1, "mimo", ("a plane with ArduPilot", "no profile fits")),
         (12, 1, "px4-stock", ("a plane with PX4", "no profile fits")),
@@ -129,40 +129,40 @@ def test_a_second_vehicle_of_the_same_number_is_never_written(mimopilot, certifi
         (0, 2, "px4-stock", ("a quadrotor with generic autopilot", "the profile that fits is mimo")),
     ],
 )
-def test_a_vehicle_of_another_kind_is_named_with_the_profile_that_fits(
-    mimopilot, certified, old, autopilot, kind, profile, words
+def test_a_vehicle_that_does_not_fit_the_profile_is_refused_with_the_one_that_fits(
+    mimopilot, certified, old, autopilot, kind, profile, parts
 ):
     vehicle = ScriptedVehicle(old)
     vehicle.autopilot, vehicle.type = autopilot, kind
     stock = () if profile == "mimo" else ("--profile", profile, "--drop-off-diagonals", "--moment-scale", "flown")
     with UdpVehicle(vehicle) as link:
         refused = upload(mimopilot, certified, link, *stock)
-    assert_one_clear_line(refused, *words, "nothing was written")
+    assert_one_clear_line(refused, *parts, "nothing was written")
     assert (vehicle.reads, vehicle.writes) == (0, 0)
 
 
-def test_a_stock_px4_is_named_and_a_vehicle_that_hears_nothing_is_not_taken_for_one(mimopilot, certified):
-    for values, words, code in [
+def test_a_stock_px4_is_distinguished_from_a_vehicle_that_receives_nothing(mimopilot, certified):
+    for values, parts, code in [
         ({"MC_ROLL_P": 6.5}, ("a quadrotor with PX4 and its stock controllers", "px4-stock"), 2),
         ({}, ("MIMO_AP_RR", "no answer in 2 s"), 1),
     ]:
         with UdpVehicle(ScriptedVehicle(values)) as link:
             refused = upload(mimopilot, certified, link, "--timeout", "2")
-        assert_one_clear_line(refused, *words, "nothing was written", code=code)
+        assert_one_clear_line(refused, *parts, "nothing was written", code=code)
 
 
-def test_a_vehicle_whose_clock_is_behind_is_told_from_one_with_another_key(mimopilot, certified, old, tmp_path):
+def test_a_slow_signing_clock_is_distinguished_from_another_key(mimopilot, certified, old, tmp_path):
     (tmp_path / "key").write_bytes(KEY)
-    for key, late, words in [
+    for key, late, parts in [
         (KEY, 3600.0, ("signed with this key, 36", "s behind this computer's clock")),
         (KEY[::-1], 0.0, ("not signed with this key",)),
     ]:
         with UdpVehicle(ScriptedVehicle(old), key=key, late=late) as link:
             refused = upload(mimopilot, certified, link, "--signing-key", "key", "--timeout", "2")
-        assert_one_clear_line(refused, "no HEARTBEAT", *words, code=1)
+        assert_one_clear_line(refused, "no HEARTBEAT", *parts, code=1)
 
 
-def test_a_snapshot_that_is_not_whole_or_out_of_range_is_refused_before_the_vehicle_is_asked(
+def test_an_incomplete_or_out_of_range_snapshot_is_refused_before_contacting_the_vehicle(
     mimopilot, certified, old, new, tmp_path
 ):
     vehicle = ScriptedVehicle(old)
@@ -171,7 +171,7 @@ def test_a_snapshot_that_is_not_whole_or_out_of_range_is_refused_before_the_vehi
         text, reads, writes = (tmp_path / "my.before-1.params").read_text(), vehicle.reads, vehicle.writes
         lines = text.splitlines(keepends=True)
         unsealed = "".join(lines[1:])
-        for content, words in [
+        for content, parts in [
             ("".join(lines[:-5]), ("holds 30 parameters, but its first line says 35",)),
             (text[:-4], ("it was cut short",)),
             (text.replace("0.13125", "0.13126"), ("damaged or edited",)),
@@ -180,7 +180,7 @@ def test_a_snapshot_that_is_not_whole_or_out_of_range_is_refused_before_the_vehi
         ]:
             (tmp_path / "bad.params").write_text(content)
             refused = mimopilot("restore", "bad.params", "--connect", link.url, "--yes")
-            assert_one_clear_line(refused, "bad.params", *words)
+            assert_one_clear_line(refused, "bad.params", *parts)
             assert (vehicle.reads, vehicle.writes) == (reads, writes)
         (tmp_path / "unsealed.params").write_text(unsealed)
         assert mimopilot("restore", "unsealed.params", "--connect", link.url, "--yes").returncode == 0

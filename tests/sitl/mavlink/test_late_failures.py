@@ -1,4 +1,4 @@
-"""What a vehicle may do after it has answered for every write, in simulated time; and who else may be on the link."""
+"""Failures after every write was acknowledged, old HEARTBEATs, and other vehicles on the link, in simulated time."""
 
 import pytest
 from mimopilot.sitl.errors import SitlError
@@ -23,43 +23,43 @@ NAMES = [f"MIMO_X_{i:02d}" for i in range(20)]
 FIXED = {"MIMO_TS": single(0.004), "MIMO_SCALE_R": single(2.5)}
 NEW = {name: single(0.3 * (i + 1)) for i, name in enumerate(NAMES)}
 OLD = {name: single(0.1 * (i + 1)) for i, name in enumerate(NAMES)} | FIXED
-VICTIM = NAMES[7]
-THERE = ("10.0.0.2", 14550)
+FAULTY = NAMES[7]
+OTHER_ADDRESS = ("10.0.0.2", 14550)
 
 
 class LateVehicle(ScriptedVehicle):
-    """Something happens to it so many seconds after it was told to store; `happens` returns what it says then."""
+    """`event` happens `seconds` after a storage command and returns the messages that the vehicle then sends."""
 
-    def __init__(self, happens, seconds):
+    def __init__(self, event, seconds):
         super().__init__(OLD)
-        self.happens, self.seconds, self.due = happens, seconds, None
+        self.event, self.seconds, self.due = event, seconds, None
 
-    def tell(self, now):
+    def stream(self, now):
         if self.stored and self.due is None:
             self.due = now + self.seconds
-        if self.happens is None or self.due is None or now < self.due:
+        if self.event is None or self.due is None or now < self.due:
             return []
-        happens, self.happens = self.happens, None
-        return happens(self) or []
+        event, self.event = self.event, None
+        return event(self) or []
 
 
 def restarts(vehicle):
-    """It has not stored anything."""
+    """It loses what it has not stored."""
     vehicle.values = dict(OLD)
 
 
 def clamps(vehicle):
-    vehicle.values[VICTIM] = single(0.5)
+    vehicle.values[FAULTY] = single(0.5)
 
 
 def is_written(vehicle):
-    """By another station."""
-    vehicle.values[VICTIM] = single(0.5)
-    return [ParameterValue(1, 1, VICTIM, vehicle.values[VICTIM])]
+    """By another ground station."""
+    vehicle.values[FAULTY] = single(0.5)
+    return [ParameterValue(1, 1, FAULTY, vehicle.values[FAULTY])]
 
 
 def is_written_and_written_back(vehicle):
-    return [ParameterValue(1, 1, VICTIM, single(0.5)), ParameterValue(1, 1, VICTIM, NEW[VICTIM])]
+    return [ParameterValue(1, 1, FAULTY, single(0.5)), ParameterValue(1, 1, FAULTY, NEW[FAULTY])]
 
 
 def arms(vehicle):
@@ -80,25 +80,25 @@ def upload(link, new=NEW, **keywords):
 
 @pytest.mark.parametrize("seconds", [0.0, 0.5, 1.5, 2.3])
 @pytest.mark.parametrize(
-    ("happens", "words"),
+    ("event", "parts"),
     [
         (restarts, f"{NAMES[0]}: reads back as 0.1, expected 0.3"),
-        (clamps, f"{VICTIM}: reads back as 0.5, expected 2.4"),
-        (is_written, f"{VICTIM}: 0.5, after the vehicle reported 2.4"),
-        (is_written_and_written_back, f"{VICTIM}: 0.5, after the vehicle reported 2.4"),
+        (clamps, f"{FAULTY}: reads back as 0.5, expected 2.4"),
+        (is_written, f"{FAULTY}: 0.5, after the vehicle reported 2.4"),
+        (is_written_and_written_back, f"{FAULTY}: 0.5, after the vehicle reported 2.4"),
         (arms, "the vehicle was armed before the last reading"),
         (arms_and_disarms, "the vehicle was armed before the last reading"),
     ],
 )
-def test_what_happens_after_storing_is_no_success_and_is_undone(happens, words, seconds):
-    vehicle = LateVehicle(happens, seconds)
+def test_an_event_after_storing_is_detected_and_rolled_back(event, parts, seconds):
+    vehicle = LateVehicle(event, seconds)
     outcome = upload(SimulatedLink(vehicle))
-    assert (outcome.state, outcome.reason) == ("rolled back", words)
+    assert (outcome.state, outcome.reason) == ("rolled back", parts)
     assert vehicle.values == OLD
-    assert outcome.armed == happens.__name__.startswith("arms")
+    assert outcome.armed == event.__name__.startswith("arms")
 
 
-def test_a_fixed_value_that_changes_is_noticed_and_is_not_written():
+def test_a_change_of_a_fixed_value_is_reported_but_not_written_back():
     vehicle = LateVehicle(lambda v: v.values.update(MIMO_TS=0.002), 1.0)
     link = RecordingLink(vehicle)
     outcome = upload(link)
@@ -109,14 +109,14 @@ def test_a_fixed_value_that_changes_is_noticed_and_is_not_written():
     assert {name: vehicle.values[name] for name in NEW} == {name: OLD[name] for name in NEW}
 
 
-def test_a_vehicle_that_was_forced_may_be_armed():
+def test_a_vehicle_may_arm_during_a_forced_upload():
     vehicle = LateVehicle(arms, 1.0)
     outcome = upload(SimulatedLink(vehicle), force_armed=True)
     assert (outcome.state, outcome.armed) == ("verified", True)
 
 
 class RecordingLink(SimulatedLink):
-    """Remembers when HEARTBEATs were heard."""
+    """Records when HEARTBEATs are received."""
 
     def __init__(self, vehicle, **keywords):
         super().__init__(vehicle, **keywords)
@@ -132,7 +132,7 @@ class RecordingLink(SimulatedLink):
 
 
 @pytest.mark.parametrize("answers", [0, None])
-def test_the_last_reading_outlasts_what_a_vehicle_saves_by_itself(answers):
+def test_the_last_reading_is_later_than_the_vehicles_own_saving(answers):
     link = RecordingLink(ScriptedVehicle(OLD, storage=answers))
     assert upload(link).state == "verified"
     last = link.sent(ReadParameter)[-len(OLD) :]
@@ -142,7 +142,7 @@ def test_the_last_reading_outlasts_what_a_vehicle_saves_by_itself(answers):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_no_heartbeat_is_older_than_the_help_says_when_something_is_written(seed):
+def test_every_write_follows_a_heartbeat_of_less_than_1_5_s_ago(seed):
     link = RecordingLink(ScriptedVehicle(OLD), seed=seed, loss=0.4, latency=0.1)
     assert upload(link).state == "verified"
     for at in link.sent(SetParameter):
@@ -150,7 +150,7 @@ def test_no_heartbeat_is_older_than_the_help_says_when_something_is_written(seed
 
 
 class RareHeartbeatVehicle(ScriptedVehicle):
-    """Sends its HEARTBEAT once, then only when asked, or never again; ATTITUDE all the time."""
+    """Sends HEARTBEAT once, then only on request, or never; streams ATTITUDE."""
 
     def __init__(self, answers):
         super().__init__(OLD)
@@ -165,28 +165,28 @@ class RareHeartbeatVehicle(ScriptedVehicle):
             return super().heartbeat() if self.answers else []
         return super().answer(order)
 
-    def tell(self, now):
+    def stream(self, now):
         return [AttitudeReport(1, 1, 0.0, 0.0)]
 
 
-def test_a_heartbeat_that_is_late_is_asked_for():
+def test_a_late_heartbeat_is_requested():
     link = RecordingLink(RareHeartbeatVehicle(answers=True))
     assert upload(link).state == "verified"
     for at in link.sent(SetParameter):
         assert at - max(beat for beat in link.beats if beat <= at) < 1.5
 
 
-def test_a_vehicle_whose_heartbeat_ends_is_not_written():
+def test_a_vehicle_without_further_heartbeats_is_not_written():
     vehicle = RareHeartbeatVehicle(answers=False)
     outcome = upload(RecordingLink(vehicle))
     assert (outcome.state, vehicle.writes) == ("untouched", 0)
     assert "no HEARTBEAT in 13.5 s" in outcome.reason
 
 
-def test_two_vehicles_of_one_number_are_refused_and_neither_is_written():
+def test_two_vehicles_with_one_system_number_are_refused_and_not_written():
     first, second = ScriptedVehicle(OLD), ScriptedVehicle(OLD)
     link = SimulatedLink(first)
-    link.join(1.3, THERE, second)
+    link.join(1.3, OTHER_ADDRESS, second)
     with pytest.raises(SitlError, match=r"system 1 is heard from two addresses, :0 and 10\.0\.0\.2:14550") as refused:
         upload(link)
     assert refused.value.exit_code == 2
@@ -194,10 +194,10 @@ def test_two_vehicles_of_one_number_are_refused_and_neither_is_written():
 
 
 @pytest.mark.parametrize("at", [2.7, 2.9, 3.1, 3.5, 4.5, 5.4])
-def test_a_second_vehicle_that_appears_in_the_middle_is_never_written(at):
+def test_a_second_vehicle_that_appears_during_the_upload_is_never_written(at):
     first, second = ScriptedVehicle(OLD), ScriptedVehicle(NEW | FIXED)
     link = SimulatedLink(first)
-    link.join(at, THERE, second)
+    link.join(at, OTHER_ADDRESS, second)
     outcome = upload(link)
     assert outcome.state == "rolled back"
     assert "system 1 is heard from two addresses, :0 and 10.0.0.2:14550" in outcome.reason
@@ -205,13 +205,15 @@ def test_a_second_vehicle_that_appears_in_the_middle_is_never_written(at):
     assert first.values == OLD
 
 
-def test_what_another_address_says_does_not_pass_for_what_the_vehicle_holds():
-    vehicle = ScriptedVehicle(OLD, "deaf to one", victim=VICTIM)
+def test_an_answer_from_another_address_is_not_accepted():
+    vehicle = ScriptedVehicle(OLD, "deaf to one", faulty=FAULTY)
     link = SimulatedLink(vehicle)
     client = ParameterClient(link.now())
     run_exchange(client.await_heartbeat(), link)
     for i in range(200):
-        link.schedule(link.time + 0.1 * i, "to ground", Received(THERE, ParameterValue(1, 1, VICTIM, NEW[VICTIM])))
-    answers = run_exchange(client.write({VICTIM: NEW[VICTIM]}, "writing", keep_going=True), link)
-    assert answers[VICTIM].value is None
-    assert "no answer" in answers[VICTIM].problem
+        link.schedule(
+            link.time + 0.1 * i, "to ground", Received(OTHER_ADDRESS, ParameterValue(1, 1, FAULTY, NEW[FAULTY]))
+        )
+    answers = run_exchange(client.write({FAULTY: NEW[FAULTY]}, "writing", keep_going=True), link)
+    assert answers[FAULTY].value is None
+    assert "no answer" in answers[FAULTY].problem
