@@ -31,6 +31,7 @@ IN_AIR = 2  # MAV_LANDED_STATE_IN_AIR
 STREAMS = {"ATTITUDE": (30, 50_000), "DEBUG_VECT": (250, 100_000), "EXTENDED_SYS_STATE": (245, 200_000)}
 # Times and limits are chosen, unless a source is given.
 FIRST_STREAM_TIMEOUT_S, REPEAT_REQUEST_S = 5.0, 1.0  # until all streams arrive; between their requests
+POLL_S = 0.1  # between two checks of the flight state
 PARAMETER_UPDATE_S = 1.5  # PX4 applies changed parameters once a second
 START_TIMEOUT_S = 5.0  # from the write to the first pulse
 STREAM_TIMEOUT_S = 1.0  # without a message of a stream
@@ -124,12 +125,8 @@ def start_monitor(client: ParameterClient, mode: int) -> Exchange[FlightMonitor]
     """
     assert client.vehicle is not None
     monitor = client.on_report = FlightMonitor(client)
-    begin, next_request = client.now, client.now
-    while (
-        monitor.overdue(STREAM_TIMEOUT_S)
-        and client.now < begin + FIRST_STREAM_TIMEOUT_S
-        and not (client.interrupted or client.closed)
-    ):
+    next_request, deadline = client.now, client.now + FIRST_STREAM_TIMEOUT_S
+    while monitor.overdue(STREAM_TIMEOUT_S) and client.now < deadline and not (client.interrupted or client.closed):
         requests = []
         if client.now >= next_request:
             next_request = client.now + REPEAT_REQUEST_S
@@ -137,7 +134,7 @@ def start_monitor(client: ParameterClient, mode: int) -> Exchange[FlightMonitor]
                 SetMessageInterval(client.vehicle.system, client.vehicle.component, *STREAMS[kind])
                 for kind in monitor.overdue(REPEAT_REQUEST_S)
             ]
-        yield from client.send_and_wait(requests, client.now + 0.1)
+        yield from client.send_and_wait(requests, client.now + POLL_S)
     missing = monitor.overdue(STREAM_TIMEOUT_S)
     reason = ""
     if client.interrupted:
@@ -218,7 +215,7 @@ def _watch_flight(
     mode, begin, seconds = client.vehicle.mode, client.now, 0.0
     first: int | None = None
     while True:
-        yield from client.send_and_wait([], client.now + 0.1)
+        yield from client.send_and_wait([], client.now + POLL_S)
         reason = _stop_reason(client, monitor, mode, wanted["MIMO_EX_TILT"])
         if reason:
             return reason, seconds

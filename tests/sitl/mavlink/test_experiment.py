@@ -2,20 +2,16 @@
 
 import re
 import signal
-import struct
 
 import numpy as np
 import pytest
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.connection import from_mavlink, to_mavlink
-from mimopilot.sitl.mavlink.ground_station.events import ParameterValue, SetParameter, run_exchange
+from mimopilot.sitl.mavlink.ground_station.events import SetParameter, run_exchange
 from mimopilot.sitl.mavlink.ground_station.experiment import INTEGERS, excite, start_monitor
 from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions, settings
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
-from mimopilot.sitl.mavlink.wire.link import Codec
 from mimopilot.tuning.logs.reader import read_log
-from pymavlink.dialects.v20 import common as mavlink
 
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
@@ -164,16 +160,6 @@ def test_the_injection_is_not_started_if_a_setting_is_refused():
 def test_settings_out_of_range_are_refused_before_sending(change, parts):
     with pytest.raises(SitlError, match=parts):
         settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
-
-
-@pytest.mark.parametrize("number", [0, 1, 60, 1000000, -1, -(2**31), 2**31 - 1])
-def test_integers_keep_their_bits_in_mavlink_messages(number):
-    codec = Codec()
-    (sent,) = codec.parse(codec.pack(to_mavlink(SetParameter(1, 1, "MIMO_EX_HMIN", float(number), 6))))
-    assert struct.pack("<f", sent.param_value) == struct.pack("<i", number)
-    echo = mavlink.MAVLink_param_value_message(b"MIMO_EX_HMIN", sent.param_value, 6, 1, 0)
-    (heard,) = codec.parse(codec.pack(echo))
-    assert from_mavlink(heard) == ParameterValue(1, 1, "MIMO_EX_HMIN", number, 6)
 
 
 # The commands, against `mimopilot sitl`.

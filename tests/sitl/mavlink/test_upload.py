@@ -2,29 +2,13 @@
 
 import json
 import os
-import random
 import signal
 import subprocess
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mimopilot.codegen.render import render
-from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.connection import Connection, from_mavlink, to_mavlink
-from mimopilot.sitl.mavlink.ground_station.events import (
-    GroundHeartbeat,
-    Heartbeat,
-    ParameterRefusal,
-    ParameterValue,
-    ReadParameter,
-    SetParameter,
-    StoreParameters,
-)
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
-from mimopilot.sitl.mavlink.wire.link import Codec
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
-from mimopilot.sitl.mavlink.wire.signing import Signer, read_key
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.gains import load_gains
 from mimopilot.tuning.parameters import PARAMETERS
@@ -37,8 +21,6 @@ from tests.sitl.mavlink.scripted_vehicle import (
     SerialVehicle,
     TcpVehicle,
     UdpVehicle,
-    encode,
-    float32,
 )
 
 KEY = bytes(range(32))
@@ -206,26 +188,6 @@ def test_a_signed_link_asks_for_its_key(mimopilot, certified, old, new, tmp_path
         assert link.vehicle.writes == 0
 
 
-@pytest.mark.parametrize("content", [b"", b"secret", bytes(31), b"zz" * 32, b"00" * 31])
-def test_an_invalid_signing_key_is_refused(tmp_path, content):
-    (tmp_path / "key").write_bytes(content)
-    with pytest.raises(SitlError, match="not a signing key"):
-        read_key(tmp_path / "key")
-
-
-def test_gains_for_another_vehicle_are_refused_before_writing(mimopilot, certified, old, gains):
-    for change, parts, extra in [
-        ({"MIMO_TS": 0.002}, ("MIMO_TS: the vehicle has 0.002", "the gains are for 0.004"), ()),
-        ({"MIMO_SCALE_P": 3.6}, ("moment_scale", "2.546, 2.546, 0.2736 N m per unit", "2.546, 3.6, 0.2736"), ()),
-        ({}, ("moment_scale", "the vehicle has 1, 1, 1"), ("--moment-scale", "1,1,1")),
-        ({"MIMO_RP_RR": float("nan")}, ("MIMO_RP_RR: the vehicle holds nan",), ()),
-    ]:
-        with UdpVehicle(ScriptedVehicle(old | change)) as link:
-            refused = mimopilot("upload", certified, "--connect", link.url, "--yes", *extra)
-            assert_one_clear_line(refused, *parts)
-            assert link.vehicle.writes == 0
-
-
 def test_a_vehicle_that_does_not_publish_its_unit_of_torque_needs_moment_scale(mimopilot, certified, old, new):
     silent = {name: value for name, value in old.items() if not name.startswith("MIMO_SCALE")}
     with UdpVehicle(ScriptedVehicle(silent)) as link:
@@ -253,20 +215,6 @@ def test_a_stock_autopilot_receives_the_diagonal_gains(mimopilot, certified, gai
     assert "dropped: RP_RP, 13.3% of its diagonal" in done.stdout
 
 
-def test_uncertified_gains_are_refused_before_contacting_the_vehicle(mimopilot, gains, old, new, tmp_path):
-    gains.save(tmp_path / "plain.gains.toml")
-    gains.with_certificate({"verdict": "unstable", "reason": "by this test"}).save(tmp_path / "bad.gains.toml")
-    with UdpVehicle(ScriptedVehicle(old)) as link:
-        for name, word in (("plain", "no certificate"), ("bad", "unstable")):
-            refused = mimopilot("upload", f"{name}.gains.toml", "--connect", link.url, "--yes")
-            assert_one_clear_line(refused, word, "--uncertified")
-            assert link.vehicle.reads == 0
-        forced = mimopilot("upload", "plain.gains.toml", "--connect", link.url, "--yes", "--uncertified")
-        assert forced.returncode == 0
-        assert "never examined" in forced.stderr
-        assert named(link.vehicle.values, new) == new
-
-
 def test_an_older_snapshot_is_never_overwritten(mimopilot, certified, old, new, tmp_path):
     with UdpVehicle(ScriptedVehicle(old)) as link:
         arguments = ("upload", certified, "--connect", link.url, "--yes")
@@ -284,48 +232,6 @@ def test_an_older_snapshot_is_never_overwritten(mimopilot, certified, old, new, 
     assert read_parameters(tmp_path / "mine.params") == named(old, new)
     assert read_parameters(tmp_path / "my.before-1.params") == named(old, new)
     assert read_parameters(tmp_path / "my.before-2.params") == named(new, new) | {"MIMO_RP_RR": 0.5}
-
-
-URLS = ["udpin:127.0.0.1", "udpin:127.0.0.1:0", "tcp::1", "udpout:127.0.0.1:70000", "", "x", "/dev/null,fast"]
-
-
-@pytest.mark.parametrize("url", URLS)
-def test_an_invalid_url_is_refused_with_the_valid_forms(url):
-    with pytest.raises(SitlError, match="expected udpin:HOST:PORT"):
-        Connection(url)
-
-
-def test_mistakes_are_one_clear_line(mimopilot, certified, tmp_path):
-    (tmp_path / "empty.params").write_text("")
-    for arguments, parts, code in [
-        (("upload", certified, "--connect", "tcp:127.0.0.1:9"), ("no terminal to ask", "--yes"), 2),
-        (("upload", certified, "--connect", "tcp:127.0.0.1:9", "--yes"), ("cannot be opened", "refused"), 1),
-        (("upload", certified, "--connect", "/dev/nowhere,57600", "--yes"), ("/dev/nowhere", "cannot be opened"), 1),
-        (("upload", certified, "--connect", "udpin:127.0.0.1:9999", "--yes", "--timeout", "3"), ("no HEARTBEAT",), 1),
-        (("upload", certified, "--connect", "x", "--yes", "--moment-scale", "1,2"), ("--moment-scale: got '1,2'",), 2),
-        (("upload", certified, "--connect", "x", "--yes", "--profile", "x"), ("--profile: got 'x'",), 2),
-        (("upload", "none.toml", "--connect", "x"), ("none.toml",), 2),
-        (("restore", "none.params", "--connect", "x"), ("none.params",), 2),
-        (("restore", "empty.params", "--connect", "x"), ("holds no parameters",), 2),
-        (("params",), ("give a gains file", "--connect"), 2),
-        (("params", certified, "--format", "xml"), ("--format: got 'xml'", "mavproxy"), 2),
-        (("params", certified, "--json"), ("--json",), 2),
-        (("params", certified, "--connect", "x", "--out", "y"), ("--out",), 2),
-        (("params", "--connect", "x", "--format", "c-header"), ("c-header",), 2),
-    ]:
-        assert_one_clear_line(mimopilot(*arguments), *parts, code=code)
-
-
-def test_with_two_vehicles_on_a_link_system_must_be_given(mimopilot, certified, old, new):
-    vehicle = ScriptedVehicle(old)
-    beat = vehicle.heartbeat
-    vehicle.heartbeat = lambda: [*beat(), *(m._replace(system=9) for m in beat())]
-    with UdpVehicle(vehicle) as link:
-        arguments = ("upload", certified, "--connect", link.url, "--yes")
-        assert_one_clear_line(mimopilot(*arguments), "systems 1, 9", "--system")
-        assert vehicle.writes == 0
-        assert mimopilot(*arguments, "--system", "1").returncode == 0
-        assert named(vehicle.values, new) == new
 
 
 def test_parameter_files_are_written_compared_and_read_from_a_vehicle(mimopilot, certified, old, new, tmp_path):
@@ -377,75 +283,3 @@ def test_our_sitl_accepts_gains_in_flight_only_if_forced(mimopilot, tmp_path):
         stored = mimopilot(*arguments)
         assert json.loads(stored.stdout)["storage"] == "acknowledged"
         pilot.close()
-
-
-def frames():
-    """One of each message that an exchange receives, as bytes."""
-    codec = Codec()
-    messages = [
-        Heartbeat(1, 1, 12, False),
-        ParameterValue(1, 1, "MIMO_RP_RR", 0.125),
-        ParameterValue(1, 1, "SIXTEEN_LETTERS_", -1.5),
-        ParameterRefusal(1, 1, "MIMO_RP_RR", 2),
-    ]
-    return [codec.pack(encode(message)) for message in messages]
-
-
-FRAMES = frames()
-
-
-def changed(frame, place, byte):
-    place %= len(frame)
-    return frame[:place] + bytes([byte]) + frame[place + 1 :]
-
-
-damage = st.one_of(
-    st.binary(max_size=40),
-    st.sampled_from(FRAMES),
-    st.builds(changed, st.sampled_from(FRAMES), st.integers(0, 99), st.integers(0, 255)),
-    st.builds(lambda frame, place: frame[: place % len(frame)], st.sampled_from(FRAMES), st.integers(0, 99)),
-)
-
-
-@given(st.lists(damage, max_size=30), st.booleans())
-@settings(max_examples=300, deadline=None)
-def test_the_parser_survives_any_bytes_and_finds_the_next_whole_frame(chunks, signed):
-    codec = Codec(255, 190)
-    if signed:
-        codec.signer = Signer(KEY)
-    for chunk in chunks:
-        for message in codec.parse(chunk):
-            from_mavlink(message)
-    codec.signer = None
-    # A false frame start may consume as many bytes as the longest frame.
-    heard = [from_mavlink(message) for _ in range(20) for message in codec.parse(FRAMES[2])]
-    assert heard[-1] == ParameterValue(1, 1, "SIXTEEN_LETTERS_", -1.5)
-
-
-def test_random_bytes_are_never_parsed_as_a_message():
-    codec, noise = Codec(255, 190), random.Random(0)
-    heard = [from_mavlink(m) for _ in range(300) for m in codec.parse(noise.randbytes(1000))]
-    assert [message for message in heard if message is not None] == []
-
-
-@pytest.mark.parametrize(
-    "order",
-    [
-        GroundHeartbeat(),
-        ReadParameter(1, 1, "SIXTEEN_LETTERS_"),
-        SetParameter(1, 1, "MIMO_RP_RR", 0.1),
-        StoreParameters(1, 1),
-    ],
-    ids=lambda order: type(order).__name__,
-)
-def test_encoded_messages_decode_to_the_same_fields(order):
-    (message,) = Codec().parse(Codec(255, 190).pack(to_mavlink(order)))
-    assert (message.get_srcSystem(), message.get_srcComponent()) == (255, 190)
-    if isinstance(order, SetParameter):
-        assert (message.param_id, message.param_value, message.param_type) == ("MIMO_RP_RR", float32(0.1), 9)
-    elif isinstance(order, ReadParameter):
-        assert (message.param_id, message.param_index) == ("SIXTEEN_LETTERS_", -1)
-    elif isinstance(order, StoreParameters):
-        assert (message.command, message.param1, message.target_system) == (245, 1.0, 1)
-    else:
-        assert (message.type, message.autopilot) == (6, 8)

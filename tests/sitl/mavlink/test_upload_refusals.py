@@ -3,8 +3,11 @@
 import json
 
 import pytest
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.mavlink.ground_station.connection import Connection
 from mimopilot.sitl.mavlink.ground_station.events import ParameterValue
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
+from mimopilot.sitl.mavlink.wire.signing import read_key
 
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.running import wait_for
@@ -194,3 +197,79 @@ def test_a_value_that_restore_would_refuse_is_not_overwritten(mimopilot, certifi
         refused = upload(mimopilot, certified, link)
     assert_one_clear_line(refused, "MIMO_RP_RR: the vehicle holds 99, expected", "set it by hand first")
     assert vehicle.writes == 0
+
+
+@pytest.mark.parametrize("content", [b"", b"secret", bytes(31), b"zz" * 32, b"00" * 31])
+def test_an_invalid_signing_key_is_refused(tmp_path, content):
+    (tmp_path / "key").write_bytes(content)
+    with pytest.raises(SitlError, match="not a signing key"):
+        read_key(tmp_path / "key")
+
+
+def test_gains_for_another_vehicle_are_refused_before_writing(mimopilot, certified, old, gains):
+    for change, parts, extra in [
+        ({"MIMO_TS": 0.002}, ("MIMO_TS: the vehicle has 0.002", "the gains are for 0.004"), ()),
+        ({"MIMO_SCALE_P": 3.6}, ("moment_scale", "2.546, 2.546, 0.2736 N m per unit", "2.546, 3.6, 0.2736"), ()),
+        ({}, ("moment_scale", "the vehicle has 1, 1, 1"), ("--moment-scale", "1,1,1")),
+        ({"MIMO_RP_RR": float("nan")}, ("MIMO_RP_RR: the vehicle holds nan",), ()),
+    ]:
+        with UdpVehicle(ScriptedVehicle(old | change)) as link:
+            refused = mimopilot("upload", certified, "--connect", link.url, "--yes", *extra)
+            assert_one_clear_line(refused, *parts)
+            assert link.vehicle.writes == 0
+
+
+def test_uncertified_gains_are_refused_before_contacting_the_vehicle(mimopilot, gains, old, new, tmp_path):
+    gains.save(tmp_path / "plain.gains.toml")
+    gains.with_certificate({"verdict": "unstable", "reason": "by this test"}).save(tmp_path / "bad.gains.toml")
+    with UdpVehicle(ScriptedVehicle(old)) as link:
+        for name, word in (("plain", "no certificate"), ("bad", "unstable")):
+            refused = mimopilot("upload", f"{name}.gains.toml", "--connect", link.url, "--yes")
+            assert_one_clear_line(refused, word, "--uncertified")
+            assert link.vehicle.reads == 0
+        forced = mimopilot("upload", "plain.gains.toml", "--connect", link.url, "--yes", "--uncertified")
+        assert forced.returncode == 0
+        assert "never examined" in forced.stderr
+        assert held_gains(link.vehicle, new) == new
+
+
+URLS = ["udpin:127.0.0.1", "udpin:127.0.0.1:0", "tcp::1", "udpout:127.0.0.1:70000", "", "x", "/dev/null,fast"]
+
+
+@pytest.mark.parametrize("url", URLS)
+def test_an_invalid_url_is_refused_with_the_valid_forms(url):
+    with pytest.raises(SitlError, match="expected udpin:HOST:PORT"):
+        Connection(url)
+
+
+def test_mistakes_are_one_clear_line(mimopilot, certified, tmp_path):
+    (tmp_path / "empty.params").write_text("")
+    for arguments, parts, code in [
+        (("upload", certified, "--connect", "tcp:127.0.0.1:9"), ("no terminal to ask", "--yes"), 2),
+        (("upload", certified, "--connect", "tcp:127.0.0.1:9", "--yes"), ("cannot be opened", "refused"), 1),
+        (("upload", certified, "--connect", "/dev/nowhere,57600", "--yes"), ("/dev/nowhere", "cannot be opened"), 1),
+        (("upload", certified, "--connect", "udpin:127.0.0.1:9999", "--yes", "--timeout", "3"), ("no HEARTBEAT",), 1),
+        (("upload", certified, "--connect", "x", "--yes", "--moment-scale", "1,2"), ("--moment-scale: got '1,2'",), 2),
+        (("upload", certified, "--connect", "x", "--yes", "--profile", "x"), ("--profile: got 'x'",), 2),
+        (("upload", "none.toml", "--connect", "x"), ("none.toml",), 2),
+        (("restore", "none.params", "--connect", "x"), ("none.params",), 2),
+        (("restore", "empty.params", "--connect", "x"), ("holds no parameters",), 2),
+        (("params",), ("give a gains file", "--connect"), 2),
+        (("params", certified, "--format", "xml"), ("--format: got 'xml'", "mavproxy"), 2),
+        (("params", certified, "--json"), ("--json",), 2),
+        (("params", certified, "--connect", "x", "--out", "y"), ("--out",), 2),
+        (("params", "--connect", "x", "--format", "c-header"), ("c-header",), 2),
+    ]:
+        assert_one_clear_line(mimopilot(*arguments), *parts, code=code)
+
+
+def test_with_two_vehicles_on_a_link_system_must_be_given(mimopilot, certified, old, new):
+    vehicle = ScriptedVehicle(old)
+    beat = vehicle.heartbeat
+    vehicle.heartbeat = lambda: [*beat(), *(m._replace(system=9) for m in beat())]
+    with UdpVehicle(vehicle) as link:
+        arguments = ("upload", certified, "--connect", link.url, "--yes")
+        assert_one_clear_line(mimopilot(*arguments), "systems 1, 9", "--system")
+        assert vehicle.writes == 0
+        assert mimopilot(*arguments, "--system", "1").returncode == 0
+        assert held_gains(vehicle, new) == new
