@@ -2,7 +2,7 @@
 
 A stock controller is diagonal: off-diagonal gains are lost. No factor is needed for the gains: PX4's and ArduPilot's
 angle P is in 1/s; their rate P, I, D and FF are normalised torque per rad/s, its integral, its derivative and the rate
-setpoint. Both filter the derivative by a first-order low-pass with our cut-off. Rate limits are converted to deg/s.
+setpoint. Both filter the derivative by a first-order low-pass with our cutoff. Rate limits are converted to deg/s.
 The unit of the normalised torque is the vehicle's own: see `sitl.physics.moment_scale`.
 """
 
