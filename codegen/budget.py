@@ -1,20 +1,20 @@
-"""Processor in the loop: the same rows on the Cortex-M4 and on the host, and what a step costs.
+"""Processor in the loop: the same inputs on the Cortex-M4 and on the host, and the cost of a control step.
 
-Cycles are estimated from the instructions that were executed, by class, between two sums. The source is ARM's
-Cortex-M4 Technical Reference Manual (DDI 0439), its tables of instruction and FPU timings, with memory without
-wait states, as the STM32F4's flash accelerator gives for code that is in its cache:
+The cycles of a step are bounded by a lower and an upper sum over its executed instructions. Costs are from ARM's
+Cortex-M4 Technical Reference Manual (DDI 0439), tables of instruction and FPU timings. Memory has no wait states, as
+the STM32F4's flash accelerator provides for code in its cache:
 
 ============================  =======  ======================================================================
 class                         lower    upper
 ============================  =======  ======================================================================
 data processing, compare      1        1
-IT                            0        1: folded into the instruction before it, or not
+IT                            0        1: folded into the preceding instruction, or not
 multiply-accumulate           1        2
 divide (integer)              2        12
-load one word                 1        3: pipelined, or alone and its result used at once
+load one word                 1        3: pipelined, or alone with its result used at once
 store one word                1        2
-load or store N words         1 + N    2 + N, with the PC among them 4 + N
-branch                        1        4: not taken, or a whole refill of the pipeline
+load or store N words         1 + N    2 + N, including the PC 4 + N
+branch                        1        4: not taken, or a full pipeline refill
 call, return                  2        4
 FPU add, multiply, compare    1        2: the result used at once
 FPU multiply-accumulate       3        4
@@ -24,7 +24,7 @@ FPU store one word            1        2
 FPU status to the flags       1        2
 ============================  =======  ======================================================================
 
-Interrupts, and the first execution of code that is not in the cache yet, come on top.
+Interrupts, and the first execution of code outside the cache, are not included.
 """
 
 from __future__ import annotations
@@ -38,21 +38,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mimopilot.codegen.cortex_m4 import EmulatedController, Image, build_image, run_in_qemu
+from mimopilot.codegen.cortex_m4 import EmulatedController, FirmwareImage, build_image, run_in_qemu
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.toolchain import CXX_FLAGS, cross_tool, run_tool
-from mimopilot.codegen.vectors import random_inputs
+from mimopilot.codegen.vectors import SEED, random_inputs
 from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
+#: Core clock, Hz: that of the STM32F4 on Pixhawk boards.
 CLOCK = 168e6
+#: Control period that the budget is for, s.
 PERIOD = 4e-3
+#: Limits, all chosen: instructions of a step, share of a period, bytes of code and of stack.
+MAX_INSTRUCTIONS, MAX_SHARE, MAX_TEXT_BYTES, MAX_STACK_BYTES = 400, 0.0015, 2048, 128
 EMULATORS = ("unicorn", "qemu")
-#: What the controller may take from a C library: copies and fills of memory.
+#: C library functions that the controller may call: copying and filling memory.
 LIBRARY = {"memcpy", "memset", "memmove"}
 
-#: Mnemonic -> (lower, upper) cycles; the first that matches. N words are added to a multiple load or store.
+#: (pattern of the mnemonic, (lower, upper) cycles); the first match counts. Multiple load and store: plus N words.
 _CYCLES = (
     (r"v(ldm|stm|push|pop)", (1, 2)),
     (r"vldr", (1, 3)),
@@ -70,23 +74,24 @@ _CYCLES = (
     (r"(b|cbn?z)((eq|ne|cs|cc|mi|pl|vs|vc|hi|ls|ge|lt|gt|le)?(\.[nw])?)$", (1, 4)),
     (r"", (1, 1)),
 )
+#: Additional upper cycles if the PC is loaded.
 _PC = 2
 
 
 @dataclass(frozen=True)
-class Figure:
+class BudgetItem:
     """One line of the budget page.
 
     Attributes
     ----------
     name : str
-        Its key in the JSON object.
+        Key in the JSON object.
     text : str
-        What it is, with its unit.
+        Description, with the unit.
     value : float
-        As measured or estimated.
+        Measured or estimated.
     limit : float or None
-        The most that is allowed; None: not budgeted.
+        Largest allowed value; None: not limited.
     """
 
     name: str
@@ -96,7 +101,7 @@ class Figure:
 
     @property
     def passed(self) -> bool:
-        """Whether the limit is kept."""
+        """Whether the value is within its limit."""
         return self.limit is None or self.value <= self.limit
 
 
@@ -121,20 +126,20 @@ def cycles(instruction: str) -> tuple[int, int]:
     return lower + words, upper + words
 
 
-def step_costs(image: Image, periods: Sequence[Sequence[tuple[int, int]]]) -> NDArray[np.int64]:
-    """Instructions and cycles of traced periods.
+def step_costs(image: FirmwareImage, periods: Sequence[Sequence[tuple[int, int]]]) -> NDArray[np.int64]:
+    """Instructions and cycles of each traced control period.
 
     Parameters
     ----------
-    image : Image
-        What ran.
+    image : FirmwareImage
+        The firmware that was traced.
     periods : sequence of sequences of (address, bytes)
-        The blocks of each period, from `EmulatedController.run_traced`.
+        Basic blocks of each period, from `EmulatedController.run_traced`.
 
     Returns
     -------
     (N, 3) array
-        Instructions, lower and upper estimate of the cycles.
+        Instructions, lower and upper estimate of the cycles, of N periods.
     """
     listing = run_tool([cross_tool("objdump"), "-d", "--no-show-raw-insn", image.elf])
     at = {
@@ -149,8 +154,8 @@ def step_costs(image: Image, periods: Sequence[Sequence[tuple[int, int]]]) -> ND
     return np.array([np.sum([cost[block] for block in period], axis=0) for period in periods])
 
 
-def stack_bytes(image: Image) -> int:
-    """The deepest stack of any call into the controller, from the compiler's call graph."""
+def stack_bytes(image: FirmwareImage) -> int:
+    """Largest stack use of any call into the controller, bytes, from the compiler's call graph."""
     graph = image.core.with_suffix(".ci").read_text()
     own = {title: int(size) for title, size in re.findall(r'node: { title: "([^"]*)".*\\n(\d+) bytes \(', graph)}
     called = defaultdict(set)
@@ -163,36 +168,36 @@ def stack_bytes(image: Image) -> int:
     return max(deepest(function) for function in own)
 
 
-def foreign_symbols(image: Image) -> list[str]:
-    """What the controller calls and does not bring, beyond `LIBRARY`."""
-    undefined = run_tool([cross_tool("nm"), "-u", image.core]).split()
-    return sorted(set(undefined) - {"U"} - LIBRARY)
+def undefined_symbols(image: FirmwareImage) -> list[str]:
+    """Undefined symbols of the controller that are not in `LIBRARY`."""
+    listing = run_tool([cross_tool("nm"), "-u", image.core]).split()
+    return sorted(set(listing) - {"U"} - LIBRARY)
 
 
 def processor_in_the_loop(
     gains: Gains, rows: int = 10_000, emulator: str = "unicorn", flags: Sequence[str] = CXX_FLAGS
-) -> list[Figure]:
-    """Run the same rows on the Cortex-M4 and on the host, and measure what a step costs.
+) -> list[BudgetItem]:
+    """Run the same inputs on the Cortex-M4 and on the host; measure the cost of a step.
 
     Parameters
     ----------
     gains : Gains
-        What both fly with.
+        Gains of both controllers.
     rows : int
-        How many control periods, one after another.
+        Number of consecutive control periods.
     emulator : str
-        Whose outputs are compared: one of `EMULATORS`. The cost is always traced by unicorn.
+        Emulator whose outputs are compared, one of `EMULATORS`. The cost is always traced in unicorn.
     flags : sequence of str
-        Of the controller's compilation for the target.
+        Compiler flags of the controller on the target.
 
     Raises
     ------
     CodegenError
-        When a tool is missing or fails.
+        If a tool is missing or fails.
     """
     if emulator not in EMULATORS:
         raise CodegenError(f"emulator: got {emulator!r}, expected one of {', '.join(EMULATORS)}")
-    inputs = random_inputs(rows, np.random.default_rng(1))
+    inputs = random_inputs(rows, np.random.default_rng(SEED))
     with tempfile.TemporaryDirectory() as folder:
         image = build_image(gains, Path(folder), flags)
         expected = NativeController(load_native(gains), gains).run(inputs)
@@ -200,40 +205,41 @@ def processor_in_the_loop(
         if emulator == "qemu":
             outputs = run_in_qemu(image, inputs)
         return [
-            Figure("rows", "rows", rows),
-            Figure("rows_different", "rows that differ from the host's", different_rows(outputs, expected), 0),
-            *_time_figures(step_costs(image, periods)),
-            *_size_figures(image),
+            BudgetItem("rows", "rows", rows),
+            BudgetItem("rows_different", "rows that differ from the host", different_rows(outputs, expected), 0),
+            *_time_items(step_costs(image, periods)),
+            *_size_items(image),
         ]
 
 
 def different_rows(a: NDArray[Any], b: NDArray[Any]) -> int:
-    """How many rows of two arrays of structures differ in any bit."""
+    """Number of rows that differ in any bit between two structured arrays."""
     return int((a.view(np.uint8) != b.view(np.uint8)).reshape(len(a), -1).any(axis=1).sum())
 
 
-def _time_figures(costs: NDArray[np.int64]) -> list[Figure]:
+def _time_items(costs: NDArray[np.int64]) -> list[BudgetItem]:
     instructions, lower, upper = costs.T
     most = int(upper.max())
     return [
-        Figure("instructions_min", "instructions a step, fewest", int(instructions.min())),
-        Figure("instructions_mean", "instructions a step, mean", float(instructions.mean())),
-        Figure("instructions_max", "instructions a step, most", int(instructions.max()), 400),
-        Figure("cycles_lower", "cycles of the longest step, lower estimate", int(lower.max())),
-        Figure("cycles_upper", "cycles of the longest step, upper estimate", most),
-        Figure("microseconds_lower", "the same at 168 MHz, us, lower estimate", float(lower.max() / CLOCK * 1e6)),
-        Figure("microseconds_upper", "the same at 168 MHz, us, upper estimate", most / CLOCK * 1e6),
-        Figure("budget_share", "share of 4 ms, upper estimate", most / CLOCK / PERIOD, 0.0015),
+        BudgetItem("instructions_min", "instructions per step, minimum", int(instructions.min())),
+        BudgetItem("instructions_mean", "instructions per step, mean", float(instructions.mean())),
+        BudgetItem("instructions_max", "instructions per step, maximum", int(instructions.max()), MAX_INSTRUCTIONS),
+        BudgetItem("cycles_lower", "cycles of the longest step, lower estimate", int(lower.max())),
+        BudgetItem("cycles_upper", "cycles of the longest step, upper estimate", most),
+        BudgetItem("microseconds_lower", "the same at 168 MHz, us, lower estimate", float(lower.max() / CLOCK * 1e6)),
+        BudgetItem("microseconds_upper", "the same at 168 MHz, us, upper estimate", most / CLOCK * 1e6),
+        BudgetItem("budget_share", "share of 4 ms, upper estimate", most / CLOCK / PERIOD, MAX_SHARE),
     ]
 
 
-def _size_figures(image: Image) -> list[Figure]:
-    foreign = foreign_symbols(image)
+def _size_items(image: FirmwareImage) -> list[BudgetItem]:
+    undefined = undefined_symbols(image)
+    library_text = ": ".join(("library functions other than memcpy, memset, memmove", *undefined))
     text, data, bss = map(int, run_tool([cross_tool("size"), image.core]).splitlines()[1].split()[:3])
     return [
-        Figure("text_bytes", "code of the controller, bytes", text, 2048),
-        Figure("data_bytes", "initialised memory of the controller, bytes", data, 0),
-        Figure("bss_bytes", "other static memory of the controller, bytes", bss, 0),
-        Figure("stack_bytes", "stack of the controller, bytes", stack_bytes(image), 128),
-        Figure("foreign_symbols", ": ".join(("library functions beyond memcpy and memset", *foreign)), len(foreign), 0),
+        BudgetItem("text_bytes", "code of the controller, bytes", text, MAX_TEXT_BYTES),
+        BudgetItem("data_bytes", "initialised memory of the controller, bytes", data, 0),
+        BudgetItem("bss_bytes", "other static memory of the controller, bytes", bss, 0),
+        BudgetItem("stack_bytes", "stack of the controller, bytes", stack_bytes(image), MAX_STACK_BYTES),
+        BudgetItem("foreign_symbols", library_text, len(undefined), 0),
     ]

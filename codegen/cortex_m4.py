@@ -1,7 +1,7 @@
-"""The controller on an emulated Cortex-M4F: its image, and the two emulators that run it.
+"""The controller on an emulated Cortex-M4F: firmware image, unicorn and QEMU.
 
-`EmulatedController` (unicorn) takes the place of `codegen.native.NativeController`; `run_in_qemu` starts the
-emitted firmware as a board would, from reset.
+`EmulatedController` (unicorn) replaces `codegen.native.NativeController`. `run_in_qemu` boots the emitted firmware
+from reset, as a board does.
 """
 
 from __future__ import annotations
@@ -24,31 +24,33 @@ from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS, cr
 from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
+#: Memory map of the STM32F405 (RM0090): address and size, bytes, of the flash and of the part of the RAM that is used.
 FLASH, FLASH_SIZE = 0x0800_0000, 1 << 20
 RAM, RAM_SIZE = 0x2000_0000, 1 << 16
-#: Where the structures stand in the emulated RAM; the stack grows from its end towards them.
+#: Addresses of the structures in the emulated RAM. The stack grows down from its end.
 STATE_AT, INPUT_AT, OUTPUT_AT, GAINS_AT = RAM, RAM + 0x400, RAM + 0x600, RAM + 0x800
-#: A function returns to here, and the emulator stops.
+#: Return address of a call; the emulator stops there.
 RETURN = FLASH + FLASH_SIZE - 0x100
-#: vmsr fpscr, r0; bx lr: a write to FPSCR from outside is not applied.
+#: vmsr fpscr, r0; bx lr. Executed to set FPSCR: unicorn does not apply a register write to it.
 SET_FPSCR = bytes.fromhex("e1ee100a7047")
 
 FUNCTIONS = ("initialise", "set_gains", "step")
+#: Timeout of a run in QEMU, s; chosen.
 QEMU_SECONDS = 300
 
 
 @dataclass(frozen=True)
-class Image:
-    """Firmware that runs rows.
+class FirmwareImage:
+    """Firmware that runs the controller on rows of inputs.
 
     Attributes
     ----------
     elf : Path
         Linked image.
     core : Path
-        Object file of the controller alone; beside it lies its call graph (``.ci``).
+        Object file of the controller alone; its call graph (``.ci``) is in the same folder.
     flash : bytes
-        What stands in the flash memory.
+        Content of the flash memory.
     functions : dict
         Name in `FUNCTIONS` -> address.
     """
@@ -59,7 +61,7 @@ class Image:
     functions: dict[str, int]
 
 
-def build_image(gains: Gains, folder: Path, flags: Sequence[str] = CXX_FLAGS) -> Image:
+def build_image(gains: Gains, folder: Path, flags: Sequence[str] = CXX_FLAGS) -> FirmwareImage:
     """Emit the cortex-m4 target into `folder` and compile it.
 
     Parameters
@@ -67,14 +69,14 @@ def build_image(gains: Gains, folder: Path, flags: Sequence[str] = CXX_FLAGS) ->
     gains : Gains
         The gains that the firmware starts with.
     folder : Path
-        Empty, or one that was generated.
+        Empty, or generated before.
     flags : sequence of str
-        What the controller itself is compiled with, beside those of the processor.
+        Compiler flags of the controller itself, besides those of the processor.
 
     Raises
     ------
     CodegenError
-        When there is no cross compiler or it fails, or the folder is not ours to write.
+        If there is no cross compiler or it fails, or the folder holds files that were not generated.
     """
     compiler = cross_tool("g++")
     write_tree(render(gains, "cortex-m4"), folder)
@@ -90,26 +92,26 @@ def build_image(gains: Gains, folder: Path, flags: Sequence[str] = CXX_FLAGS) ->
     run_tool([cross_tool("objcopy"), "-O", "binary", elf, flash])
     symbols = run_tool([cross_tool("nm"), "-C", elf])
     found = re.findall(rf"^([0-9a-f]+) T mimopilot::({'|'.join(FUNCTIONS)})\(", symbols, re.MULTILINE)
-    return Image(elf, core, flash.read_bytes(), {name: int(address, 16) for address, name in found})
+    return FirmwareImage(elf, core, flash.read_bytes(), {name: int(address, 16) for address, name in found})
 
 
 class EmulatedController:
-    """One controller on a Cortex-M4F emulated by unicorn; called as a `NativeController` is.
+    """One controller on a Cortex-M4F emulated by unicorn, with the interface of `NativeController`.
 
     Parameters
     ----------
-    image : Image
+    image : FirmwareImage
         The firmware; its functions are called directly.
     gains : Gains
-        What it starts with.
+        The initial gains.
 
     Raises
     ------
     CodegenError
-        When unicorn is not installed, or the controller refuses its gains.
+        If unicorn is not installed, or the controller refuses its gains.
     """
 
-    def __init__(self, image: Image, gains: Gains) -> None:
+    def __init__(self, image: FirmwareImage, gains: Gains) -> None:
         try:
             import unicorn
             from unicorn import arm_const as arm
@@ -130,6 +132,7 @@ class EmulatedController:
         self._sp, self._lr = arm.UC_ARM_REG_SP, arm.UC_ARM_REG_LR
         self._block_hook = unicorn.UC_HOOK_BLOCK
         self._error: type[Exception] = unicorn.UcError
+        # Enable the FPU: full access to coprocessors 10 and 11, then the enable bit of FPEXC.
         self._uc.reg_write(arm.UC_ARM_REG_C1_C0_2, 0xF << 20)
         self._uc.reg_write(arm.UC_ARM_REG_FPEXC, 1 << 30)
         self._call(RETURN - len(SET_FPSCR), 0)
@@ -142,11 +145,13 @@ class EmulatedController:
         self._input, self._output, self._gains = view(INPUT_AT, INPUT), view(OUTPUT_AT, OUTPUT), view(GAINS_AT, GAINS)
         self._gains[0] = gains_array(gains)
         if not self._call(image.functions["initialise"], STATE_AT, GAINS_AT):
-            raise CodegenError("the controller refused its gains: every one must be finite and within its range")
-        self._foreign_step = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(self._step_at)
+            raise CodegenError(
+                "the controller refused its gains: each must be finite and within its range; correct the gains file"
+            )
+        self._host_step = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p)(self._step_at)
 
     def _call(self, function: int, *arguments: int) -> int:
-        """Call a function as the ARM procedure call standard has it; returns r0."""
+        """Call a function by the ARM procedure call standard (AAPCS); returns r0."""
         for register, value in zip(self._registers, arguments, strict=False):
             self._uc.reg_write(register, value)
         self._uc.reg_write(self._sp, RAM + RAM_SIZE)
@@ -161,7 +166,7 @@ class EmulatedController:
         self._call(self.image.functions["step"], STATE_AT, INPUT_AT, OUTPUT_AT)
 
     def _step_at(self, state: int, inputs: int, outputs: int) -> None:
-        # `state` is the emulated memory already. An error leaves NaN behind: a lost vehicle, never a stale moment.
+        # `state` is in the emulated memory already. After an error the output is NaN, never a stale torque.
         ctypes.memset(outputs, 0xFF, OUTPUT.itemsize)
         ctypes.memmove(self._input.ctypes.data, inputs, INPUT.itemsize)
         self._step()
@@ -169,27 +174,27 @@ class EmulatedController:
 
     @property
     def step_address(self) -> int:
-        """Address of a function like mimo_pid_step, for calls from compiled loops; `state` is this one's."""
-        return int(ctypes.cast(self._foreign_step, ctypes.c_void_p).value or 0)
+        """Address of a function like mimo_pid_step, for calls from compiled loops; uses this controller's state."""
+        return int(ctypes.cast(self._host_step, ctypes.c_void_p).value or 0)
 
     def set_gains(self, gains: Gains | NDArray[np.float32]) -> bool:
-        """Change the gains, bumpless. False: refused, the old ones stay.
+        """Change the gains, bumpless. False: refused, the old gains are kept.
 
         Parameters
         ----------
         gains : Gains or (36,) float32 array
-            The new set.
+            The new gains.
         """
         self._gains[0] = gains_array(gains)
         return bool(self._call(self.image.functions["set_gains"], STATE_AT, GAINS_AT))
 
     def run(self, inputs: NDArray[Any], after_each: Callable[[], None] = lambda: None) -> NDArray[Any]:
-        """Consecutive control periods.
+        """Run consecutive control periods.
 
         Parameters
         ----------
         inputs : (N,) array of `codegen.layout.INPUT`
-            One row a period.
+            One row per period.
         after_each : callable
             Called after each period.
 
@@ -207,35 +212,35 @@ class EmulatedController:
         return outputs
 
     def run_traced(self, inputs: NDArray[Any]) -> tuple[NDArray[Any], list[list[tuple[int, int]]]]:
-        """As `run`; also the basic blocks that each period executed, as (address, bytes)."""
+        """As `run`; also returns the basic blocks executed in each period, as (address, bytes)."""
         blocks: list[tuple[int, int]] = []
         periods: list[list[tuple[int, int]]] = []
 
-        def take() -> None:
+        def close_period() -> None:
             periods.append(blocks.copy())
             blocks.clear()
 
         hook = self._uc.hook_add(self._block_hook, lambda _uc, address, size, _data: blocks.append((address, size)))
-        outputs = self.run(inputs, take)
+        outputs = self.run(inputs, close_period)
         self._uc.hook_del(hook)
         return outputs, periods
 
 
 def load_emulated(gains: Gains) -> EmulatedController:
-    """`build_image` in a folder of its own, and the controller on it."""
+    """Build the image in a temporary folder, and return the controller on it."""
     with tempfile.TemporaryDirectory() as folder:
         return EmulatedController(build_image(gains, Path(folder)), gains)
 
 
-def run_in_qemu(image: Image, inputs: NDArray[Any]) -> NDArray[Any]:
-    """The same periods on a whole emulated board (QEMU's netduinoplus2, an STM32F405), from reset.
+def run_in_qemu(image: FirmwareImage, inputs: NDArray[Any]) -> NDArray[Any]:
+    """Run control periods on an emulated board (QEMU's netduinoplus2, an STM32F405), from reset.
 
     Parameters
     ----------
-    image : Image
-        The firmware; it starts with its own gains.
+    image : FirmwareImage
+        The firmware; it uses the gains that it was generated with.
     inputs : (N,) array of `codegen.layout.INPUT`
-        One row a period.
+        One row per period.
 
     Returns
     -------
@@ -244,7 +249,7 @@ def run_in_qemu(image: Image, inputs: NDArray[Any]) -> NDArray[Any]:
     Raises
     ------
     CodegenError
-        When QEMU is missing, or the firmware fails.
+        If QEMU is missing, or the firmware fails.
     """
     qemu = find_tool("qemu-system-arm", "qemu-system-arm")
     folder = image.elf.parent

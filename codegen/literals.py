@@ -1,4 +1,4 @@
-"""Numbers as C++ literals that every compiler reads back to the same bits."""
+"""C++ literals that every compiler reads back to the same bits."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ def float_literal(value: float) -> str:
     Raises
     ------
     CodegenError
-        When the value is not finite in single precision.
+        If the value is not finite in single precision.
 
     Examples
     --------

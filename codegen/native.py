@@ -1,4 +1,4 @@
-"""The generated controller, compiled for this machine and called through cffi (ABI mode)."""
+"""The generated controller, compiled for the host and called through cffi (ABI mode)."""
 
 from __future__ import annotations
 
@@ -44,20 +44,20 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
     Parameters
     ----------
     gains : Gains
-        The gains that become the library's defaults.
+        Default gains of the library.
     folder : Path, optional
-        Where the tree is written and compiled; by default only the library is kept, in the cache.
+        For the source tree and the library; by default only the library is kept, in the cache.
 
     Returns
     -------
     Path
-        The library; its name holds the hash of its sources and flags, so that a changed one is never
-        mistaken for one already loaded.
+        The library. Its name contains the hash of its sources and flags, so a changed library is never mistaken
+        for one already loaded.
 
     Raises
     ------
     CodegenError
-        When there is no compiler or it fails, or the folder is not ours to write.
+        If there is no compiler or it fails, or the folder holds files that were not generated.
     """
     files = render(gains, "native")
     compiler = find_compiler()
@@ -72,16 +72,16 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
     else:
         library = cache_folder() / name
     if not _whole(library):
-        with tempfile.TemporaryDirectory() as scratch:  # of its own: other processes may be building the same
+        with tempfile.TemporaryDirectory() as scratch:  # other processes may be building the same library
             tree = Path(scratch)
             write_tree(files, tree)
             compile_shared(compiler, [tree / source for source in SOURCES], tree / name)
-            write_atomically(library, seal((tree / name).read_bytes(), name))  # the loader ignores what is appended
+            write_atomically(library, seal((tree / name).read_bytes(), name))  # the loader ignores appended bytes
     return library
 
 
 def _whole(library: Path) -> bool:
-    """Whether a library is as it was written: a damaged one ends the process, or does anything else."""
+    """Whether a library is undamaged: loading a damaged one could crash the process."""
     try:
         found = unseal(library.read_bytes())
     except OSError:
@@ -90,7 +90,7 @@ def _whole(library: Path) -> bool:
 
 
 def _declarations() -> str:
-    """The functions of the C header, as cffi reads them."""
+    """Function declarations of the C header, for cffi."""
     text = re.sub(r"/\*.*?\*/", "", HEADER.read_text(), flags=re.DOTALL)
     return "\n".join(re.findall(r"^(?:uint32_t|int32_t|void) \w+\([^)]*\);", text, flags=re.MULTILINE))
 
@@ -124,7 +124,7 @@ class NativeLibrary:
             raise CodegenError(f"{path}: sizes and offsets are {layout}, expected {LAYOUT}; generate again")
 
     def default_gains(self) -> NDArray[np.float32]:
-        """The gains that the library was generated with, (len(PARAMETERS),) float32."""
+        """Default gains of the library, (len(PARAMETERS),) float32."""
         gains = np.zeros(GAINS.shape, np.float32)
         self.lib.mimo_pid_default_gains(self.ffi.from_buffer("float[]", gains))
         return gains
@@ -136,9 +136,9 @@ class NativeController:
     Parameters
     ----------
     library : NativeLibrary
-        The code.
+        The loaded library.
     gains : Gains or None
-        What it starts with; None takes the library's defaults.
+        The initial gains; None: the library's defaults.
     """
 
     def __init__(self, library: NativeLibrary, gains: Gains | None = None) -> None:
@@ -147,7 +147,9 @@ class NativeController:
         self._state = library.ffi.from_buffer("uint8_t[]", self.state)
         array = library.default_gains() if gains is None else to_array(gains)
         if not library.lib.mimo_pid_initialise(self._state, library.ffi.from_buffer("float[]", array)):
-            raise CodegenError("the controller refused its gains: every one must be finite and within its range")
+            raise CodegenError(
+                "the controller refused its gains: each must be finite and within its range; correct the gains file"
+            )
 
     @property
     def step_address(self) -> int:
@@ -156,23 +158,23 @@ class NativeController:
         return int(ffi.cast("uintptr_t", ffi.addressof(self.library.lib, "mimo_pid_step")))
 
     def set_gains(self, gains: Gains | NDArray[np.float32]) -> bool:
-        """Change the gains, bumpless. False: refused, the old ones stay.
+        """Change the gains, bumpless. False: refused, the old gains are kept.
 
         Parameters
         ----------
         gains : Gains or (len(PARAMETERS),) float32 array
-            The new set.
+            The new gains.
         """
         array = gains_array(gains)
         return bool(self.library.lib.mimo_pid_set_gains(self._state, self.library.ffi.from_buffer("float[]", array)))
 
     def run(self, inputs: NDArray[Any]) -> NDArray[Any]:
-        """Consecutive control periods.
+        """Run consecutive control periods.
 
         Parameters
         ----------
         inputs : (N,) array of `codegen.layout.INPUT`
-            One row a period.
+            One row per period.
 
         Returns
         -------
@@ -188,5 +190,5 @@ class NativeController:
 
 
 def load_native(gains: Gains, folder: Path | None = None) -> NativeLibrary:
-    """`build_native` and load the result."""
+    """Build the library with `build_native` and load it."""
     return NativeLibrary(build_native(gains, folder))

@@ -1,4 +1,4 @@
-"""Compilers: of the host, and for the Cortex-M4."""
+"""Compilers of the host and of the Cortex-M4: finding them, their flags, running them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mimopilot.codegen.errors import CodegenError
 
-#: Flags of every build; the Makefiles that are emitted use the same.
+#: Flags of every build, also in the emitted Makefiles. No contraction: the result must equal the reference bit for bit.
 CXX_FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fno-exceptions", "-fno-rtti")
 WARNINGS = (
     "-Wall",
@@ -23,7 +23,7 @@ WARNINGS = (
     "-Wshadow",
     "-Werror",
 )
-#: The Pixhawk Mini's processor: single-precision FPU, arguments in its registers.
+#: The Pixhawk Mini's processor: single-precision FPU, arguments in FPU registers.
 CORTEX_M4_FLAGS = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard")
 CROSS = "arm-none-eabi-"
 
@@ -34,7 +34,7 @@ def find_compiler() -> str:
     Raises
     ------
     CodegenError
-        When there is none, naming the package that installs it.
+        If there is none; names the package that installs it.
     """
     wanted = os.environ.get("CXX")
     for name in (wanted,) if wanted else ("g++", "clang++"):
@@ -46,12 +46,12 @@ def find_compiler() -> str:
 
 
 def find_tool(name: str, packages: str) -> str:
-    """Path of a program that Debian's `packages` bring.
+    """Path of a program that Debian's `packages` install.
 
     Raises
     ------
     CodegenError
-        When it is not on the PATH, naming the packages.
+        If it is not on the PATH; names the packages.
     """
     path = shutil.which(name)
     if path is None:
@@ -65,12 +65,12 @@ def cross_tool(name: str) -> str:
 
 
 def run_tool(command: Sequence[str | Path], folder: Path | None = None) -> str:
-    """What a compiler or one of its tools prints.
+    """Run a compiler or one of its tools; returns its standard output.
 
     Raises
     ------
     CodegenError
-        When it fails: its first lines and the command to repeat.
+        If it fails; shows its first error lines and the command to repeat.
     """
     words = [str(word) for word in command]
     result = subprocess.run(words, capture_output=True, text=True, check=False, cwd=folder)
@@ -81,12 +81,12 @@ def run_tool(command: Sequence[str | Path], folder: Path | None = None) -> str:
 
 
 def compile_shared(compiler: str, sources: Sequence[Path], output: Path) -> None:
-    """Build `sources` into the shared library `output`; nothing is left behind on failure.
+    """Compile `sources` into the shared library `output`; on failure no file is left.
 
     Raises
     ------
     CodegenError
-        When the compiler fails.
+        If the compiler fails.
     """
     temporary = output.with_name(f".{output.name}.{os.getpid()}")
     try:

@@ -1,4 +1,4 @@
-"""Test vectors: rows of random inputs and the bits that the independent Python reference returns for them."""
+"""Test vectors: random inputs, and the outputs of the independent Python reference, bit for bit."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
-ROWS = 256
+#: Control periods of the emitted test, and the seed of all test vectors; chosen.
+ROWS, SEED = 256, 1
 
 
 def random_inputs(rows: int, generator: np.random.Generator) -> NDArray[Any]:
-    """Inputs that reach every branch of the controller.
+    """Random inputs that reach every branch of the controller.
 
-    Ordinary flight, saturation, denormals, and values that are not finite or far out of range, alone and
-    in runs longer than the controller holds.
+    Normal flight, saturation, denormals, and values that are not finite or far out of range: single ones, and runs
+    longer than the 25 periods for which the controller holds an input.
 
     Parameters
     ----------
     rows : int
-        How many control periods.
+        Number of control periods.
     generator : numpy.random.Generator
         Source of all randomness.
 
@@ -30,6 +31,7 @@ def random_inputs(rows: int, generator: np.random.Generator) -> NDArray[Any]:
     -------
     (rows,) array of `codegen.layout.INPUT`
     """
+    # All magnitudes and probabilities are chosen to reach the branches often enough.
     inputs = np.zeros(rows, INPUT)
     scale = 10.0 ** generator.uniform(-3, 0.5, (rows, 1))
     for name, size in (("attitude_setpoint", 0.5), ("attitude", 0.5), ("rates", 3.0), ("excitation", 0.1)):
@@ -38,10 +40,10 @@ def random_inputs(rows: int, generator: np.random.Generator) -> NDArray[Any]:
     inputs["saturation"] = generator.choice([-1, 0, 0, 0, 1], (rows, 3))
     inputs["armed"] = generator.random(rows) > 0.02
     inputs["landed"] = generator.random(rows) < 0.05
-    wild = np.array([np.nan, np.inf, -np.inf, 1e38, -1e38, 1e-40, -1e-42, 0.0, -0.0, 100.0, 12.6], np.float32)
+    extreme = np.array([np.nan, np.inf, -np.inf, 1e38, -1e38, 1e-40, -1e-42, 0.0, -0.0, 100.0, 12.6], np.float32)
     for name in ("attitude_setpoint", "attitude", "rates", "excitation"):
         hit = generator.random((rows, 3)) < 0.01
-        inputs[name][hit] = generator.choice(wild, int(hit.sum()))
+        inputs[name][hit] = generator.choice(extreme, int(hit.sum()))
     for _ in range(max(1, rows // 500)):
         start = int(generator.integers(0, max(1, rows - 60)))
         name = ("attitude_setpoint", "attitude", "rates")[int(generator.integers(3))]
@@ -50,7 +52,7 @@ def random_inputs(rows: int, generator: np.random.Generator) -> NDArray[Any]:
 
 
 def reference_outputs(controller: Controller, inputs: NDArray[Any]) -> NDArray[Any]:
-    """What the Python reference makes of `inputs`, as rows of `codegen.layout.OUTPUT`."""
+    """Outputs of the Python reference, as rows of `codegen.layout.OUTPUT`."""
     outputs = np.zeros(len(inputs), OUTPUT)
     for row, output in zip(inputs, outputs, strict=True):
         step = controller.step(
@@ -68,8 +70,8 @@ def reference_outputs(controller: Controller, inputs: NDArray[Any]) -> NDArray[A
 
 
 def emitted_vectors(gains: Gains) -> dict[str, list[list[str]]]:
-    """Inputs and expected outputs as rows of 32-bit hexadecimal words, for the emitted test."""
-    inputs = random_inputs(ROWS, np.random.default_rng(1))
+    """Inputs and expected outputs for the emitted test, as rows of 32-bit hexadecimal words."""
+    inputs = random_inputs(ROWS, np.random.default_rng(SEED))
     outputs = reference_outputs(Controller(gains), inputs)
     return {"inputs": _words(inputs), "outputs": _words(outputs)}
 

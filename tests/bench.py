@@ -18,9 +18,9 @@ from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import doublet, excitation_flight
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.mavlink.ground_station.connection import Connection
-from mimopilot.sitl.mavlink.ground_station.events import drive, single
-from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, Conversation
-from mimopilot.sitl.mavlink.ground_station.upload import apply, read
+from mimopilot.sitl.mavlink.ground_station.events import run_exchange, single
+from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, ParameterClient
+from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
 from mimopilot.sitl.mavlink.simulator_api import lockstep
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import ARMED, SimulatedVehicle
@@ -52,11 +52,11 @@ def upload_seconds(round_trip: float) -> float:
     vehicle = ScriptedVehicle(dict.fromkeys(new, 0.0))
     with UdpVehicle(vehicle, delay=round_trip) as link:
         connection = Connection(link.url)
-        talk = Conversation(connection.now())
-        drive(talk.meet(), connection)
+        client = ParameterClient(connection.now())
+        run_exchange(client.await_heartbeat(), connection)
         begin = time.perf_counter()
-        held = drive(read(talk, list(new)), connection)
-        outcome = drive(apply(talk, new, held), connection)
+        held = run_exchange(read_values(client, list(new)), connection)
+        outcome = run_exchange(write_and_verify(client, new, held), connection)
         seconds = time.perf_counter() - begin
         connection.close()
     if (outcome.state, outcome.storage, vehicle.values) != ("verified", "acknowledged", new):

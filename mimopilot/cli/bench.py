@@ -156,14 +156,14 @@ def experiment(
             "its own log"
         )
     from mimopilot.sitl.flight.excitation_flight import AMPLITUDE
-    from mimopilot.sitl.mavlink.ground_station.experiment_console import Choice
+    from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions
     from mimopilot.sitl.mavlink.ground_station.experiment_console import experiment as fly_experiment
-    from mimopilot.sitl.mavlink.ground_station.session import Options
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
 
-    options = Options(connect or "", system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json)
+    options = LinkOptions(connect or "", system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json)
     tilt = 28.0 if tilt_deg is None else tilt_deg
     strength = AMPLITUDE if amplitude is None else amplitude
-    choice = Choice(axis or "both", seconds_per_axis, strength, bandwidth, seed, mode or "hold", tilt)
+    choice = ExcitationOptions(axis or "both", seconds_per_axis, strength, bandwidth, seed, mode or "hold", tilt)
     fly_experiment(options, choice)
 
 

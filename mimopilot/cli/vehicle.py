@@ -73,8 +73,8 @@ def upload(
     import sys
 
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
-    from mimopilot.sitl.mavlink.ground_station.session import Options
-    from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, transact
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+    from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, upload_and_verify
     from mimopilot.tuning.acceptance import check_verdict
     from mimopilot.tuning.gains_file import load_gains
 
@@ -85,10 +85,10 @@ def upload(
     plan = make_plan(loaded, profile, drop_off_diagonals)
     scale = parse_scale(moment_scale)
     stem = gains.name.removesuffix(".toml").removesuffix(".gains")
-    options = Options(
+    options = LinkOptions(
         connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, gains.with_name(stem)
     )
-    transact(plan, options, loaded, scale)
+    upload_and_verify(plan, options, loaded, scale)
 
 
 def restore(
@@ -107,17 +107,17 @@ def restore(
 
     A snapshot that is not whole, holds a part of our gains only, or a value out of its range, is refused.
     """
-    from mimopilot.sitl.mavlink.ground_station.profiles import restoration
-    from mimopilot.sitl.mavlink.ground_station.session import Options
-    from mimopilot.sitl.mavlink.ground_station.upload_console import transact
+    from mimopilot.sitl.mavlink.ground_station.profiles import make_restore_plan
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+    from mimopilot.sitl.mavlink.ground_station.upload_console import upload_and_verify
     from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 
-    plan = restoration(read_parameters(parameters), str(parameters))
+    plan = make_restore_plan(read_parameters(parameters), str(parameters))
     stem = parameters.with_name(
         re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
     )  # a snapshot's next one is its sister
-    options = Options(connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, stem)
-    transact(plan, options)
+    options = LinkOptions(connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, stem)
+    upload_and_verify(plan, options)
 
 
 def params(
@@ -138,9 +138,9 @@ def params(
     """Write gains, or what a vehicle holds, as a parameter file; compare the two when both are given."""
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.mavlink.ground_station.params_console import compare, export
-    from mimopilot.sitl.mavlink.ground_station.session import Options
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
 
-    options = Options(connect or "", system, timeout, signing_key, as_json=as_json)
+    options = LinkOptions(connect or "", system, timeout, signing_key, as_json=as_json)
     if gains is None or connect is None:
         if as_json:
             raise SitlError("--json: belongs to the comparison of a gains file with a vehicle")

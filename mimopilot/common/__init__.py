@@ -1,1 +1,1 @@
-"""What is not about flight: files, tables, processes, charts."""
+"""General helpers without flight knowledge: files, TOML, tables, processes, charts, intervals."""

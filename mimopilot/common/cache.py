@@ -1,4 +1,4 @@
-"""Where machine code is kept between runs: a folder that only its owner can write to."""
+"""The cache folder for machine code: only its owner can write to it."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """$XDG_CACHE_HOME/mimopilot, else mimopilot-UID in the temporary folder, else one that ends with this process.
+    """$XDG_CACHE_HOME/mimopilot, else mimopilot-UID in the temporary folder, else a folder deleted at exit.
 
-    Code is run from it: the first is taken that nobody else can write to.
+    Code is executed from it, so the first of them is used that nobody else can write to.
     """
     usual = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache")
     for folder in (usual / "mimopilot", Path(tempfile.gettempdir()) / f"mimopilot-{os.geteuid()}"):
-        if found := _own(folder):
+        if found := _private_folder(folder):
             return found
     return Path(_temporary().name)
 
@@ -26,11 +26,11 @@ def _temporary() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="mimopilot-")
 
 
-def _own(folder: Path) -> Path | None:
-    """The folder without links on its way, made when it is missing; None where others could change what is in it.
+def _private_folder(folder: Path) -> Path | None:
+    """The resolved folder, created if missing; None if other users could change its content.
 
-    That is so when it, or a folder above it, belongs to someone else than root, or is writable for others. Above it
-    the sticky bit is enough: there only owners can rename or remove.
+    They could if it, or a parent folder, is writable for others, or owned by a user other than this one and root. In
+    a parent folder the sticky bit is sufficient: only owners can rename or remove entries there.
     """
     try:
         folder = folder.expanduser()
@@ -42,6 +42,6 @@ def _own(folder: Path) -> Path | None:
             sticky = step != folder and status.st_mode & stat.S_ISVTX
             if status.st_uid not in (0, os.geteuid()) or (shared and not sticky):
                 return None
-    except (OSError, RuntimeError):  # RuntimeError: links that form a loop, or no home
+    except (OSError, RuntimeError):  # RuntimeError: a loop of links, or no home folder
         return None
     return folder if os.access(folder, os.R_OK | os.W_OK | os.X_OK) else None

@@ -1,4 +1,4 @@
-"""The decorator for functions that numba compiles, and where their machine code is kept."""
+"""Decorator for functions that numba compiles, and the cache of their machine code."""
 
 from __future__ import annotations
 
@@ -20,42 +20,42 @@ from mimopilot.common.files import seal, sha256, unseal, write_atomically
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """Compile a function at its first call, or take its machine code from the cache."""
+    """Compile a function at its first call, or load its machine code from the cache."""
     dispatcher = numba.njit(error_model="numpy")(function)
-    dispatcher._cache = _Cache(function)
+    dispatcher._cache = _CheckedCache(function)
     return dispatcher
 
 
 @lru_cache
 def _folder(package: Path) -> Path:
-    """One for each state of a package: numba does not notice that a *called* function changed."""
+    """Cache folder of a package's current sources: numba does not detect a change of a *called* function."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(package.glob("*.py")):
         digest.update(path.read_bytes())
     return cache_folder() / f"numba-{digest.hexdigest()[:16]}"
 
 
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """numba's cache of a function, on files that are checked before they are used.
+class _CheckedCache(FunctionCache):  # type: ignore[misc]
+    """numba's cache of a function, in files that are checked before use.
 
-    numba's own files are unpickled and run whatever stands in them: a damaged one ends in any exception or a signal.
+    numba unpickles and runs its own files unchecked: a damaged one ends in any exception, or a signal.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         config.CACHE_DIR = str(_folder(Path(function.__code__.co_filename).parent))
         super().__init__(function)
-        self._cache_file = _Files(Path(self._cache_path), self._impl.filename_base)
+        self._cache_file = _SealedFiles(Path(self._cache_path), self._impl.filename_base)
 
 
-class _Files:
-    """One sealed file for each signature of a function; what is missing or damaged is compiled again.
+class _SealedFiles:
+    """One sealed file for each signature of a function; if it is missing or damaged, it is compiled again.
 
     Parameters
     ----------
     folder : Path
-        Where they lie.
+        Of the files.
     name : str
-        Of the function, as it can stand in a file's name.
+        Of the function, in a form valid as a file name.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
@@ -65,7 +65,7 @@ class _Files:
         return self.folder / f"{self.name}-{sha256(repr(key))[:16]}.nbc"
 
     def load(self, key: Any) -> Any:
-        """What was saved under a key; None when there is nothing, or it is not whole."""
+        """Machine code saved under a key; None if missing or damaged."""
         path = self._path(key)
         try:
             found = unseal(path.read_bytes())
@@ -77,7 +77,7 @@ class _Files:
         return data if saved_key == key else None
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep machine code; without room for it the next run compiles again."""
+        """Save machine code. If that fails (disk full), the next run compiles again."""
         path = self._path(key)
         with suppress(OSError):
             write_atomically(path, seal(dumps((key, data)), path.name))

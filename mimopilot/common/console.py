@@ -1,4 +1,4 @@
-"""What every command prints: tables for people, one JSON object for programs."""
+"""Output of all commands: tables, one JSON object, progress bars."""
 
 from __future__ import annotations
 
@@ -7,14 +7,17 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+#: Columns of a table that is not printed on a terminal; chosen so that no table of ours is cut.
+WIDTH = 160
+
 
 def print_json(value: Mapping[str, Any]) -> None:
-    """One JSON object on standard output; a number that is not finite becomes null."""
+    """Print one JSON object on standard output; a number that is not finite becomes null."""
     print(json_text(value), end="")
 
 
 def json_text(value: Mapping[str, Any]) -> str:
-    """What `print_json` prints, for files."""
+    """The text that `print_json` prints."""
     return json.dumps(_finite(value), indent=2) + "\n"
 
 
@@ -29,7 +32,7 @@ def _finite(value: Any) -> Any:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """A table on standard output: first column to the left, the others to the right."""
+    """Print a table on standard output: first column left-aligned, the others right-aligned."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
@@ -40,11 +43,11 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
         table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
     for row in rows:
         table.add_row(*row)
-    Console(width=None if _is_terminal() else 160, highlight=False, markup=False).print(table)
+    Console(width=None if _is_terminal() else WIDTH, highlight=False, markup=False).print(table)
 
 
 def progress_console() -> Any:
-    """Where progress bars go: standard error, and only when it is a terminal."""
+    """Console for progress bars: standard error, silent unless it is a terminal."""
     import sys
 
     from rich.console import Console

@@ -1,15 +1,15 @@
-"""The exceptions that the command line reports as one message."""
+"""Exceptions that the command line reports as one message."""
 
 
 class Error(Exception):
-    """Base of every error that a user can correct or act on: the message says what, where and what to do next.
+    """Base of every error that a user can correct: the message says what, where and what to do next.
 
     Parameters
     ----------
     message : str
         What went wrong.
     exit_code : int
-        Of the command line: 2 for bad input or a missing tool, 1 when a tool, a flight or a link failed.
+        Of the command line: 2 for bad input or a missing tool, 1 if a tool, a run or a link failed.
     """
 
     def __init__(self, message: str, exit_code: int = 2) -> None:
@@ -18,4 +18,4 @@ class Error(Exception):
 
 
 class InputFileError(Error, ValueError):
-    """A file cannot be read, or does not hold what it should."""
+    """A file cannot be read, or its content is not as expected."""

@@ -1,4 +1,4 @@
-"""Files: read with a bound, written whole or not at all, never through a link that lies in an output folder."""
+"""Files: bounded reading, atomic writing, never through a link inside an output folder, and seals."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from pathlib import Path
 
 from mimopilot.common.errors import InputFileError
 
-#: Most bytes of a text file that a user gives. All parameters of a vehicle, the largest there is, are some 60 kB.
+#: Largest text file that a user may give, bytes. The largest expected one, a full parameter file, has some 60 kB.
 MAX_TEXT_BYTES = 1 << 20
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Content of a small file that a user names; a device, a pipe or a huge file is refused before it is read.
+    """Content of a small file that a user names. A device, a pipe or a large file is refused.
 
     Parameters
     ----------
     path : Path
         The file, or a link to it.
     what : str
-        What it should be, for the message: ``gains file``.
+        Its kind, for messages: ``gains file``.
 
     Raises
     ------
     InputFileError
-        When it is missing, no regular file, larger than `MAX_TEXT_BYTES`, or cannot be read.
+        If it is missing, not a regular file, larger than `MAX_TEXT_BYTES`, or cannot be read.
     """
     try:
-        # Without O_NONBLOCK the opening of a pipe waits until someone writes into it.
+        # Without O_NONBLOCK, opening a pipe waits for a writer.
         with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
             status = os.fstat(stream.fileno())
             if not stat.S_ISREG(status.st_mode):
@@ -55,7 +55,7 @@ def read_text(path: Path, what: str) -> str:
     Raises
     ------
     InputFileError
-        As `read_bytes`, and when it is not UTF-8.
+        As `read_bytes`, and if it is not UTF-8.
     """
     try:
         return read_bytes(path, what).decode("utf-8-sig")
@@ -66,7 +66,7 @@ def read_text(path: Path, what: str) -> str:
 
 
 def inside(folder: Path, name: str) -> Path:
-    """Path of a file in an output folder, on which no link lies: what is written there stays in the folder.
+    """Path of a file in an output folder, without a link on its way: what is written there stays in the folder.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def inside(folder: Path, name: str) -> Path:
     Raises
     ------
     OSError
-        When `folder` is something else than a folder, or `name` or a folder on its way is a link.
+        If `folder` exists and is not a folder, or `name` or a folder on its path is a link.
     """
     if os.path.lexists(folder) and not folder.is_dir():
         kind = "is a link that leads to no folder" if folder.is_symlink() else "is a file"
@@ -99,25 +99,24 @@ def _link(path: Path) -> OSError:
 
 
 def write_atomically(path: Path, content: str | bytes) -> bool:
-    """Put `content` at `path` in one step, and only when it differs from what is there.
+    """Write `content` to `path` in one step, only if it differs from the present content.
 
     Parameters
     ----------
     path : Path
         Destination; its folder is created. Text is written as UTF-8.
     content : str or bytes
-        The whole file.
+        Of the whole file.
 
     Returns
     -------
     bool
-        True when the file was written, False when it already held `content`.
+        True if the file was written, False if it already held `content`.
 
     Raises
     ------
     OSError
-        When the folder or file cannot be written, or a link, a device or a pipe is there; what was there is then
-        untouched.
+        If the folder or file cannot be written, or `path` is a link, a device or a pipe; it is then unchanged.
     """
     data = content.encode() if isinstance(content, str) else content
     if path.is_symlink():
@@ -131,7 +130,7 @@ def write_atomically(path: Path, content: str | bytes) -> bool:
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:  # of the file that was asked for, not of the one in between
+    except OSError as error:  # names the requested file, not the temporary one
         raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
     try:
         with os.fdopen(handle, "wb") as stream:
@@ -142,7 +141,7 @@ def write_atomically(path: Path, content: str | bytes) -> bool:
         os.umask(mask)
         Path(temporary).chmod(0o666 & ~mask)
         Path(temporary).replace(path)
-    except OSError as error:  # a full disk, say, which names no file
+    except OSError as error:  # for example a full disk; that error names no file
         Path(temporary).unlink(missing_ok=True)
         raise OSError(error.errno, f"cannot be written: {error.strerror}", str(path)) from error
     except BaseException:
@@ -152,13 +151,13 @@ def write_atomically(path: Path, content: str | bytes) -> bool:
 
 
 def seal(content: bytes, label: str) -> bytes:
-    """`content`, a line that says what it is, and the SHA-256 of both in hexadecimal; see `unseal`."""
+    """`content`, a line with its label, and the SHA-256 of both in hexadecimal; see `unseal`."""
     body = content + f"\n{label}\n".encode()
     return body + sha256(body).encode()
 
 
 def unseal(sealed: bytes) -> tuple[bytes, str] | None:
-    """Content and label that `seal` was given; None when a byte of them is another or is missing."""
+    """Content and label given to `seal`; None if any byte is changed or missing."""
     body, digest = sealed[:-64], sealed[-64:]
     parts = body.rsplit(b"\n", 2)
     if len(parts) < 3 or sha256(body).encode() != digest:

@@ -1,4 +1,4 @@
-"""Self-contained HTML reports: tables and inline SVG figures, nothing fetched, nothing of the clock."""
+"""Self-contained HTML reports: tables and inline SVG figures; no external resources, no date."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ TEMPLATE = Path(__file__).with_name("html_report.html.jinja")
 
 
 @dataclass(frozen=True)
-class Table:
-    """A caption, column heads and rows of text."""
+class ReportTable:
+    """Caption, column headings and rows of text."""
 
     caption: str
     columns: Sequence[str]
@@ -24,11 +24,11 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading, a paragraph, tables, and figures as SVG text."""
+    """Heading, paragraph, tables, and figures as SVG text."""
 
     heading: str
     text: str = ""
-    tables: Sequence[Table] = ()
+    tables: Sequence[ReportTable] = ()
     figures: Sequence[str] = ()
 
 
@@ -42,7 +42,7 @@ def write_report(path: Path, title: str, lead: str, sections: Sequence[Section])
     title, lead : str
         Heading and first paragraph.
     sections : sequence of Section
-        In order.
+        In their order on the page.
     """
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=True, trim_blocks=True)
     template = environment.from_string(TEMPLATE.read_text())

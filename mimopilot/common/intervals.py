@@ -1,4 +1,4 @@
-"""95 % intervals of what repeated flights show: a share of successes, a quantile."""
+"""95 % confidence intervals from repeated trials: of a success probability, of a quantile."""
 
 from __future__ import annotations
 
@@ -7,21 +7,22 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 from scipy.stats import binom
 
+#: Confidence level.
 LEVEL = 0.95
 
 
 def wilson(successes: int, trials: int) -> tuple[float, float]:
-    """Wilson's score interval of a probability.
+    """Wilson's score interval of a probability (Wilson 1927).
 
     Parameters
     ----------
     successes, trials : int
-        k of n.
+        k successes in n trials.
 
     Returns
     -------
     low, high : float
-        0 and 1 without a trial.
+        0 and 1 without trials.
 
     Examples
     --------
@@ -34,12 +35,12 @@ def wilson(successes: int, trials: int) -> tuple[float, float]:
     p, square = successes / trials, z * z / trials
     middle = (p + square / 2) / (1 + square)
     half = z / (1 + square) * float(np.sqrt(p * (1 - p) / trials + square / (4 * trials)))
-    # At the ends the bound is exact; rounding must not move it.
+    # At 0 or n successes the bound is exactly 0 or 1; rounding must not change it.
     return 0.0 if successes == 0 else middle - half, 1.0 if successes == trials else middle + half
 
 
 def quantile(ordered: NDArray[np.float64], p: float) -> tuple[float, float, float]:
-    """A quantile and its interval between order statistics: exact for any distribution.
+    """A quantile and its confidence interval between order statistics: exact for any distribution.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def quantile(ordered: NDArray[np.float64], p: float) -> tuple[float, float, floa
     Returns
     -------
     value, low, high : float
-        A sample each; an end that the sample is too small for is not a number, as everything of an empty one.
+        Each one of the samples. NaN: an end for which there are too few samples, and all three without samples.
     """
     n = len(ordered)
     if n == 0:

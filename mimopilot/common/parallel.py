@@ -1,4 +1,4 @@
-"""Many independent tasks on all cores of this machine, or on a cluster."""
+"""Independent tasks on all cores of this machine, or on a cluster."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ def cores() -> int:
 
 @contextmanager
 def processes(count: int) -> Iterator[Executor]:
-    """Worker processes that end with this one, however it ends, and leave Ctrl-C to it.
+    """Worker processes that end with this one, however it ends, and ignore Ctrl-C.
 
-    On Linux they are forked: what is loaded and compiled here is at hand there.
+    On Linux they are forked, so loaded modules and compiled code are shared.
 
     Parameters
     ----------
     count : int
-        How many.
+        Number of processes.
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
     with ProcessPoolExecutor(count, context, initializer=_follow_parent) as executor:
-        executor.submit(int).result()  # forks them now, before a progress bar has threads
+        executor.submit(int).result()  # fork now, before a progress bar starts threads
         yield executor
 
 
@@ -43,11 +43,11 @@ def _follow_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
 
-    def end_with_it() -> None:
+    def exit_after_parent() -> None:
         parent.join()
         os._exit(1)
 
-    threading.Thread(target=end_with_it, daemon=True).start()
+    threading.Thread(target=exit_after_parent, daemon=True).start()
 
 
 def run_all(
@@ -59,24 +59,25 @@ def run_all(
 ) -> None:
     """Call a function for each argument on an executor's workers, in any order.
 
-    At a `KeyboardInterrupt` no more are begun, and those under way are waited for and counted.
+    After a `KeyboardInterrupt` no call is started; running calls are completed and passed to `done`.
 
     Parameters
     ----------
     executor : Executor
-        Where.
+        Of the workers.
     ahead : int
-        How many are handed over at a time: memory is bounded by it.
+        Largest number of submitted calls; bounds the memory.
     function : callable
         Of one argument.
     arguments : iterable
+        One for each call.
     done : callable
-        Called here with each argument and its result.
+        Called in this process with each argument and its result.
 
     Raises
     ------
     Exception
-        What a call raised; BrokenProcessPool when a worker process was killed.
+        Raised by a call; BrokenProcessPool if a worker process was killed.
     """
     source = iter(arguments)
     waiting: dict[Future[Result], Argument] = {}

@@ -1,4 +1,4 @@
-"""TOML from and to users: read with bounds on its size and depth, written so that it reads back to the same."""
+"""TOML files of users: bounded reading, and writing that reads back to the same values."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pydantic import BaseModel, ValidationError
 from mimopilot.common.errors import InputFileError
 from mimopilot.common.files import read_text
 
-#: Tables and lists within each other. Our own files have at most 6; Python's parser fails at some hundreds.
+#: Largest nesting of tables and lists. Our own files have at most 6; Python's parser fails at some hundreds.
 MAX_DEPTH = 16
-#: Characters of a number or of a key without quotes. A double needs at most 24; `int` fails at 4300 digits.
-MAX_WORD = 128
-#: Characters of a value in a message: what is longer hides the message.
+#: Longest number or unquoted key, characters. A double needs at most 24; `int` fails at 4300 digits.
+MAX_TOKEN = 128
+#: Longest value in a message, characters; chosen so that the message stays readable.
 MAX_SHOWN = 80
 
-# All quantifiers are possessive: linear in the length, whatever the text. A string that does not end is the parser's.
+# All quantifiers are possessive: linear time for any text. An unterminated string is left to the parser.
 _STRING_OR_COMMENT = re.compile(
     r"""
       "{3} (?: [^"\\]++ | \\. | "{1,2}(?!") )*+ (?:"{3,5})?
@@ -34,7 +34,7 @@ _STRING_OR_COMMENT = re.compile(
     re.DOTALL | re.VERBOSE,
 )
 _SPACES = re.compile(r"[ \t]+")
-_WORD = re.compile(r"[^\s=,\[\]{}]+")
+_TOKEN = re.compile(r"[^\s=,\[\]{}]+")
 _BRACKET = re.compile(r"[\[\]{}]")
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
@@ -42,52 +42,52 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """The table of a TOML file that a user names.
+    """Read a TOML file that a user names.
 
     Parameters
     ----------
     path : Path
         The file.
     what : str
-        What it should be, for messages: ``gains file``.
+        Its kind, for messages: ``gains file``.
 
     Raises
     ------
     InputFileError
-        When it cannot be read, see `mimopilot.common.files.read_bytes`, or parsed, see `parse_toml`.
+        If it cannot be read, see `mimopilot.common.files.read_bytes`, or parsed, see `parse_toml`.
     """
     return parse_toml(read_text(path, what), str(path))
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
-    """The table that a TOML text holds.
+    """Parse a TOML text.
 
-    The text is looked through before it is parsed: the time of the parser grows with the square of a key's length,
-    and its depth of recursion with the nesting.
+    The text is checked before parsing: the parser's time grows with the square of a key's length, and its recursion
+    depth with the nesting.
 
     Parameters
     ----------
     text : str
-        Line ends of either kind.
+        With line ends of either kind.
     where : str
         Names the text in messages.
 
     Raises
     ------
     InputFileError
-        When it is not TOML, nests deeper than `MAX_DEPTH`, or holds a word longer than `MAX_WORD`.
+        If it is not TOML, is nested deeper than `MAX_DEPTH`, or holds a token longer than `MAX_TOKEN`.
     """
     bare = _SPACES.sub(" ", _STRING_OR_COMMENT.sub("s", text)).replace(" .", ".").replace(". ", ".")
     depth = deepest = 0
     for bracket in _BRACKET.findall(bare):
         depth += 1 if bracket in "[{" else -1
         deepest = max(deepest, depth)
-    for word in _WORD.findall(bare):
-        if len(word) > MAX_WORD and word.count(".") < MAX_DEPTH:
+    for token in _TOKEN.findall(bare):
+        if len(token) > MAX_TOKEN and token.count(".") < MAX_DEPTH:
             raise InputFileError(
-                f"{where}: {shown(word)}: a number or key of {len(word)} characters, expected at most {MAX_WORD}"
+                f"{where}: {shown(token)}: a number or key of {len(token)} characters, expected at most {MAX_TOKEN}"
             )
-        deepest = max(deepest, word.count(".") + 1)
+        deepest = max(deepest, token.count(".") + 1)
     if deepest > MAX_DEPTH:
         raise _too_deep(where)
     try:
@@ -104,19 +104,19 @@ def _too_deep(where: str) -> InputFileError:
 
 
 def _depth(value: Any) -> int:
-    """Levels of tables and lists; a list of tables is one with them, as ``[[name]]`` is."""
+    """Nesting of tables and lists; a list of tables counts as one level, as ``[[name]]`` does."""
     if isinstance(value, Mapping):
         return 1 + max(map(_depth, value.values()), default=0)
     return 1 + max(map(_depth, value), default=0) if isinstance(value, list) else 0
 
 
 def checked(model: type[Model], table: Mapping[str, Any], where: str) -> Model:
-    """A table as one of pydantic's models.
+    """Validate a table with a pydantic model.
 
     Raises
     ------
     InputFileError
-        In one line: the first entry that is unknown or impossible.
+        Names the first unknown or invalid entry, in one line.
     """
     try:
         return model.model_validate(table)
@@ -125,22 +125,22 @@ def checked(model: type[Model], table: Mapping[str, Any], where: str) -> Model:
 
 
 def complaint(error: ValidationError) -> str:
-    """The first thing that pydantic found wrong, in one line."""
+    """The first error that pydantic found, in one line."""
     first = error.errors()[0]
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
-    if first["type"] == "missing":  # what pydantic calls its input is the table around it
+    if first["type"] == "missing":  # its input is then the table, not a value
         return f"{shown_text(field)}: {message}"
     return f"{shown_text(field)}: {message}, got {shown(first.get('input'))}" if field else message
 
 
 def shown(value: Any) -> str:
-    """A value that a user gave, for a message: at most `MAX_SHOWN` characters of it, in one line."""
+    """A user's value for a message: at most `MAX_SHOWN` characters, in one line."""
     return shown_text(repr(value))
 
 
 def shown_text(text: str) -> str:
-    """Text for a message, as `shown` without quotes."""
+    """A user's text for a message: as `shown`, without quotes."""
     text = "".join(c if c.isprintable() else " " for c in text[: MAX_SHOWN + 1])
     return text if len(text) <= MAX_SHOWN else text[: MAX_SHOWN - 4] + " ..."
 
@@ -151,7 +151,7 @@ def toml_entries(table: Mapping[str, Any]) -> list[str]:
 
 
 def toml_key(key: str) -> str:
-    """A key, in quotes where TOML asks for them."""
+    """A key, in quotes if TOML requires them."""
     return key if _BARE_KEY.fullmatch(key) else toml_value(key)
 
 
@@ -174,6 +174,6 @@ def toml_value(value: Any) -> str:
 
 
 def _escape(character: str) -> str:
-    """A character that cannot be printed. Half of a surrogate pair is no character: a file's name may hold one."""
+    """Escape of an unprintable character. Half a surrogate pair, as in a file name, has none: U+FFFD."""
     code = ord(character)
     return "\ufffd" if 0xD800 <= code <= 0xDFFF else f"\\U{code:08x}"

@@ -20,7 +20,7 @@ from mimopilot.sitl.campaign.summary import (
 from mimopilot.sitl.flight.figures import svg
 
 from mimopilot.common.files import inside
-from mimopilot.common.html_report import Section, Table, write_report
+from mimopilot.common.html_report import ReportTable, Section, write_report
 
 INTERVALS = (
     "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "
@@ -49,9 +49,9 @@ def write_campaign_report(results: Results, summary: Summary, over: tuple[str, s
         f"{summary.rejected} draws of no vehicle that flies were drawn again."
     )
     tables = [
-        Table("Survived", SURVIVAL_COLUMNS, survival_rows(summary)),
-        Table("Figures", FIGURE_COLUMNS, figure_rows(summary)),
-        Table("Worst flights; the commands are for this folder", WORST_COLUMNS, worst_rows(summary, ".")),
+        ReportTable("Survived", SURVIVAL_COLUMNS, survival_rows(summary)),
+        ReportTable("Figures", FIGURE_COLUMNS, figure_rows(summary)),
+        ReportTable("Worst flights; the commands are for this folder", WORST_COLUMNS, worst_rows(summary, ".")),
     ]
     sample = figures.fly_sample(stand)
     envelopes = [
@@ -78,7 +78,9 @@ def write_campaign_report(results: Results, summary: Summary, over: tuple[str, s
         maps = [svg(figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
         sections.append(Section("Survival", "Over two of the quantities that vary.", figures=maps))
     sections.append(
-        Section("What was flown", "", tables=[Table(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])])
+        Section(
+            "What was flown", "", tables=[ReportTable(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])]
+        )
     )
     path = inside(results.path.parent, REPORT)
     write_report(path, f"mimopilot campaign: {plan.airframe.name}", lead, sections)

@@ -23,7 +23,7 @@ from mimopilot.sitl.studies.attitude_figures import (
 )
 from mimopilot.sitl.studies.attitude_runs import Statistics
 
-from mimopilot.common.html_report import Section, Table
+from mimopilot.common.html_report import ReportTable, Section
 
 IN_KIND = (
     "The thesis' figures of real flights can only be compared in kind: its vehicles' inertias, motors and winds are "
@@ -105,7 +105,7 @@ def _lead(study: Study, inner: str, outer: str) -> str:
     return text
 
 
-def gains_table(found: Statistics) -> Table:
+def gains_table(found: Statistics) -> ReportTable:
     """Medians and spread of every method, beside the thesis'."""
     number, printed = found.study.gains_table
     rows = []
@@ -120,10 +120,10 @@ def gains_table(found: Statistics) -> Table:
             rows.append([f"{matrix}  {method}", *cells])
             if method in printed:
                 rows.append([f"{matrix}  {method}, {number}", *(f"{v:.4f}" for v in np.ravel(printed[method][matrix]))])
-    return Table(f"{found.study.name}: gains, output <- error", SPREAD_COLUMNS, rows)
+    return ReportTable(f"{found.study.name}: gains, output <- error", SPREAD_COLUMNS, rows)
 
 
-def costs_table(found: Statistics) -> Table:
+def costs_table(found: Statistics) -> ReportTable:
     """Medians of every figure by method and axis, beside the thesis' real flights."""
     number, axis_printed, printed = found.study.costs_table
     rows = []
@@ -135,10 +135,10 @@ def costs_table(found: Statistics) -> Table:
                 flown = [_figure(name, printed[method][name]) if name in printed[method] else "" for name in COSTS]
                 rows.append([f"{axis}, {method}, {number} (real flight)", *flown])
     caption = f"{found.study.name}: medians of {len(found.runs)} seeds; J in rad^2 and rad^2/s^2, peak in deg"
-    return Table(caption, COST_COLUMNS, rows)
+    return ReportTable(caption, COST_COLUMNS, rows)
 
 
-def certificates_table(found: Statistics) -> Table:
+def certificates_table(found: Statistics) -> ReportTable:
     """What the certificate says of every method, from the log that this vehicle flew."""
     rows = []
     for method in found.study.methods():
@@ -146,7 +146,7 @@ def certificates_table(found: Statistics) -> Table:
         peaks = [run[method]["Ms"] for run in found.runs if run[method]["Ms"] is not None]
         lost = sum(np.isinf(found.values(method, axis, "effort_rms")).sum() for axis in AXES)
         rows.append([method, verdicts, f"{np.median(peaks):.2f}" if peaks else "", str(lost)])
-    return Table(
+    return ReportTable(
         f"{found.study.name}: certificates, median peak of the sensitivity, lost flights",
         CERTIFICATE_COLUMNS,
         rows,

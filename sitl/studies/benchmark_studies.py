@@ -22,7 +22,7 @@ from mimopilot.tuning.law import Filters
 from mimopilot.tuning.loop_controller import LoopController
 from mimopilot.tuning.plant.pbsid import pbsid
 
-from mimopilot.common.html_report import Section, Table
+from mimopilot.common.html_report import ReportTable, Section
 
 SAMPLES = 5000
 IFT_SAMPLES = 1000
@@ -128,7 +128,7 @@ def study_numerical_example() -> Part:
     diagonal = {term: np.diag([axis.gain(term).item() for axis in axes]) for term in "PI"}
     found = {"MIMO": mimo, "SISO": LoopController(diagonal, Filters(task.plant.Ts))}
     shown = _beside(found, _printed(task, "table_5_3"), "Table 5.3")
-    table = Table("Table 5.3: (B0 z + B1)/(z - 1), noise-free", CONTROLLER_COLUMNS, _rows(task, shown, {}))
+    table = ReportTable("Table 5.3: (B0 z + B1)/(z - 1), noise-free", CONTROLLER_COLUMNS, _rows(task, shown, {}))
     figure = svg(step_figure(task, found, 60, "Steps of the numerical example: MIMO and SISO VRFT"), "steps")
     lead = (
         "The 2x2 numerical example of the thesis, tuned without noise: one input after the other, white, in open loop."
@@ -177,8 +177,10 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
     rms = {d: [np.sqrt(np.mean(s**2, axis=0)).tolist() for s in one_experiment(task, d, 0)[1:]] for d in medians}
 
     tables = (
-        Table("Table 5.1: (B0 z + B1)/(z - 1) by each method", CONTROLLER_COLUMNS, _rows(task, shown, experiments)),
-        Table(
+        ReportTable(
+            "Table 5.1: (B0 z + B1)/(z - 1) by each method", CONTROLLER_COLUMNS, _rows(task, shown, experiments)
+        ),
+        ReportTable(
             f"J_MR from one experiment (N = {SAMPLES}, noise variance 0.0025, amplitude 1): median of {seeds} seeds",
             ("method", *(f"axes {design}" for design in medians)),
             [[m, *(f"{medians[d][m]:.4f}" for d in medians)] for m in medians["in turn"]]
@@ -188,7 +190,7 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
                 for i, name in enumerate(("u", "y"))
             ],
         ),
-        Table(f"Table 5.2: gains of {runs} experiments a length", SPREAD_COLUMNS, _spread_rows(task, gains)),
+        ReportTable(f"Table 5.2: gains of {runs} experiments a length", SPREAD_COLUMNS, _spread_rows(task, gains)),
     )
     main = {
         name: ours[name] for name in ("VRFT, instrument u_bar, W = I", "VRFT, refined on a PBSID model", "CbT", "IFT")

@@ -32,7 +32,7 @@ from mimopilot.tuning.spec import load_spec
 
 from mimopilot.common.console import print_table
 from mimopilot.common.files import inside
-from mimopilot.common.html_report import Section, Table, write_report
+from mimopilot.common.html_report import ReportTable, Section, write_report
 
 AIRFRAME = "adam0"
 METHODS = ("default", "siso", "mimo")
@@ -263,13 +263,13 @@ def _write_report(
             "standard deviation under repeated noise. Kp_o in 1/s, Kp_i in s, Ki_i dimensionless, Kd_i in s^2; a small "
             "negative Kd_i means that these models ask for no damping beyond the vehicle's own. SISO tunes each axis "
             "by itself with the same instruments.",
-            tables=[Table("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
+            tables=[ReportTable("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
         ),
         Section(
             "Doublets",
             f"{DOUBLET_DEG:g} degrees, {DOUBLET_S:g} s. J in rad^2 and rad^2/s^2, over the doublet. The flight over "
             "MAVLink (roll, MIMO) gave the same moments bit for bit.",
-            tables=[Table("Performance figures, (6.1)-(6.4)", FIGURE_COLUMNS, _figure_rows(figures))],
+            tables=[ReportTable("Performance figures, (6.1)-(6.4)", FIGURE_COLUMNS, _figure_rows(figures))],
             figures=doublets,
         ),
     ]

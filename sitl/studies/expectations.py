@@ -9,7 +9,7 @@ from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.studies.attitude import BEST, MIMO, REFINED, SISO
 from mimopilot.sitl.studies.attitude_runs import Statistics
 
-from mimopilot.common.html_report import Table
+from mimopilot.common.html_report import ReportTable
 
 #: J_M,o over that of the best on the true plant, effort over SISO's, and how equal "no worse" is.
 NEAR_BEST, EFFORT, NO_WORSE = 1.15, 1.10, 1.0
@@ -65,13 +65,13 @@ def expectations(found: Sequence[Statistics]) -> list[Expectation]:
     return rows
 
 
-def expectations_table(rows: Sequence[Expectation]) -> Table:
+def expectations_table(rows: Sequence[Expectation]) -> ReportTable:
     """Met or not, with the figure."""
 
     def cells(row: Expectation, method: str) -> list[str]:
         return [f"{row.ratios[method]:.3f}", "met" if row.met(method) else "NOT met"]
 
-    return Table(
+    return ReportTable(
         "Expectations: ratios of medians",
         COLUMNS,
         [

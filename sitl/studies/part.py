@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from mimopilot.common.html_report import Section, Table
+from mimopilot.common.html_report import ReportTable, Section
 
 
 @dataclass(frozen=True)
@@ -27,6 +27,6 @@ class Part:
     figures: dict[str, Any]
 
     @property
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[ReportTable]:
         """Of all sections, in order."""
         return [table for section in self.sections for table in section.tables]

@@ -16,7 +16,7 @@ from mimopilot.sitl.studies.part import Part
 
 from mimopilot.common.console import print_table
 from mimopilot.common.files import inside
-from mimopilot.common.html_report import Section, Table, write_report
+from mimopilot.common.html_report import ReportTable, Section, write_report
 
 #: Noise seeds of the attitude studies: what is expected is expected of their medians.
 SEEDS = 50
@@ -37,7 +37,7 @@ class Reproduction:
     """What was computed: the object that ``--json`` prints, the tables, and the report."""
 
     figures: dict[str, Any]
-    tables: tuple[Table, ...]
+    tables: tuple[ReportTable, ...]
     report: Path
 
     def as_json(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The controller on the emulated processor of the vehicle: the host's bits, within its budget."""
+"""The controller on the emulated Cortex-M4F: bit-identical to the host, and within its budget."""
 
 import json
 import re
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import unicorn
 from mimopilot.codegen import budget
-from mimopilot.codegen.budget import Figure, cycles, different_rows, processor_in_the_loop, stack_bytes, step_costs
+from mimopilot.codegen.budget import BudgetItem, cycles, different_rows, processor_in_the_loop, stack_bytes, step_costs
 from mimopilot.codegen.cortex_m4 import RAM, RAM_SIZE, EmulatedController, build_image, load_emulated, run_in_qemu
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import to_array
@@ -20,7 +20,7 @@ from mimopilot.tuning.gains_file import load_gains
 
 from tests.conftest import assert_one_clear_line
 
-#: What PX4 gives every file, as far as it concerns code, and -fno-fast-math, which the controller asks for.
+#: PX4's compiler flags that affect code, and -fno-fast-math, which the controller requires.
 PX4_FLAGS = (
     *("-std=gnu++14", "-Os", "-g", "-fdata-sections", "-ffunction-sections", "-fomit-frame-pointer"),
     *("-funsafe-math-optimizations", "-fno-strict-aliasing", "-fno-math-errno", "-fno-strength-reduce"),
@@ -56,14 +56,14 @@ def inputs():
 
 
 @pytest.mark.parametrize("flags", FLAGS)
-def test_ten_thousand_rows_are_the_hosts_in_every_bit_in_both_emulators(fixed, inputs, tmp_path, flags):
+def test_both_emulators_are_bit_identical_to_the_host_over_ten_thousand_periods(fixed, inputs, tmp_path, flags):
     image = build_image(fixed, tmp_path, FLAGS[flags])
     expected = NativeController(load_native(fixed), fixed).run(inputs)
     assert different_rows(EmulatedController(image, fixed).run(inputs), expected) == 0
     assert different_rows(run_in_qemu(image, inputs), expected) == 0
 
 
-def test_a_gain_that_is_wrong_by_its_last_bit_is_seen(fixed, image, inputs):
+def test_an_error_in_the_last_bit_of_a_gain_is_detected(fixed, image, inputs):
     array = to_array(fixed)
     array[4] = np.nextafter(array[4], np.float32(1))
     other = NativeController(load_native(fixed), fixed)
@@ -71,7 +71,7 @@ def test_a_gain_that_is_wrong_by_its_last_bit_is_seen(fixed, image, inputs):
     assert different_rows(EmulatedController(image, fixed).run(inputs), other.run(inputs)) > ROWS // 10
 
 
-def test_gain_changes_and_the_whole_state_agree_in_every_bit(fixed, image, inputs):
+def test_state_and_outputs_are_bit_identical_after_gain_changes(fixed, image, inputs):
     emulated, native = EmulatedController(image, fixed), NativeController(load_native(fixed), fixed)
     rng = np.random.default_rng(4)
     for block in np.split(inputs[:2000], 40):
@@ -83,7 +83,7 @@ def test_gain_changes_and_the_whole_state_agree_in_every_bit(fixed, image, input
         assert emulated.state.tobytes() == native.state.tobytes()
 
 
-def test_gains_and_rows_of_another_shape_are_refused_as_by_the_native_controller(fixed, image):
+def test_gains_and_inputs_of_a_wrong_type_are_refused_by_both_controllers(fixed, image):
     for controller in (EmulatedController(image, fixed), NativeController(load_native(fixed), fixed)):
         with pytest.raises(CodegenError, match="gains: got float64"):
             controller.set_gains(np.zeros(36))
@@ -91,13 +91,13 @@ def test_gains_and_rows_of_another_shape_are_refused_as_by_the_native_controller
             controller.run(np.zeros(3, np.float32))
 
 
-def test_a_controller_refused_at_the_start_is_an_error_on_the_target_too(fixed, image):
+def test_initial_gains_out_of_range_are_an_error_on_the_target(fixed, image):
     with pytest.raises(CodegenError, match="refused its gains"):
         EmulatedController(image, fixed.with_elements({"RP_RR": 1e7}))
 
 
 @pytest.mark.parametrize("name", ["adam0", "antr"])
-def test_the_controllers_of_the_airframes_keep_every_budget(name):
+def test_the_controllers_of_the_airframes_are_within_budget(name):
     figures = {f.name: f for f in processor_in_the_loop(load_gains(FOLDER / f"{name}.gains.toml"))}
     assert [f.name for f in figures.values() if not f.passed] == []
     assert figures["rows"].value == ROWS
@@ -117,13 +117,13 @@ def test_the_controllers_of_the_airframes_keep_every_budget(name):
     assert figures["budget_share"].value == pytest.approx(figures["cycles_upper"].value / 168e6 / 0.004)
 
 
-def test_an_unoptimised_controller_is_over_its_budget(fixed):
+def test_an_unoptimised_controller_exceeds_its_budget(fixed):
     figures = processor_in_the_loop(fixed, 200, flags=FLAGS["O0"])
     over = {f.name for f in figures if not f.passed}
     assert over == {"instructions_max", "budget_share", "text_bytes", "stack_bytes"}
 
 
-def test_the_traced_blocks_hold_every_instruction_that_the_emulator_executed(fixed, image, inputs):
+def test_the_traced_blocks_contain_every_executed_instruction(fixed, image, inputs):
     listing = subprocess.run(
         ["arm-none-eabi-objdump", "-d", "--no-show-raw-insn", image.elf], capture_output=True, text=True, check=True
     ).stdout
@@ -142,12 +142,12 @@ def test_the_traced_blocks_hold_every_instruction_that_the_emulator_executed(fix
     single._uc.hook_add(unicorn.UC_HOOK_CODE, lambda _uc, address, _size, _data: executed.append(address))
     each = []
 
-    def take():
+    def close_period():
         each.append(executed.copy())
         executed.clear()
 
-    single.run(rows, take)
-    # The single-step hook leaves out what a condition skips, which takes its time all the same.
+    single.run(rows, close_period)
+    # The single-step hook omits instructions skipped by a condition, although they take time.
     starts = {address for address, _ in code}
     blocks = [[a for at, n in period for a in range(at, at + n, 2) if a in starts] for period in periods]
     assert [len(addresses) for addresses in blocks] == list(counted)
@@ -155,7 +155,7 @@ def test_the_traced_blocks_hold_every_instruction_that_the_emulator_executed(fix
         assert [a for a in addresses if a not in conditional] == [a for a in traced if a not in conditional]
 
 
-def test_no_call_uses_more_stack_than_the_call_graph_says(fixed, image, inputs):
+def test_measured_stack_use_is_within_the_call_graphs_bound(fixed, image, inputs):
     controller = EmulatedController(image, fixed)
     stack = np.frombuffer(controller._memory, np.uint8)[0x1000:]
     stack[:] = 0xA5
@@ -186,11 +186,11 @@ def test_no_call_uses_more_stack_than_the_call_graph_says(fixed, image, inputs):
         ("vmrs APSR_nzcv, fpscr", 1, 2),
     ],
 )
-def test_each_class_of_instruction_has_its_cycles(instruction, lower, upper):
+def test_each_instruction_class_has_its_documented_cycles(instruction, lower, upper):
     assert cycles(instruction) == (lower, upper)
 
 
-def test_pil_prints_one_json_object_with_the_figures(mimopilot):
+def test_pil_prints_one_json_object_with_all_figures(mimopilot):
     for emulator in budget.EMULATORS:
         result = mimopilot("pil", FOLDER / "adam0.gains.toml", "--rows", 500, "--emulator", emulator, "--json")
         assert result.returncode == 0, result.stderr
@@ -205,10 +205,10 @@ def test_pil_prints_one_json_object_with_the_figures(mimopilot):
     assert "FAIL" not in page
 
 
-def test_a_figure_over_its_budget_fails_the_command(monkeypatch, capsys):
+def test_pil_fails_if_a_figure_exceeds_its_limit(monkeypatch, capsys):
     from mimopilot.cli.codegen import pil
 
-    figures = [Figure("rows_different", "rows that differ", 3, 0), Figure("text_bytes", "code", 2048, 2048)]
+    figures = [BudgetItem("rows_different", "rows that differ", 3, 0), BudgetItem("text_bytes", "code", 2048, 2048)]
     monkeypatch.setattr(budget, "processor_in_the_loop", lambda *_: figures)
     with pytest.raises(CodegenError, match="over its budget: rows_different") as error:
         pil(FOLDER / "adam0.gains.toml")
@@ -216,7 +216,7 @@ def test_a_figure_over_its_budget_fails_the_command(monkeypatch, capsys):
     assert "FAIL" in capsys.readouterr().out
 
 
-def test_what_is_missing_is_named_with_its_package(mimopilot, tmp_path, monkeypatch, fixed, image):
+def test_a_missing_tool_is_reported_with_its_package(mimopilot, tmp_path, monkeypatch, fixed, image):
     import os
 
     environment = {**os.environ, "PATH": "/nowhere"}
@@ -243,7 +243,7 @@ def test_an_unknown_emulator_or_processor_is_refused(mimopilot):
     assert_one_clear_line(mimopilot("fly", "adam0", "--on", "z80"), "'z80'", "cortex-m4")
 
 
-def test_a_wild_access_of_the_target_is_an_error_and_not_an_output(fixed):
+def test_an_invalid_memory_access_of_the_target_is_an_error(fixed):
     controller = load_emulated(fixed)
     controller.image.functions["step"] = 0x3000_0000  # no memory there
     with pytest.raises(CodegenError, match="the emulated controller stopped") as error:
@@ -251,7 +251,7 @@ def test_a_wild_access_of_the_target_is_an_error_and_not_an_output(fixed):
     assert error.value.exit_code == 1
 
 
-def test_the_image_can_be_linked_without_a_library_of_cpp(image):
+def test_the_image_needs_no_cpp_library_and_no_double_arithmetic(image):
     linked = subprocess.run(["arm-none-eabi-nm", "-C", image.elf], capture_output=True, text=True, check=True).stdout
     assert "std::" not in linked
     assert "__aeabi_d" not in linked

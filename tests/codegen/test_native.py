@@ -1,4 +1,4 @@
-"""The compiled C++ against the independent Python reference, bit for bit, and what each rule of it does."""
+"""The compiled C++ controller: bit-identical to the Python reference, and the behaviour of each of its rules."""
 
 import dataclasses
 import subprocess
@@ -26,7 +26,7 @@ def library():
     return load_native(gains.__wrapped__())
 
 
-def quiet(rows=1, **values):
+def zero_inputs(rows=1, **values):
     """Armed rows of zeros with the given fields."""
     inputs = np.zeros(rows, INPUT)
     inputs["armed"] = 1
@@ -48,7 +48,7 @@ def random_gains(base, rng):
     return base.with_elements(changes)
 
 
-def test_ten_thousand_random_rows_with_gain_changes_agree_in_every_bit(library, gains):
+def test_ten_thousand_random_periods_with_gain_changes_are_bit_identical(library, gains):
     rng = np.random.default_rng(20)
     inputs = random_inputs(10_000, rng)
     native, reference = NativeController(library, gains), Controller(gains)
@@ -63,7 +63,7 @@ def test_ten_thousand_random_rows_with_gain_changes_agree_in_every_bit(library, 
         assert native.set_gains(changed)
         reference.set_gains(changed)
     assert different == 0
-    # The rows reach what they are meant to reach.
+    # The random inputs reached saturation, faults and values that are not finite.
     assert saturated > 200
     assert faulty > 50
     assert sum(np.count_nonzero(~np.isfinite(inputs[name])) for name in ("rates", "attitude")) > 100
@@ -71,7 +71,7 @@ def test_ten_thousand_random_rows_with_gain_changes_agree_in_every_bit(library, 
 
 @given(seed=st.integers(0, 10_000))
 @settings(max_examples=25, deadline=None)
-def test_any_gains_and_any_inputs_agree_in_every_bit(library, seed):
+def test_any_gains_and_inputs_are_bit_identical(library, seed):
     from tests.conftest import gains
 
     rng = np.random.default_rng(seed)
@@ -83,7 +83,7 @@ def test_any_gains_and_any_inputs_agree_in_every_bit(library, seed):
 
 
 def test_denormal_inputs_are_not_flushed_to_zero(library, gains):
-    inputs = quiet(2, rates=[[1e-40, 0, 0]])
+    inputs = zero_inputs(2, rates=[[1e-40, 0, 0]])
     got = NativeController(library, gains).run(inputs)
     assert 0 < abs(got["moment"][0, 0]) < 1.2e-38
 
@@ -91,14 +91,14 @@ def test_denormal_inputs_are_not_flushed_to_zero(library, gains):
 @pytest.mark.parametrize("matrix", list(MATRICES))
 @pytest.mark.parametrize("i", [0, 1])
 @pytest.mark.parametrize("j", [0, 1])
-def test_each_gain_element_changes_exactly_its_output(library, gains, matrix, i, j):
-    # All matrices diagonal, inputs that drive axis j alone: only output i may answer to element (i, j).
+def test_each_gain_element_changes_only_its_own_output(library, gains, matrix, i, j):
+    # All matrices are diagonal and only axis j has inputs, so element (i, j) may affect only output i.
     base = dataclasses.replace(gains, **{name: np.diag(np.diag(getattr(gains, name))) for name in MATRICES})
     changed = getattr(base, matrix).copy()
     changed[i, j] += 0.0625
     other = dataclasses.replace(base, **{matrix: changed})
     rng = np.random.default_rng(3)
-    inputs = quiet(50)
+    inputs = zero_inputs(50)
     for name in ("attitude_setpoint", "attitude", "rates"):
         inputs[name][:, j] = 0.1 * rng.standard_normal(50)
     before, after = (NativeController(library, g).run(inputs)["moment"] for g in (base, other))
@@ -107,47 +107,47 @@ def test_each_gain_element_changes_exactly_its_output(library, gains, matrix, i,
 
 
 @pytest.mark.parametrize("name", list(MATRICES))
-def test_each_yaw_gain_changes_yaw_alone(library, gains, name):
+def test_each_yaw_gain_changes_only_yaw(library, gains, name):
     other = dataclasses.replace(gains, yaw=dataclasses.replace(gains.yaw, **{name: getattr(gains.yaw, name) + 0.0625}))
     rng = np.random.default_rng(3)
-    inputs = quiet(50)
+    inputs = zero_inputs(50)
     for field in ("attitude_setpoint", "attitude", "rates"):
         inputs[field] = 0.1 * rng.standard_normal((50, 3))
     before, after = (NativeController(library, g).run(inputs)["moment"] for g in (gains, other))
     assert list(np.flatnonzero((before != after).any(axis=0))) == [2]
 
 
-def test_positive_derivative_gain_damps(library, gains):
+def test_a_positive_derivative_gain_damps(library, gains):
     only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2) * 0.01}
     damping = dataclasses.replace(gains, **only)
-    inputs = quiet(20)
-    inputs["rates"][:, 0] = np.arange(20) * 0.01  # accelerating to the right
+    inputs = zero_inputs(20)
+    inputs["rates"][:, 0] = np.arange(20) * 0.01  # accelerating in roll
     assert (NativeController(library, damping).run(inputs)["moment"][1:, 0] < 0).all()
 
 
 def test_the_first_sample_has_no_derivative(library, gains):
     only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2)}
-    out = NativeController(library, dataclasses.replace(gains, **only)).run(quiet(1, rates=[[3.0, -2.0, 1.0]]))
+    out = NativeController(library, dataclasses.replace(gains, **only)).run(zero_inputs(1, rates=[[3.0, -2.0, 1.0]]))
     assert (out["moment"][0, :2] == 0).all()
 
 
 def test_gain_changes_are_bumpless_within_the_integrator_limit(library, gains):
-    inputs = quiet(40, attitude_setpoint=[[0.02, -0.01, 0.01]], rates=[[0.01, 0.02, -0.01]])
+    inputs = zero_inputs(40, attitude_setpoint=[[0.02, -0.01, 0.01]], rates=[[0.01, 0.02, -0.01]])
     controller = NativeController(library, gains)
     before = controller.run(inputs)["moment"][-1]
     assert controller.set_gains(
         gains.with_elements({"RP_RR": 0.2, "RP_RP": -0.05, "AP_RR": 4.0, "RI_PP": 0.4, "RP_YY": 0.3})
     )
     after = controller.run(inputs[:1])["moment"][0]
-    # One period of integration is all that may change.
+    # Only one period of integration may change the output.
     assert np.abs(after - before).max() < 2e-4
     jumped = NativeController(library, gains.with_elements({"RP_RR": 0.2, "AP_RR": 4.0})).run(inputs)["moment"][-1]
     assert np.abs(jumped - before).max() > 10 * np.abs(after - before).max()
 
 
-def test_an_axis_without_integral_gain_drops_its_integrator(library, gains):
+def test_an_axis_without_integral_gain_clears_its_integrator(library, gains):
     controller = NativeController(library, gains)
-    controller.run(quiet(100, attitude_setpoint=[[0.05, 0.05, 0.05]]))
+    controller.run(zero_inputs(100, attitude_setpoint=[[0.05, 0.05, 0.05]]))
     assert (controller.state["integral"][0] != 0).all()
     assert controller.set_gains(gains.with_elements({"RI_RR": 0.0, "RI_RP": 0.0}))
     assert controller.state["integral"][0, 0] == 0
@@ -155,9 +155,9 @@ def test_an_axis_without_integral_gain_drops_its_integrator(library, gains):
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e38, -1e7])
-def test_gains_that_no_vehicle_can_fly_are_refused_and_change_nothing(library, gains, bad):
+def test_gains_out_of_range_are_refused_without_effect(library, gains, bad):
     controller = NativeController(library, gains)
-    controller.run(quiet(10, attitude_setpoint=[[0.1, 0.1, 0.1]]))
+    controller.run(zero_inputs(10, attitude_setpoint=[[0.1, 0.1, 0.1]]))
     before = controller.state.tobytes()
     for index in range(len(to_array(gains))):
         array = to_array(gains)
@@ -166,7 +166,7 @@ def test_gains_that_no_vehicle_can_fly_are_refused_and_change_nothing(library, g
     assert controller.state.tobytes() == before
 
 
-def test_refused_gains_at_the_start_are_an_error(library, gains):
+def test_initialise_refuses_gains_that_are_not_finite(library, gains):
     array = to_array(gains)
     assert (
         library.lib.mimo_pid_initialise(library.ffi.new("uint8_t[1024]"), library.ffi.from_buffer("float[]", array))
@@ -179,39 +179,39 @@ def test_refused_gains_at_the_start_are_an_error(library, gains):
     )
 
 
-def test_saturation_stops_the_integrator_in_that_direction_only(library, gains):
+def test_saturation_stops_the_integrator_only_in_its_direction(library, gains):
     only_integral = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kp_o": np.eye(2), "Ki_i": np.eye(2)}
     g = dataclasses.replace(gains, **only_integral, limits=Limits((9, 9, 9), (1, 1, 1), (0.5, 0.5, 0.5)))
-    push = quiet(1, attitude_setpoint=[[1.0, 0, 0]])
+    setpoint = zero_inputs(1, attitude_setpoint=[[1.0, 0, 0]])
     for sign, moves in ((1, False), (-1, True), (0, True)):
         controller = NativeController(library, g)
-        push["saturation"][0, 0] = sign
-        controller.run(push)
+        setpoint["saturation"][0, 0] = sign
+        controller.run(setpoint)
         assert (controller.state["integral"][0, 0] > 0) == moves
 
 
 def test_the_integrator_does_not_wind_up_while_the_excitation_saturates(library, gains):
     g = gains.with_elements({"UMAX_R": 0.2})
     controller = NativeController(library, g)
-    controller.run(quiet(200, attitude_setpoint=[[0.01, 0, 0]], excitation=[[0.5, 0, 0]]))
+    controller.run(zero_inputs(200, attitude_setpoint=[[0.01, 0, 0]], excitation=[[0.5, 0, 0]]))
     assert controller.state["integral"][0, 0] == 0
 
 
-def test_disarmed_clears_and_landed_holds_the_integrator(library, gains):
+def test_disarming_clears_the_integrator_and_landing_holds_it(library, gains):
     controller = NativeController(library, gains)
-    controller.run(quiet(50, attitude_setpoint=[[0.05, 0.02, 0.01]]))
+    controller.run(zero_inputs(50, attitude_setpoint=[[0.05, 0.02, 0.01]]))
     held = controller.state["integral"].copy()
-    controller.run(quiet(50, attitude_setpoint=[[0.05, 0.02, 0.01]], landed=1))
+    controller.run(zero_inputs(50, attitude_setpoint=[[0.05, 0.02, 0.01]], landed=1))
     assert (controller.state["integral"] == held).all()
-    controller.run(quiet(1, attitude_setpoint=[[0.05, 0.02, 0.01]], armed=0))
+    controller.run(zero_inputs(1, attitude_setpoint=[[0.05, 0.02, 0.01]], armed=0))
     assert (controller.state["integral"] == 0).all()
 
 
 @pytest.mark.parametrize("field", ["attitude_setpoint", "attitude", "rates"])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e38, -101.0])
-def test_an_invalid_input_is_held_for_25_samples_and_then_the_rates_are_damped(library, gains, field, bad):
+def test_after_25_invalid_samples_the_controller_only_damps_the_rates(library, gains, field, bad):
     controller = NativeController(library, gains)
-    normal = quiet(20, attitude_setpoint=[[0.05, 0.02, 0.0]], attitude=[[0.01, 0, 0]], rates=[[0.3, -0.2, 0.1]])
+    normal = zero_inputs(20, attitude_setpoint=[[0.05, 0.02, 0.0]], attitude=[[0.01, 0, 0]], rates=[[0.3, -0.2, 0.1]])
     controller.run(normal)
     broken = normal[:1].repeat(HOLD + 1)
     broken[field][:, 0] = bad
@@ -236,35 +236,35 @@ def test_an_invalid_input_is_held_for_25_samples_and_then_the_rates_are_damped(l
     assert np.isfinite(recovered["moment"]).all()
 
 
-def test_a_recovered_rate_makes_no_derivative_kick(library, gains):
+def test_a_recovered_rate_causes_no_derivative_kick(library, gains):
     only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2) * 0.1}
     controller = NativeController(library, dataclasses.replace(gains, **only))
-    controller.run(quiet(5))
-    lost = quiet(40, rates=[[np.nan, 0, 0]])
+    controller.run(zero_inputs(5))
+    lost = zero_inputs(40, rates=[[np.nan, 0, 0]])
     controller.run(lost)
-    assert controller.run(quiet(1, rates=[[2.0, 0, 0]]))["moment"][0, 0] == 0
+    assert controller.run(zero_inputs(1, rates=[[2.0, 0, 0]]))["moment"][0, 0] == 0
 
 
 def test_an_excitation_that_is_not_finite_is_not_injected(library, gains):
     controller, clean = NativeController(library, gains), NativeController(library, gains)
-    wild = controller.run(quiet(3, excitation=[[np.nan, np.inf, 7.0]]))
-    assert (wild["moment"] == clean.run(quiet(3))["moment"]).all()
-    # NaN means that nothing is injected; infinity and 7 are faults.
-    assert wild["fault_count"][-1] == 6
+    extreme = controller.run(zero_inputs(3, excitation=[[np.nan, np.inf, 7.0]]))
+    assert (extreme["moment"] == clean.run(zero_inputs(3))["moment"]).all()
+    # NaN means no excitation; infinity and 7 are faults.
+    assert extreme["fault_count"][-1] == 6
 
 
-def test_yaw_takes_the_shortest_way_round(library, gains):
-    out = NativeController(library, gains).run(quiet(1, attitude_setpoint=[[0, 0, 3.1]], attitude=[[0, 0, -3.1]]))
-    # From -3.1 to 3.1 rad the short way is -0.083 rad.
+def test_yaw_turns_the_shorter_way(library, gains):
+    out = NativeController(library, gains).run(zero_inputs(1, attitude_setpoint=[[0, 0, 3.1]], attitude=[[0, 0, -3.1]]))
+    # From -3.1 to 3.1 rad the shorter way is -0.083 rad.
     assert out["rates_setpoint"][0, 2] == pytest.approx(1.5 * (6.2 - 2 * np.pi), rel=1e-4)
 
 
 def test_the_rate_setpoint_is_limited(library, gains):
-    out = NativeController(library, gains).run(quiet(1, attitude_setpoint=[[3.0, -3.0, 3.0]]))
+    out = NativeController(library, gains).run(zero_inputs(1, attitude_setpoint=[[3.0, -3.0, 3.0]]))
     assert list(out["rates_setpoint"][0]) == [5.0, -4.0, 3.0]
 
 
-def test_a_library_of_another_interface_is_refused(gains, tmp_path):
+def test_a_library_with_another_interface_is_refused(gains, tmp_path):
     path = build_native(gains, tmp_path / "a")
     source = tmp_path / "a" / "native" / "mimo_pid_native.cpp"
     text = source.read_text()
@@ -278,7 +278,7 @@ def test_a_library_of_another_interface_is_refused(gains, tmp_path):
         NativeLibrary(other)
 
 
-def test_the_library_carries_the_gains_it_was_generated_with(gains, library):
+def test_the_library_contains_the_gains_it_was_generated_with(gains, library):
     assert (library.default_gains() == to_array(gains)).all()
 
 
@@ -291,7 +291,7 @@ def test_a_damaged_library_is_built_again(gains, tmp_path, monkeypatch, cached):
     assert NativeLibrary(path).default_gains().tolist() == to_array(gains).tolist()
     middle = len(whole) // 2
     for damaged in (whole[:middle], bytes(len(whole)), whole[:middle] + b"\xff" + whole[middle + 1 :]):
-        path.unlink()  # the loaded one is not to be changed under the process
+        path.unlink()  # the file of the loaded library must not change
         path.write_bytes(damaged)
         assert build_native(gains, folder) == path
         assert path.read_bytes() == whole
@@ -300,7 +300,7 @@ def test_a_damaged_library_is_built_again(gains, tmp_path, monkeypatch, cached):
     assert path.stat().st_mtime_ns == before
 
 
-def test_the_library_of_other_gains_is_not_taken_for_the_own(gains, tmp_path, monkeypatch):
+def test_a_library_of_other_gains_in_its_place_is_built_again(gains, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     other = gains.with_elements({"RP_RR": 0.25})
     mine, foreign = build_native(gains), build_native(other)

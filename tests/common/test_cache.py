@@ -1,4 +1,4 @@
-"""The cache: nobody else's code is run from it, and a damaged file is compiled again."""
+"""The cache of machine code: no code of other users is run, and a damaged file is compiled again."""
 
 import importlib.util
 import os
@@ -23,7 +23,7 @@ def triple(x):
 
 @pytest.fixture
 def places(tmp_path, monkeypatch):
-    """Folders for the cache and for temporary files, and what the environment says of them."""
+    """Folders for the cache and for temporary files, set in the environment."""
     usual, temporary = tmp_path / "usual", tmp_path / "temporary"
     usual.mkdir(mode=0o755)
     temporary.mkdir(mode=0o755)
@@ -34,22 +34,22 @@ def places(tmp_path, monkeypatch):
     _temporary.cache_clear()
 
 
-def give_away(folder, monkeypatch):
-    """Another owner; who is not root becomes someone else instead."""
+def change_owner(folder, monkeypatch):
+    """Change the owner; without root rights, change our own user instead."""
     if os.geteuid() == 0:
         os.chown(folder, 12345, -1)
     else:
         monkeypatch.setattr("mimopilot.common.cache.os.geteuid", lambda: os.getuid() + 1)
 
 
-def test_the_usual_folder_is_made_for_its_owner_alone(places):
+def test_the_usual_folder_is_created_private_to_its_owner(places):
     usual, _ = places
     assert cache_folder() == usual / "mimopilot"
     assert (usual / "mimopilot").stat().st_mode & 0o777 == 0o700
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o775, 0o702, 0o1777])
-def test_a_folder_that_others_can_write_to_is_left_alone(places, mode):
+def test_a_folder_that_others_can_write_to_is_not_used(places, mode):
     usual, temporary = places
     (usual / "mimopilot").mkdir()
     (usual / "mimopilot").chmod(mode)
@@ -64,22 +64,22 @@ def test_a_folder_that_others_can_write_to_is_left_alone(places, mode):
     assert not list((usual / "mimopilot").iterdir()) + list(fallback.iterdir())
 
 
-def test_above_the_folder_the_sticky_bit_is_enough_and_without_it_nothing_is(places):
+def test_a_shared_parent_folder_needs_the_sticky_bit(places):
     usual, temporary = places
     usual.chmod(0o1777)
     assert cache_folder() == usual / "mimopilot"
-    usual.chmod(0o777)  # anyone may put another folder into its place
+    usual.chmod(0o777)  # anybody may replace the folder
     assert cache_folder().parent == temporary
 
 
-def test_a_folder_of_another_owner_is_left_alone(places, monkeypatch):
+def test_a_folder_of_another_owner_is_not_used(places, monkeypatch):
     usual, _ = places
     (usual / "mimopilot").mkdir(mode=0o700)
-    give_away(usual / "mimopilot", monkeypatch)
+    change_owner(usual / "mimopilot", monkeypatch)
     assert cache_folder() != usual / "mimopilot"
 
 
-def test_a_link_counts_as_the_folder_that_it_leads_to(places, tmp_path):
+def test_a_link_is_judged_by_the_folder_that_it_leads_to(places, tmp_path):
     usual, temporary = places
     (tmp_path / "own").mkdir(mode=0o700)
     (usual / "mimopilot").symlink_to(tmp_path / "own")
@@ -92,7 +92,7 @@ def test_a_link_counts_as_the_folder_that_it_leads_to(places, tmp_path):
         assert cache_folder().parent == temporary
 
 
-def test_without_a_home_there_is_a_folder_all_the_same(places, monkeypatch):
+def test_without_a_home_folder_the_temporary_folder_is_used(places, monkeypatch):
     def no_home(_):
         raise RuntimeError("Could not determine home directory.")
 
@@ -139,7 +139,7 @@ def test_machine_code_that_is_damaged_or_of_another_function_is_compiled_again(p
     assert triple.read_bytes() == kept
 
 
-def test_without_room_for_machine_code_functions_are_compiled_all_the_same(places, tmp_path, monkeypatch):
+def test_functions_are_compiled_if_the_disk_is_full(places, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -148,8 +148,10 @@ def test_without_room_for_machine_code_functions_are_compiled_all_the_same(place
     assert load(tmp_path / "functions.py").double(21.0) == 42.0
 
 
-def test_machine_code_for_other_types_is_not_taken_even_from_the_same_file(places, tmp_path, monkeypatch):
-    monkeypatch.setattr("mimopilot.common.compiled._Files._path", lambda self, key: self.folder / f"{self.name}.nbc")
+def test_machine_code_for_other_types_is_not_loaded_from_the_same_file(places, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "mimopilot.common.compiled._SealedFiles._path", lambda self, key: self.folder / f"{self.name}.nbc"
+    )
     (tmp_path / "functions.py").write_text(MODULE)
     assert load(tmp_path / "functions.py").double(21.5) == 43.0
     other = load(tmp_path / "functions.py").double

@@ -1,4 +1,4 @@
-"""Files: what is read has an end, what is written is whole and stays where it belongs."""
+"""Files: reading is bounded, writing is atomic and stays inside the output folder."""
 
 import os
 import socket
@@ -42,7 +42,7 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path, monkeypatch):
         read_bytes(tmp_path / "full", "gains file")
 
 
-def test_neither_a_link_nor_a_device_is_replaced_or_written_through(tmp_path):
+def test_links_pipes_and_devices_are_neither_replaced_nor_written_through(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "own").write_text("old")
     for name, target in (("null", "/dev/null"), ("link", "own"), ("loop", "loop"), ("dangling", "nothing")):
@@ -58,7 +58,7 @@ def test_neither_a_link_nor_a_device_is_replaced_or_written_through(tmp_path):
     assert (tmp_path / "own").read_text() == "old"
 
 
-def test_a_link_below_an_output_folder_is_refused_and_the_folder_itself_may_be_one(tmp_path):
+def test_a_link_inside_an_output_folder_is_refused_but_the_folder_may_be_a_link(tmp_path):
     out = tmp_path / "out"
     (tmp_path / "real" / "sub").mkdir(parents=True)
     out.symlink_to("real")
@@ -78,7 +78,7 @@ def test_a_link_below_an_output_folder_is_refused_and_the_folder_itself_may_be_o
         inside(tmp_path / "file", "x")
 
 
-def test_a_seal_is_broken_by_every_byte_that_changes_or_is_missing():
+def test_a_changed_or_missing_byte_breaks_the_seal():
     sealed = seal(b"con\ntent\n", "label")
     assert unseal(sealed) == (b"con\ntent\n", "label")
     assert unseal(seal(b"", "")) == (b"", "")

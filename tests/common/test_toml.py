@@ -1,4 +1,4 @@
-"""TOML of users: one line for whatever it holds, and what is written reads back to the same."""
+"""TOML files of users: an error is one line, and written values read back unchanged."""
 
 import dataclasses
 import datetime
@@ -12,22 +12,22 @@ from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml
 from mimopilot.tuning.provenance import Provenance
 
 from mimopilot.common.errors import InputFileError
-from mimopilot.common.toml import MAX_DEPTH, MAX_SHOWN, MAX_WORD, parse_toml, read_toml, shown, toml_entries
+from mimopilot.common.toml import MAX_DEPTH, MAX_SHOWN, MAX_TOKEN, parse_toml, read_toml, shown, toml_entries
 from tests.conftest import assert_one_clear_line
 
-MONSTERS = {
+REFUSED_TEXTS = {
     "decimal digits": ("a = " + "9" * 5000, "a number or key of 5000 characters"),
     "hexadecimal digits": ("a = 0x" + "f" * 5000, "a number or key of 5002 characters"),
     "a long key": ("k" * 5000 + " = 1", "a number or key of 5000 characters"),
-    "dotted": (".".join("a" * 5000) + " = 1", f"nest deeper than {MAX_DEPTH}"),
-    "dotted with spaces": (" \t. ".join("a" * 5000) + " = 1", f"nest deeper than {MAX_DEPTH}"),
-    "dotted and quoted": (".".join(['"x.y"', "'z'"] * 2500) + " = 1", f"nest deeper than {MAX_DEPTH}"),
-    "a dotted header": ("[" + ".".join("a" * 5000) + "]", f"nest deeper than {MAX_DEPTH}"),
-    "nested lists": ("a = " + "[" * 5000 + "]" * 5000, f"nest deeper than {MAX_DEPTH}"),
-    "nested tables": ("a = " + "{b = " * 5000 + "1" + "}" * 5000, f"nest deeper than {MAX_DEPTH}"),
-    "many dots and brackets": ("a = " + "{b.c.d = " * 10 + "1" + "}" * 10, f"nest deeper than {MAX_DEPTH}"),
-    "behind four quotes": ('a = {b = """x"""", ' + ".".join("c" * 5000) + ' = "d"}', f"nest deeper than {MAX_DEPTH}"),
-    "an escaped quote": ('"\\"" = 1\n' + ".".join("c" * 5000) + " = 1", f"nest deeper than {MAX_DEPTH}"),
+    "dotted": (".".join("a" * 5000) + " = 1", f"nested deeper than {MAX_DEPTH}"),
+    "dotted with spaces": (" \t. ".join("a" * 5000) + " = 1", f"nested deeper than {MAX_DEPTH}"),
+    "dotted and quoted": (".".join(['"x.y"', "'z'"] * 2500) + " = 1", f"nested deeper than {MAX_DEPTH}"),
+    "a dotted header": ("[" + ".".join("a" * 5000) + "]", f"nested deeper than {MAX_DEPTH}"),
+    "nested lists": ("a = " + "[" * 5000 + "]" * 5000, f"nested deeper than {MAX_DEPTH}"),
+    "nested tables": ("a = " + "{b = " * 5000 + "1" + "}" * 5000, f"nested deeper than {MAX_DEPTH}"),
+    "many dots and brackets": ("a = " + "{b.c.d = " * 10 + "1" + "}" * 10, f"nested deeper than {MAX_DEPTH}"),
+    "behind four quotes": ('a = {b = """x"""", ' + ".".join("c" * 5000) + ' = "d"}', f"nested deeper than {MAX_DEPTH}"),
+    "an escaped quote": ('"\\"" = 1\n' + ".".join("c" * 5000) + " = 1", f"nested deeper than {MAX_DEPTH}"),
     "an open string": ('a = "' + '\\"' * 200_000, "not a TOML file"),
     "an open text": ('a = """' + '\\"""' * 200_000, "not a TOML file"),
     "spaces": (" " * 1_000_000 + "a", "not a TOML file"),
@@ -35,9 +35,9 @@ MONSTERS = {
 }
 
 
-@pytest.mark.parametrize("name", MONSTERS)
-def test_a_text_that_no_parser_should_see_is_refused_in_one_line(name):
-    text, message = MONSTERS[name]
+@pytest.mark.parametrize("name", REFUSED_TEXTS)
+def test_a_text_that_would_overload_the_parser_is_refused_in_one_line(name):
+    text, message = REFUSED_TEXTS[name]
     with pytest.raises(InputFileError) as caught:
         parse_toml(text, "file")
     assert message in str(caught.value)
@@ -45,7 +45,7 @@ def test_a_text_that_no_parser_should_see_is_refused_in_one_line(name):
     assert len(str(caught.value)) < 300
 
 
-def test_what_only_looks_like_a_monster_is_read():
+def test_long_words_and_brackets_inside_strings_and_comments_are_accepted():
     dots = ".".join("a" * 500)
     text = f"""
     a = "{dots}" # {dots} {"[" * 500}
@@ -57,15 +57,15 @@ def test_what_only_looks_like_a_monster_is_read():
     assert parse_toml(text, "file") == tomllib.loads(text)
 
 
-def test_as_deep_as_the_bound_is_read_and_one_deeper_is_not():
-    lists = MAX_DEPTH - 1  # and the table that they stand in
+def test_nesting_up_to_the_limit_is_read_and_deeper_nesting_is_refused():
+    lists = MAX_DEPTH - 1  # the table around them is one level
     assert parse_toml("a = " + "[" * lists + "]" * lists, "file")
-    with pytest.raises(InputFileError, match="nest deeper"):
+    with pytest.raises(InputFileError, match="nested deeper"):
         parse_toml("a = " + "[" * MAX_DEPTH + "]" * MAX_DEPTH, "file")
     assert parse_toml(".".join("a" * MAX_DEPTH) + " = 1", "file")
-    with pytest.raises(InputFileError, match="nest deeper"):
+    with pytest.raises(InputFileError, match="nested deeper"):
         parse_toml(".".join("a" * (MAX_DEPTH + 1)) + " = 1", "file")
-    assert parse_toml("a = " + "9" * MAX_WORD, "file") == {"a": int("9" * MAX_WORD)}
+    assert parse_toml("a = " + "9" * MAX_TOKEN, "file") == {"a": int("9" * MAX_TOKEN)}
 
 
 PLAIN = (
@@ -82,11 +82,11 @@ VALUES = st.recursive(PLAIN, lambda inner: st.lists(inner) | st.dictionaries(st.
 
 @settings(deadline=None, max_examples=50)
 @given(st.dictionaries(st.text(max_size=9), VALUES, max_size=5))
-def test_what_is_written_reads_back_to_the_same(table):
+def test_written_values_read_back_unchanged(table):
     assert tomllib.loads("\n".join(toml_entries(table))) == table
 
 
-def test_odd_names_survive_the_way_through_a_gains_file(gains, mimopilot, tmp_path):
+def test_unusual_keys_and_values_are_preserved_by_a_gains_file(gains, mimopilot, tmp_path):
     odd = {'a "quoted" = key': 1, "a.b": {"": "empty", "line\nbreak": [{"ü ]": "\U0001f681\u2028"}]}, "'": math.inf}
     odd |= {"k" * 300: "long", "\x7f\\": "back\\slash", "when": datetime.datetime(2026, 1, 2, 3, 4)}
     written = dataclasses.replace(gains, provenance=Provenance.from_table(odd))
@@ -98,13 +98,13 @@ def test_odd_names_survive_the_way_through_a_gains_file(gains, mimopilot, tmp_pa
     assert read_toml(tmp_path / "bench.gains.toml", "gains file")["provenance"] == odd
 
 
-def test_half_of_a_surrogate_pair_from_a_file_name_is_written_as_the_sign_for_it(gains):
+def test_half_a_surrogate_pair_is_written_as_the_replacement_character(gains):
     text = gains_to_toml(dataclasses.replace(gains, provenance=Provenance(log="x\udcff.ulg")))
     assert gains_from_toml(text, "file").provenance.log == "x\ufffd.ulg"
 
 
 @given(st.text() | st.integers() | st.lists(st.text()))
-def test_a_value_in_a_message_is_short_and_in_one_line(value):
+def test_a_value_in_a_message_is_shortened_to_one_line(value):
     assert len(shown(value)) <= MAX_SHOWN
     assert len(shown(value).splitlines()) == 1
 
@@ -122,7 +122,7 @@ def test_a_value_in_a_message_is_short_and_in_one_line(value):
         ("restore", "BAD", "--connect", "udpin:127.0.0.1:0"),
     ],
 )
-def test_a_device_in_place_of_a_file_is_refused_by_every_command(mimopilot, tmp_path, command):
+def test_every_command_refuses_a_device_instead_of_a_file(mimopilot, tmp_path, command):
     from mimopilot.sitl.physics.airframe import FOLDER
 
     (tmp_path / "log.csv").write_text("t,p\n0,0\n")

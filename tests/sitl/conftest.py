@@ -1,4 +1,4 @@
-"""What several tests of the upload share."""
+"""Fixtures of the upload tests."""
 
 import io
 import subprocess
@@ -15,7 +15,7 @@ from tests.sitl.mavlink.scripted_vehicle import float32
 
 @pytest.fixture
 def quick_mimopilot(monkeypatch, capsys, tmp_path):
-    """The command line in this process, with `WAITS`: a real upload waits for seconds."""
+    """The command line in this process, with the shortened `WAITS`: a real upload waits for seconds."""
     for (module, name), value in WAITS.items():
         monkeypatch.setattr(f"{module}.{name}", value)
     monkeypatch.chdir(tmp_path)
@@ -34,7 +34,7 @@ def quick_mimopilot(monkeypatch, capsys, tmp_path):
 
 @pytest.fixture
 def certified(gains, tmp_path):
-    """A gains file with a certificate for its very matrices."""
+    """A gains file with a certificate for its matrices."""
     path = tmp_path / "my.gains.toml"
     certificate = {"verdict": "certified", "reason": "by this test"}
     gains.with_certificate(certificate).save(path)
@@ -48,7 +48,7 @@ def new(gains):
 
 @pytest.fixture
 def old(gains, new):
-    """Every gain on the vehicle differs from the new one; the period and the unit of moment do not."""
+    """Every gain on the vehicle differs from the new one; the period and the unit of torque do not."""
     identity = dict(zip((p.name for p in IDENTITY), gains.moment_scale, strict=True))
     values = {name: value * 0.875 for name, value in new.items()} | {"MIMO_TS": gains.Ts} | identity
     return {name: float32(value) for name, value in values.items()}

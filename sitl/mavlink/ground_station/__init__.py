@@ -1,1 +1,1 @@
-"""The ground station: parameters up and down, and the experiment on a vehicle in the air."""
+"""The ground station: reads and writes parameters, and runs the excitation experiment on a flying vehicle."""

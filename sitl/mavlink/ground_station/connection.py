@@ -1,4 +1,4 @@
-"""A link to a vehicle, from its URL: MAVLink 2 over UDP, TCP or a serial port, signed where a key is given."""
+"""A link to a vehicle, opened from its URL: MAVLink 2 over UDP, TCP or a serial port, signed if a key is given."""
 
 from __future__ import annotations
 
@@ -12,85 +12,87 @@ from typing import Any
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
     INT32,
-    THE_PEER,
-    Ack,
+    SOLE_PEER,
     Address,
-    Attitude,
-    Beat,
-    Excited,
-    Heard,
+    AttitudeReport,
+    CommandAck,
+    GroundHeartbeat,
     Heartbeat,
     Incoming,
-    Landed,
+    InjectorState,
+    LandedState,
     Outgoing,
-    Read,
-    Refusal,
-    Request,
-    RequestOnce,
-    Text,
-    Value,
-    Write,
+    ParameterRefusal,
+    ParameterValue,
+    ReadParameter,
+    Received,
+    RequestMessage,
+    SetMessageInterval,
+    SetParameter,
+    StatusText,
 )
 from mimopilot.sitl.mavlink.wire.link import Codec, udp_socket
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from pymavlink.dialects.v20 import common as mavlink
 
-#: How ground stations call themselves.
+#: System and component number that ground stations use.
 GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
+#: Default baud rate: that of a SiK telemetry radio.
 BAUD = 57600
-#: Name under which the vehicle tells what its injector does.
+#: Name of the DEBUG_VECT in which the vehicle reports its injector's state.
 EXCITATION = "MIMO_EXC"
 FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
+#: Timeout of connecting and of a blocking write, s; chosen.
 CONNECT_S = 5.0
-#: Addresses of a UDP link that are remembered: more than any network of vehicles and routers has.
+#: Addresses remembered on a UDP link; chosen above the size of any network of vehicles and routers.
 MAX_PEERS = 64
 
 
-def understand(message: Any) -> Incoming | None:
-    """What a parsed message means to an exchange of parameters; None when nothing."""
+def from_mavlink(message: Any) -> Incoming | None:
+    """Event of a parsed message; None if an exchange does not use it."""
     kind = message.get_type()
-    speaker = message.get_srcSystem(), message.get_srcComponent()
+    sender = message.get_srcSystem(), message.get_srcComponent()
     if kind == "HEARTBEAT":
         if message.type == mavlink.MAV_TYPE_GCS or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
             return None
         armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        return Heartbeat(*speaker, message.autopilot, armed, message.custom_mode, message.type)
+        return Heartbeat(*sender, message.autopilot, armed, message.custom_mode, message.type)
     if kind == "PARAM_VALUE":
         value = message.param_value
         whole = struct.unpack("<i", struct.pack("<f", value))[0] if message.param_type == INT32 else value
-        return Value(*speaker, message.param_id, whole + 0.0, message.param_type)
+        return ParameterValue(*sender, message.param_id, whole + 0.0, message.param_type)
     if kind == "PARAM_ERROR":
-        return Refusal(*speaker, message.param_id, message.error)
+        return ParameterRefusal(*sender, message.param_id, message.error)
     if kind == "COMMAND_ACK":
-        return Ack(*speaker, message.command, message.result)
+        return CommandAck(*sender, message.command, message.result)
     if kind == "ATTITUDE":
-        return Attitude(*speaker, message.roll, message.pitch)
+        return AttitudeReport(*sender, message.roll, message.pitch)
     if kind == "EXTENDED_SYS_STATE":
-        return Landed(*speaker, message.landed_state)
+        return LandedState(*sender, message.landed_state)
     if kind == "DEBUG_VECT" and message.name == EXCITATION and message.z in (-1, 0, 1, 2):
-        return Excited(*speaker, int(message.z), message.time_usec)
+        return InjectorState(*sender, int(message.z), message.time_usec)
     if kind == "STATUSTEXT":
-        return Text(*speaker, message.text)
+        return StatusText(*sender, message.text)
     return None
 
 
-def express(order: Outgoing) -> Any:
-    """The message that carries an order."""
-    if isinstance(order, Beat):
+def to_mavlink(order: Outgoing) -> Any:
+    """MAVLink message that encodes an outgoing message."""
+    if isinstance(order, GroundHeartbeat):
         return mavlink.MAVLink_heartbeat_message(
             mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
         )
-    if isinstance(order, Read):
+    if isinstance(order, ReadParameter):
         name = order.name.encode()
         return mavlink.MAVLink_param_request_read_message(order.system, order.component, name, -1)
-    if isinstance(order, Write):
+    if isinstance(order, SetParameter):
         name = order.name.encode()
         value = order.value
         coded = struct.unpack("<f", struct.pack("<i", round(value)))[0] if order.kind == INT32 else value
         return mavlink.MAVLink_param_set_message(order.system, order.component, name, coded, order.kind)
-    if isinstance(order, Request):
+    if isinstance(order, SetMessageInterval):
         command, parameters = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (order.message, order.interval)
-    elif isinstance(order, RequestOnce):
+    elif isinstance(order, RequestMessage):
         command, parameters = mavlink.MAV_CMD_REQUEST_MESSAGE, (order.message, 0)
     else:
         command, parameters = mavlink.MAV_CMD_PREFLIGHT_STORAGE, (1, 0)
@@ -103,31 +105,31 @@ class Connection:
     Parameters
     ----------
     url : str
-        ``udpin:HOST:PORT`` (listen), ``udpout:HOST:PORT`` (speak first), ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
+        ``udpin:HOST:PORT`` (listen), ``udpout:HOST:PORT`` (send first), ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
     key : bytes, optional
-        Signs what is sent; what is not signed with it is then ignored.
+        Signs outgoing messages; incoming messages not signed with it are ignored.
 
     Raises
     ------
     SitlError
-        When the URL is none of these, or cannot be opened.
+        If the URL has another form, or cannot be opened.
     """
 
     def __init__(self, url: str, key: bytes | None = None) -> None:
         self.closed = False
         self.signer = None if key is None else Signer(key)
         self.kind, _, rest = url.partition(":")
-        #: Who is there, each with what packs and parses its messages: two half frames of two speakers make none.
+        #: Senders on the link. Each has its own codec, so that frames of two senders are never mixed.
         self.peers: dict[Address, Codec] = {}
         if self.kind in ("udp", "udpin", "udpout", "tcp"):
             self.port: Any = self._open_socket(url, rest)
         else:
             self.port = self._open_serial(url)
         if self.kind not in ("udp", "udpin", "udpout"):
-            self._peer(THE_PEER)
+            self._peer(SOLE_PEER)
 
     def _peer(self, address: Address) -> Codec:
-        """What speaks with an address. Beyond so many the oldest is forgotten: anybody can send a datagram."""
+        """Codec of an address, created if new. Beyond `MAX_PEERS` the oldest is dropped: anybody can send datagrams."""
         if address not in self.peers and len(self.peers) >= MAX_PEERS:
             del self.peers[next(iter(self.peers))]
         return self.peers.setdefault(address, Codec(GROUND_SYSTEM, GROUND_COMPONENT, self.signer))
@@ -164,20 +166,20 @@ class Connection:
 
     @property
     def hint(self) -> str:
-        """What signatures tell about a silence; empty when nothing."""
+        """Why messages may have been ignored, according to their signatures; empty if no reason is known."""
         if any(codec.unasked for codec in self.peers.values()):
             return "; messages on this link are signed: give --signing-key"
         if self.signer is None or self.signer.heard:
             return ""
         if self.signer.behind:
             return (
-                f"; messages came that are signed with this key, {self.signer.behind:.0f} s behind this computer's "
-                "clock: set the clock of whichever is wrong"
+                f"; received messages are signed with this key, {self.signer.behind:.0f} s behind this computer's "
+                "clock: set the clock that is wrong"
             )
-        return "; messages came that are not signed with this key" * any(c.refused for c in self.peers.values())
+        return "; received messages are not signed with this key" * any(c.refused for c in self.peers.values())
 
     def close(self) -> None:
-        """Release the port."""
+        """Close the port."""
         self.port.close()
 
     def now(self) -> float:
@@ -185,10 +187,10 @@ class Connection:
         return time.monotonic()
 
     def send(self, messages: Sequence[Outgoing], to: Address | None = None) -> None:
-        """Send to one address or to all; what cannot be sent is lost, as on any radio."""
+        """Send to one address or to all; a message that cannot be sent is lost, as on a radio."""
         for address in [*self.peers] if to is None else [to]:
             for message in messages:
-                self._transmit(self._peer(address).pack(express(message)), address)
+                self._transmit(self._peer(address).pack(to_mavlink(message)), address)
 
     def _transmit(self, data: bytes, address: Address) -> None:
         try:
@@ -201,34 +203,34 @@ class Connection:
         except OSError:
             self.closed = self.closed or not self.kind.startswith("udp")
 
-    def receive(self, until: float) -> list[Heard]:
-        """What has been heard; waits for it until a time (s)."""
+    def receive(self, until: float) -> list[Received]:
+        """Messages received; waits for one until a time (s)."""
         wait = max(0.0, until - self.now())
         if self.closed or not select.select([self.port], [], [], wait)[0]:
             return []
-        data, origin = self._bytes()
-        meanings = map(understand, self._peer(origin).parse(data)) if data else ()
-        return [Heard(origin, meaning) for meaning in meanings if meaning is not None]
+        data, origin = self._receive_bytes()
+        messages = map(from_mavlink, self._peer(origin).parse(data)) if data else ()
+        return [Received(origin, message) for message in messages if message is not None]
 
     def discard(self) -> None:
-        """Throw away what has piled up."""
+        """Discard all messages that are waiting."""
         while not self.closed and select.select([self.port], [], [], 0)[0]:
-            self._bytes()
+            self._receive_bytes()
 
-    def _bytes(self) -> tuple[bytes, Address]:
-        """What has arrived, and from where."""
+    def _receive_bytes(self) -> tuple[bytes, Address]:
+        """Bytes received, and the sender's address."""
         try:
             if self.kind.startswith("udp"):
                 data, origin = self.port.recvfrom(65536)
                 return bytes(data), origin
             if self.kind != "tcp":
-                # Nothing, now and then, although it was ready; its end is an error.
-                return bytes(self.port.read(65536)), THE_PEER
+                # A serial port that select reports as readable may return nothing; a closed one raises.
+                return bytes(self.port.read(65536)), SOLE_PEER
             data = self.port.recv(65536)
         except (BlockingIOError, ConnectionRefusedError):
-            return b"", THE_PEER
+            return b"", SOLE_PEER
         except OSError:
             data = b""
-        # A stream that is ready and has nothing to say has ended.
+        # A TCP stream that is readable and returns nothing has ended.
         self.closed = not data
-        return bytes(data), THE_PEER
+        return bytes(data), SOLE_PEER

@@ -1,8 +1,8 @@
-"""What a ground station and a vehicle say to each other about parameters, apart from how it is packed and carried.
+"""Messages between ground station and vehicle, independent of their encoding and of the link that carries them.
 
-A conversation is a generator: it yields a `Turn` (what to send, and when to wake it at the latest) and is sent an
-`Event` (the time, and what was heard). `drive` runs one over a link, be it a radio or a simulated one that loses,
-doubles and reorders.
+An exchange is a generator. It yields a `SendAndWait` (messages to send, latest time to resume) and receives a
+`LinkEvent` (the time, messages received). `run_exchange` runs one over a link: a real one, or a simulated one that
+loses, duplicates and reorders messages.
 """
 
 from __future__ import annotations
@@ -14,16 +14,19 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 from mimopilot.sitl.errors import SitlError
 
+#: MAV_PARAM_TYPE.
 INT32, REAL32 = 6, 9
-#: Component number of an autopilot.
+#: MAV_COMP_ID_AUTOPILOT1.
 AUTOPILOT = 1
+#: MAV_CMD_PREFLIGHT_STORAGE.
 STORAGE_COMMAND = 245
 #: MAV_RESULT.
 ACCEPTED, DENIED, FAILED, IN_PROGRESS = 0, 2, 4, 5
+#: Message number of HEARTBEAT.
 HEARTBEAT = 0
-#: MAV_TYPE of a vehicle that does not say what it is.
+#: MAV_TYPE_GENERIC.
 GENERIC = 0
-#: Of PARAM_ERROR.
+#: MAV_PARAM_ERROR of PARAM_ERROR, and its text.
 DOES_NOT_EXIST = 1
 REASONS = {
     DOES_NOT_EXIST: "it does not exist",
@@ -48,8 +51,8 @@ class Heartbeat(NamedTuple):
     type: int = GENERIC
 
 
-class Value(NamedTuple):
-    """PARAM_VALUE; `kind` is its param_type, and an INT32 is the whole number that its bits stand for."""
+class ParameterValue(NamedTuple):
+    """PARAM_VALUE; `kind` is its param_type. The value of an INT32 is the integer that its bits encode."""
 
     system: int
     component: int
@@ -58,7 +61,7 @@ class Value(NamedTuple):
     kind: int = REAL32
 
 
-class Refusal(NamedTuple):
+class ParameterRefusal(NamedTuple):
     """PARAM_ERROR."""
 
     system: int
@@ -67,7 +70,7 @@ class Refusal(NamedTuple):
     reason: int
 
 
-class Ack(NamedTuple):
+class CommandAck(NamedTuple):
     """COMMAND_ACK."""
 
     system: int
@@ -76,7 +79,7 @@ class Ack(NamedTuple):
     result: int
 
 
-class Attitude(NamedTuple):
+class AttitudeReport(NamedTuple):
     """ATTITUDE: roll and pitch, rad."""
 
     system: int
@@ -85,16 +88,16 @@ class Attitude(NamedTuple):
     pitch: float
 
 
-class Landed(NamedTuple):
-    """EXTENDED_SYS_STATE: where the vehicle is, by MAV_LANDED_STATE."""
+class LandedState(NamedTuple):
+    """EXTENDED_SYS_STATE; `state` is MAV_LANDED_STATE."""
 
     system: int
     component: int
     state: int
 
 
-class Excited(NamedTuple):
-    """DEBUG_VECT of the injector: its phase (0 roll, 1 pitch, 2 between them, -1 off) at a time of the vehicle, us."""
+class InjectorState(NamedTuple):
+    """DEBUG_VECT of the injector: phase (0 roll, 1 pitch, 2 pause between them, -1 off), vehicle time (us)."""
 
     system: int
     component: int
@@ -102,7 +105,7 @@ class Excited(NamedTuple):
     time: int
 
 
-class Text(NamedTuple):
+class StatusText(NamedTuple):
     """STATUSTEXT."""
 
     system: int
@@ -110,11 +113,11 @@ class Text(NamedTuple):
     text: str
 
 
-class Beat(NamedTuple):
-    """Our own HEARTBEAT, so that the vehicle knows where to answer."""
+class GroundHeartbeat(NamedTuple):
+    """HEARTBEAT of the ground station; the vehicle answers to where it comes from."""
 
 
-class Read(NamedTuple):
+class ReadParameter(NamedTuple):
     """PARAM_REQUEST_READ by name."""
 
     system: int
@@ -122,8 +125,8 @@ class Read(NamedTuple):
     name: str
 
 
-class Write(NamedTuple):
-    """PARAM_SET; `kind` as in `Value`."""
+class SetParameter(NamedTuple):
+    """PARAM_SET; `kind` as in `ParameterValue`."""
 
     system: int
     component: int
@@ -132,15 +135,15 @@ class Write(NamedTuple):
     kind: int = REAL32
 
 
-class Store(NamedTuple):
-    """MAV_CMD_PREFLIGHT_STORAGE: write the parameters to the vehicle's memory."""
+class StoreParameters(NamedTuple):
+    """MAV_CMD_PREFLIGHT_STORAGE: save the parameters to non-volatile memory."""
 
     system: int
     component: int
 
 
-class Request(NamedTuple):
-    """MAV_CMD_SET_MESSAGE_INTERVAL: send a message every so many microseconds."""
+class SetMessageInterval(NamedTuple):
+    """MAV_CMD_SET_MESSAGE_INTERVAL: stream a message (number) at an interval (us)."""
 
     system: int
     component: int
@@ -148,52 +151,52 @@ class Request(NamedTuple):
     interval: int
 
 
-class RequestOnce(NamedTuple):
-    """MAV_CMD_REQUEST_MESSAGE: send a message now."""
+class RequestMessage(NamedTuple):
+    """MAV_CMD_REQUEST_MESSAGE: send a message (number) once, now."""
 
     system: int
     component: int
     message: int
 
 
-#: What a vehicle tells of its flight.
-Sight = Attitude | Landed | Excited | Text
-Incoming = Heartbeat | Value | Refusal | Ack | Sight
-Outgoing = Beat | Read | Write | Store | Request | RequestOnce
+#: Flight state that a vehicle streams.
+FlightReport = AttitudeReport | LandedState | InjectorState | StatusText
+Incoming = Heartbeat | ParameterValue | ParameterRefusal | CommandAck | FlightReport
+Outgoing = GroundHeartbeat | ReadParameter | SetParameter | StoreParameters | SetMessageInterval | RequestMessage
 T = TypeVar("T")
-#: Host and port of a speaker on a UDP link; `THE_PEER` on a link that has but one.
+#: Host and port of a sender on a UDP link; `SOLE_PEER` on a point-to-point link.
 Address = tuple[str, int]
-THE_PEER: Address = ("", 0)
+SOLE_PEER: Address = ("", 0)
 
 
-class Heard(NamedTuple):
-    """A message, and the address that it came from."""
+class Received(NamedTuple):
+    """A received message and its sender's address."""
 
     origin: Address
     message: Incoming
 
 
-class Turn(NamedTuple):
-    """What to send now, the time (s) at which to come back at the latest, and to whom; None: to every address."""
+class SendAndWait(NamedTuple):
+    """Messages to send now, latest time (s) to resume, receiver (None: every address)."""
 
     send: Sequence[Outgoing]
     wake: float
     to: Address | None = None
 
 
-class Event(NamedTuple):
-    """The time (s) now, what was heard since, and whether the link is gone for good."""
+class LinkEvent(NamedTuple):
+    """The time (s) now, messages received since, and whether the link is closed for good."""
 
     now: float
-    heard: Sequence[Heard]
+    received: Sequence[Received]
     closed: bool = False
 
 
-Steps = Generator[Turn, Event, T]
+Exchange = Generator[SendAndWait, LinkEvent, T]
 
 
 class Link(Protocol):
-    """What carries a conversation."""
+    """Carries an exchange."""
 
     closed: bool
 
@@ -201,20 +204,20 @@ class Link(Protocol):
         """Monotonic time, s."""
 
     def send(self, messages: Sequence[Outgoing], to: Address | None = None) -> None:
-        """Send, to one address or to every one; may lose."""
+        """Send to one address or to every one; messages may be lost."""
 
-    def receive(self, until: float) -> Sequence[Heard]:
-        """What has been heard; waits for it until a time (s)."""
+    def receive(self, until: float) -> Sequence[Received]:
+        """Messages received; waits for one until a time (s)."""
 
 
-def drive(steps: Steps[T], link: Link) -> T:
-    """Run a conversation over a link to its end and return its result."""
+def run_exchange(exchange: Exchange[T], link: Link) -> T:
+    """Run an exchange over a link to its end and return its result."""
     try:
-        turn = next(steps)
+        step = next(exchange)
         while True:
-            link.send(turn.send, turn.to)
-            heard = link.receive(turn.wake)
-            turn = steps.send(Event(link.now(), heard, link.closed))
+            link.send(step.send, step.to)
+            received = link.receive(step.wake)
+            step = exchange.send(LinkEvent(link.now(), received, link.closed))
     except StopIteration as end:
         result: T = end.value
         return result

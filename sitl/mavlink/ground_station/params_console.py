@@ -1,4 +1,4 @@
-"""What `params` does: gains or a vehicle's parameters as a file, or the two beside each other."""
+"""The command `params`: gains or a vehicle's parameters as a file, or a comparison of the two."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import shortest
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
-from mimopilot.sitl.mavlink.ground_station.session import Options, session
+from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
 from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.gains import Gains
@@ -18,24 +18,24 @@ from mimopilot.tuning.parameters import PARAMETERS
 from mimopilot.common.console import print_json, print_table
 from mimopilot.common.files import write_atomically
 
-#: Format -> the target of code generation that emits it, and its path there.
+#: Format -> code generation target that emits it, and its path there.
 GENERATED = {
     "c-header": ("native", "core/parameters.h"),
     "px4-yaml": ("px4", "px4/src/modules/mc_mimo_pid/module.yaml"),
 }
 
 
-def compare(file: Path, options: Options) -> None:
-    """Show a gains file beside what the vehicle holds.
+def compare(file: Path, options: LinkOptions) -> None:
+    """Compare a gains file with the vehicle's parameters.
 
     Raises
     ------
     SitlError
-        With exit code 1 when they differ.
+        With exit code 1 if they differ.
     """
     plan = make_plan(load_gains(file))
     wanted = plan.values | plan.fixed
-    with session(options) as vehicle:
+    with open_session(options) as vehicle:
         held = vehicle.read(list(wanted))
     differ = [name for name, value in wanted.items() if held[name] != value]
     if options.as_json:
@@ -51,13 +51,13 @@ def compare(file: Path, options: Options) -> None:
         raise SitlError(f"{len(differ)} of {len(wanted)} parameters differ", exit_code=1)
 
 
-def export(file: Path | None, options: Options, form: str, out: Path | None, uncertified: bool = False) -> None:
-    """Write a gains file, or what a vehicle holds, as a parameter file.
+def export(file: Path | None, options: LinkOptions, form: str, out: Path | None, uncertified: bool = False) -> None:
+    """Write a gains file, or a vehicle's parameters, as a parameter file.
 
     Raises
     ------
     SitlError
-        When the format is unknown, or there is nothing to export.
+        If the format is unknown, or there is nothing to export.
     """
     if form not in (*FORMATS, *GENERATED):
         raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *GENERATED])}")
@@ -70,9 +70,9 @@ def export(file: Path | None, options: Options, form: str, out: Path | None, unc
     elif not options.connect:
         raise SitlError("give a gains file to write, --connect to read from a vehicle, or both to compare them")
     elif form in GENERATED:
-        raise SitlError(f"--format {form}: is made from a gains file, not from a vehicle")
+        raise SitlError(f"--format {form}: needs a gains file; a vehicle cannot be written in this format")
     else:
-        with session(options) as vehicle:
+        with open_session(options) as vehicle:
             held = vehicle.read([p.name for p in PARAMETERS if p.writable])
         text = parameter_text(form, held, vehicle.vehicle.system, vehicle.vehicle.component)
     if out is None:

@@ -1,10 +1,9 @@
-"""What a set of gains means in the parameters of a vehicle: our module's, or those of a stock autopilot.
+"""Conversion of gains to the parameters of a vehicle: our module's, or those of a stock autopilot.
 
-A stock controller is diagonal, so the off-diagonals are lost. What carries over without a factor: PX4's and ArduPilot's
-angle P is 1/s, their rate P, I, D and FF are normalised moment per rad/s, its integral, its derivative and the rate
-set-point, and both filter the derivative by a first-order low-pass, so that our cut-off is theirs. What is converted:
-limits of the rate are degrees per second there. The unit of the normalised moment is the vehicle's own: see
-`sitl.physics.moment_scale`.
+A stock controller is diagonal: off-diagonal gains are lost. No factor is needed for the gains: PX4's and ArduPilot's
+angle P is in 1/s; their rate P, I, D and FF are normalised torque per rad/s, its integral, its derivative and the rate
+setpoint. Both filter the derivative by a first-order low-pass with our cutoff. Rate limits are converted to deg/s.
+The unit of the normalised torque is the vehicle's own: see `sitl.physics.moment_scale`.
 """
 
 from __future__ import annotations
@@ -28,16 +27,16 @@ from mimopilot.tuning.parameters import (
     PARAMETERS,
     PREFIX,
     Parameter,
+    Setting,
 )
-from mimopilot.tuning.parameters import Setting as VehicleSetting
 
-#: Largest off-diagonal, as a share of its row's diagonal, that a stock profile may drop unasked.
+#: Largest off-diagonal gain, as a share of its row's diagonal, that a stock profile drops without the option; chosen.
 DROPPED_SHARE = 0.1
 
 
 @dataclass(frozen=True)
-class Setting:
-    """One parameter to write: its unit, its value in single precision, and the range that it must be in."""
+class ParameterWrite:
+    """One parameter to write: unit, value in single precision, and allowed range."""
 
     name: str
     unit: str
@@ -47,26 +46,26 @@ class Setting:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What an upload does.
+class UploadPlan:
+    """Parameters that an upload writes, and those that it checks.
 
     Attributes
     ----------
-    settings : tuple of Setting
+    settings : tuple of ParameterWrite
         To write, in the order of the vehicle's table.
     fixed : dict
         Name -> value that the firmware must have been built with.
     scale : tuple of str
-        Parameters in which the vehicle publishes its unit of moment; empty when it has none.
+        Parameters in which the vehicle publishes its unit of torque, N m; empty if it has none.
     dropped : dict
-        Code of a gain that the vehicle has no place for -> its size as a share of its row's diagonal.
+        Code of a gain that the vehicle has no parameter for -> its size as a share of its row's diagonal.
     notes : tuple of str
-        What else the vehicle's controller does differently.
+        Other differences of the vehicle's controller.
     profile : str
-        Which of `PROFILES` the vehicle must fit; empty: any vehicle will do.
+        Key of `PROFILES` that the vehicle must fit; empty: any vehicle.
     """
 
-    settings: tuple[Setting, ...]
+    settings: tuple[ParameterWrite, ...]
     fixed: dict[str, float]
     scale: tuple[str, ...]
     dropped: dict[str, float]
@@ -79,86 +78,88 @@ class Plan:
         return {setting.name: setting.value for setting in self.settings}
 
 
-def _mimo(gains: Gains) -> Plan:
+def _mimo(gains: Gains) -> UploadPlan:
     check_ranges(gains)
     elements = gains.elements()
-    settings = tuple(Setting(p.name, p.unit, elements[p.code], p.minimum, p.maximum) for p in PARAMETERS if p.writable)
+    settings = tuple(
+        ParameterWrite(p.name, p.unit, elements[p.code], p.minimum, p.maximum) for p in PARAMETERS if p.writable
+    )
     fixed = {p.name: single(elements[p.code]) for p in PARAMETERS if not p.writable}
-    return Plan(settings, fixed, tuple(p.name for p in IDENTITY), {})
+    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY), {})
 
 
-def _px4_stock(gains: Gains) -> Plan:
-    """Ranges are those of PX4's own parameter descriptions; where they state no maximum, that of our table."""
-    settings: list[Setting] = []
+def _px4_stock(gains: Gains) -> UploadPlan:
+    """Ranges are from PX4's parameter reference; if it has no maximum, from our table."""
+    settings: list[ParameterWrite] = []
     largest_p, largest_d = (0.5, 0.6, 0.6), (0.01, 0.5, 0.5)
     for axis, name in enumerate(("ROLL", "PITCH", "YAW")):
         angle, p, i, d, ff = _diagonal(gains, axis)
         limit = math.degrees(gains.limits.rate_max[axis])
         settings += [
-            Setting(f"MC_{name}_P", "1/s", angle, 0.0, 5.0 if name == "YAW" else 12.0),
-            Setting(f"MC_{name}RATE_P", "s", p, 0.0, largest_p[axis]),
-            Setting(f"MC_{name}RATE_I", "", i, 0.0, 10.0),
-            Setting(f"MC_{name}RATE_D", "s^2", d, 0.0, largest_d[axis]),
-            Setting(f"MC_{name}RATE_FF", "s", ff, 0.0, 5.0),
-            # It multiplies P, I and D there.
-            Setting(f"MC_{name}RATE_K", "", 1.0, 1.0, 1.0),
-            Setting(f"MC_{name[0]}R_INT_LIM", "norm", gains.limits.integral_max[axis], 0.0, 1.0),
-            Setting(f"MC_{name}RATE_MAX", "deg/s", limit, 0.0, 1800.0),
+            ParameterWrite(f"MC_{name}_P", "1/s", angle, 0.0, 5.0 if name == "YAW" else 12.0),
+            ParameterWrite(f"MC_{name}RATE_P", "s", p, 0.0, largest_p[axis]),
+            ParameterWrite(f"MC_{name}RATE_I", "", i, 0.0, 10.0),
+            ParameterWrite(f"MC_{name}RATE_D", "s^2", d, 0.0, largest_d[axis]),
+            ParameterWrite(f"MC_{name}RATE_FF", "s", ff, 0.0, 5.0),
+            # PX4 multiplies P, I and D by it.
+            ParameterWrite(f"MC_{name}RATE_K", "", 1.0, 1.0, 1.0),
+            ParameterWrite(f"MC_{name[0]}R_INT_LIM", "norm", gains.limits.integral_max[axis], 0.0, 1.0),
+            ParameterWrite(f"MC_{name}RATE_MAX", "deg/s", limit, 0.0, 1800.0),
         ]
-    settings.append(Setting("IMU_DGYRO_CUTOFF", "Hz", gains.derivative_cutoff_hz, 0.0, 1000.0))
+    settings.append(ParameterWrite("IMU_DGYRO_CUTOFF", "Hz", gains.derivative_cutoff_hz, 0.0, 1000.0))
     notes = ("PX4 integrates less when the rate error is large, and MC_YAW_TQ_CUTOFF filters yaw; neither is set",)
-    return Plan(tuple(settings), {}, (), {}, notes)
+    return UploadPlan(tuple(settings), {}, (), {}, notes)
 
 
-def _ardupilot_stock(gains: Gains) -> Plan:
-    """Ranges are those of ArduPilot's own parameter descriptions, from 0 on: it enforces none."""
-    settings: list[Setting] = []
+def _ardupilot_stock(gains: Gains) -> UploadPlan:
+    """Ranges are from ArduPilot's parameter reference, but start at 0: it enforces none."""
+    settings: list[ParameterWrite] = []
     largest_p, largest_i, largest_d = (0.5, 0.5, 2.5), (2.0, 2.0, 1.0), (0.05, 0.05, 0.02)
     for axis, name in enumerate(("RLL", "PIT", "YAW")):
         angle, p, i, d, ff = _diagonal(gains, axis)
         settings += [
-            Setting(f"ATC_ANG_{name}_P", "1/s", angle, 0.0, 12.0),
-            Setting(f"ATC_RAT_{name}_P", "s", p, 0.0, largest_p[axis]),
-            Setting(f"ATC_RAT_{name}_I", "", i, 0.0, largest_i[axis]),
-            Setting(f"ATC_RAT_{name}_D", "s^2", d, 0.0, largest_d[axis]),
-            Setting(f"ATC_RAT_{name}_FF", "s", ff, 0.0, 0.5),
-            Setting(f"ATC_RAT_{name}_IMAX", "norm", gains.limits.integral_max[axis], 0.0, 1.0),
-            Setting(f"ATC_RAT_{name}_FLTD", "Hz", gains.derivative_cutoff_hz, 0.0, 100.0),
-            Setting(f"ATC_RATE_{name[0]}_MAX", "deg/s", math.degrees(gains.limits.rate_max[axis]), 0.0, 1080.0),
+            ParameterWrite(f"ATC_ANG_{name}_P", "1/s", angle, 0.0, 12.0),
+            ParameterWrite(f"ATC_RAT_{name}_P", "s", p, 0.0, largest_p[axis]),
+            ParameterWrite(f"ATC_RAT_{name}_I", "", i, 0.0, largest_i[axis]),
+            ParameterWrite(f"ATC_RAT_{name}_D", "s^2", d, 0.0, largest_d[axis]),
+            ParameterWrite(f"ATC_RAT_{name}_FF", "s", ff, 0.0, 0.5),
+            ParameterWrite(f"ATC_RAT_{name}_IMAX", "norm", gains.limits.integral_max[axis], 0.0, 1.0),
+            ParameterWrite(f"ATC_RAT_{name}_FLTD", "Hz", gains.derivative_cutoff_hz, 0.0, 100.0),
+            ParameterWrite(f"ATC_RATE_{name[0]}_MAX", "deg/s", math.degrees(gains.limits.rate_max[axis]), 0.0, 1080.0),
         ]
     notes = (
         "ArduPilot's D acts on the error, not on the measurement; its FLTT and FLTE filters, which our loop does not "
         "have, are not set",
     )
-    return Plan(tuple(settings), {}, (), {}, notes)
+    return UploadPlan(tuple(settings), {}, (), {}, notes)
 
 
-#: Profile -> what a set of gains becomes in it.
-PROFILES: dict[str, Callable[[Gains], Plan]] = {
+#: Profile -> its conversion of gains.
+PROFILES: dict[str, Callable[[Gains], UploadPlan]] = {
     "mimo": _mimo,
     "px4-stock": _px4_stock,
     "ardupilot-stock": _ardupilot_stock,
 }
 
 
-def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> Plan:
-    """What to write to a vehicle.
+def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> UploadPlan:
+    """Plan the upload of gains to a vehicle.
 
     Parameters
     ----------
     gains : Gains
-        The set.
+        To upload.
     profile : str
         A key of `PROFILES`.
     drop : bool
-        Drop off-diagonals of any size.
+        Drop off-diagonal gains of any size.
 
     Raises
     ------
     SitlError
-        When the profile is unknown, a value is out of its parameter's range, or too much would be dropped.
+        If the profile is unknown, a value is out of its parameter's range, or a large off-diagonal would be dropped.
     CodegenError
-        When a value is out of the range of our module's parameter.
+        If a value is out of the range of our module's parameter.
     """
     if profile not in PROFILES:
         raise SitlError(f"--profile: got {profile!r}, expected one of {', '.join(PROFILES)}")
@@ -168,10 +169,10 @@ def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> Plan:
             raise SitlError(
                 f"{setting.name}: got {setting.value:.6g}, expected {setting.minimum:g} to {setting.maximum:g} "
                 f"{setting.unit}".rstrip()
-                + f"; the {profile} controller takes no such value"
+                + f"; the {profile} controller does not accept it: tune again, or use another profile"
             )
     if profile != "mimo":
-        plan = replace(plan, dropped=off_diagonals(gains), notes=plan.notes + _lost_limits(gains))
+        plan = replace(plan, dropped=off_diagonal_shares(gains), notes=plan.notes + _lost_limits(gains))
         code, share = max(plan.dropped.items(), key=lambda item: item[1], default=("", 0.0))
         if share > DROPPED_SHARE and not drop:
             raise SitlError(
@@ -181,8 +182,8 @@ def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> Plan:
     return replace(plan, settings=tuple(replace(s, value=single(s.value)) for s in plan.settings), profile=profile)
 
 
-def off_diagonals(gains: Gains) -> dict[str, float]:
-    """Code of each off-diagonal gain that is not zero -> its size as a share of the diagonal of its row."""
+def off_diagonal_shares(gains: Gains) -> dict[str, float]:
+    """Code of each non-zero off-diagonal gain -> its size as a share of its row's diagonal."""
     shares: dict[str, float] = {}
     for name, code in MATRICES.items():
         matrix = np.abs(getattr(gains, name))
@@ -194,7 +195,7 @@ def off_diagonals(gains: Gains) -> dict[str, float]:
 
 
 def _diagonal(gains: Gains, axis: int) -> list[float]:
-    """P of the outer loop, then P, I, D and FF of the inner one, of one axis."""
+    """P of the outer loop, then P, I, D and FF of the inner loop, of one axis."""
     if axis == 2:
         return [getattr(gains.yaw, name) for name in MATRICES]
     return [float(getattr(gains, name)[axis, axis]) for name in MATRICES]
@@ -205,37 +206,37 @@ def _lost_limits(gains: Gains) -> tuple[str, ...]:
     return (f"moment_max ({', '.join(lost)}) has no counterpart and is not set",) if lost else ()
 
 
-#: All that our own vehicles have, by name; what their parameters begin with tells the other profiles.
-_OURS: tuple[Parameter | VehicleSetting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
+#: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.
+_OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
 TABLE = {p.name: p for p in _OURS}
 PREFIXES = {"mimo": PREFIX, "px4-stock": "MC_", "ardupilot-stock": "ATC_"}
 
 
-def out_of_range(name: str, value: float) -> str:
-    """The range of a parameter of ours that does not hold a value; empty when it does, or is none of ours."""
+def violated_range(name: str, value: float) -> str:
+    """Range of one of our parameters if a value is outside it; empty if inside, or not our parameter."""
     ours = TABLE.get(name)
     if ours is None or ours.minimum <= value <= ours.maximum:
         return ""
     return f"{ours.minimum:g} to {ours.maximum:g} {ours.unit}".rstrip() + f" ({ours.description})"
 
 
-def restoration(values: Mapping[str, float], source: str) -> Plan:
-    """What to write to put values back that a vehicle held.
+def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
+    """Plan the restoration of values that a vehicle held.
 
     Parameters
     ----------
     values : mapping
         Name -> value in single precision.
     source : str
-        Where they come from.
+        Their file, for messages.
 
     Raises
     ------
     SitlError
-        When one is out of the range of our table, or some of our gains are there and others are not.
+        If one is out of the range of our table, or only some of our gains are present.
     """
     for name, value in values.items():
-        expected = out_of_range(name, value)
+        expected = violated_range(name, value)
         if expected:
             raise SitlError(f"{source}: {name}: got {value:.6g}, expected {expected}")
     writable = [p.name for p in PARAMETERS if p.writable]
@@ -243,14 +244,14 @@ def restoration(values: Mapping[str, float], source: str) -> Plan:
     if 0 < len(lacking) < len(writable):
         raise SitlError(
             f"{source}: holds {len(writable) - len(lacking)} of our {len(writable)} gains and lacks {lacking[0]}"
-            f"{f' and {len(lacking) - 1} more' if len(lacking) > 1 else ''}: half a set is a controller that nobody "
-            "tuned"
+            f"{f' and {len(lacking) - 1} more' if len(lacking) > 1 else ''}: restore a complete "
+            "set"
         )
     fixed = {p.name for p in (*PARAMETERS, *IDENTITY) if not p.writable}
     settings = tuple(
-        Setting(name, TABLE[name].unit if name in TABLE else "", value, -math.inf, math.inf)
+        ParameterWrite(name, TABLE[name].unit if name in TABLE else "", value, -math.inf, math.inf)
         for name, value in values.items()
         if name not in fixed
     )
     profile = next((p for p, prefix in PREFIXES.items() if any(name.startswith(prefix) for name in values)), "")
-    return Plan(settings, {name: values[name] for name in values if name in fixed}, (), {}, profile=profile)
+    return UploadPlan(settings, {name: values[name] for name in values if name in fixed}, (), {}, profile=profile)

@@ -1,4 +1,4 @@
-"""A vehicle on a link while somebody watches: progress, Ctrl-C, and which vehicle it is."""
+"""A link to a vehicle for an interactive command: progress bars, Ctrl-C, check of the vehicle's type."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.connection import Connection
-from mimopilot.sitl.mavlink.ground_station.events import Heartbeat, Steps, T, drive
-from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Conversation
-from mimopilot.sitl.mavlink.ground_station.upload import NoneHeldError, read
+from mimopilot.sitl.mavlink.ground_station.events import Exchange, Heartbeat, T, run_exchange
+from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
+from mimopilot.sitl.mavlink.ground_station.upload import NoParametersError, read_values
 from mimopilot.sitl.mavlink.ground_station.vehicle_contact import TRY_S
-from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import STOCK_PARAMETERS, check_kind, without_module
+from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import STOCK_PARAMETERS, check_kind, describe_missing_module
 from mimopilot.sitl.mavlink.wire.signing import read_key
 from mimopilot.tuning.parameters import PREFIX
 
@@ -23,8 +23,16 @@ from mimopilot.common.console import progress_console
 
 
 @dataclass(frozen=True)
-class Options:
-    """The options that the commands share; see their help."""
+class LinkOptions:
+    """Options of upload, restore, params and experiment; see their help.
+
+    Attributes
+    ----------
+    timeout : float, s
+        Without a message from the vehicle.
+    stem : Path
+        Start of a snapshot's file name.
+    """
 
     connect: str
     system: int
@@ -39,28 +47,28 @@ class Options:
 
 
 class Session:
-    """A vehicle on a link, while somebody watches.
+    """A vehicle on a link, for an interactive command.
 
     Parameters
     ----------
-    options : Options
+    options : LinkOptions
         How to reach it.
     integers : collection of str
-        Names of parameters that may be whole numbers.
+        Names of parameters that may be INT32.
     """
 
-    def __init__(self, options: Options, integers: Collection[str] = ()) -> None:
+    def __init__(self, options: LinkOptions, integers: Collection[str] = ()) -> None:
         self.options = options
         self.link = Connection(options.connect, read_key(options.signing_key) if options.signing_key else None)
         tries = max(1, round(options.timeout / TRY_S))
-        self.talk = Conversation(self.link.now(), tries, options.system, options.force_armed, integers)
+        self.client = ParameterClient(self.link.now(), tries, options.system, options.force_armed, integers)
 
-    def run(self, steps: Steps[T]) -> T:
-        """Run a part of the conversation; Ctrl-C and a closed terminal end it in order, not at once."""
+    def run(self, exchange: Exchange[T]) -> T:
+        """Run an exchange. Ctrl-C or a closed terminal ends it in order, with the roll-back."""
         from rich.progress import Progress
 
         def interrupt(number: int, frame: object) -> None:
-            self.talk.interrupted = True
+            self.client.interrupted = True
 
         numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
         before = {number: signal.signal(number, interrupt) for number in numbers}
@@ -73,8 +81,8 @@ class Session:
                         tasks[phase] = bar.add_task(phase)
                     bar.update(tasks[phase], completed=done, total=of)
 
-                self.talk.progress = progress
-                return drive(steps, self.link)
+                self.client.progress = progress
+                return run_exchange(exchange, self.link)
         except SitlError as error:
             raise type(error)(f"{error}{self.link.hint}", error.exit_code) from error
         finally:
@@ -82,28 +90,28 @@ class Session:
                 signal.signal(number, handler)
 
     def read(self, names: Sequence[str], profile: str = "") -> dict[str, float]:
-        """What the vehicle holds, once it is clear which vehicle that is, and that a profile fits it."""
-        check_kind(self.run(self.talk.meet()), profile)
+        """Parameters of the vehicle, after it is identified and found to fit a profile."""
+        check_kind(self.run(self.client.await_heartbeat()), profile)
         try:
-            return self.run(read(self.talk, names))
-        except NoneHeldError as error:
+            return self.run(read_values(self.client, names))
+        except NoParametersError as error:
             probe = STOCK_PARAMETERS.get(self.vehicle.autopilot, "")
             if not probe or not all(name.startswith(PREFIX) for name in names):
                 raise
-            # A vehicle that does not hear us is silent, too: what its own controller has tells the two apart.
-            if self.run(self.talk.ask([probe], "reading"))[probe].absent:
+            # A vehicle that does not receive us does not answer either: probe a parameter of its stock controller.
+            if self.run(self.client.read([probe], "reading"))[probe].absent:
                 raise
-            raise SitlError(f"{without_module(self.vehicle)}; nothing was written") from error
+            raise SitlError(f"{describe_missing_module(self.vehicle)}; nothing was written") from error
 
     @property
     def vehicle(self) -> Heartbeat:
         """Its last HEARTBEAT."""
-        assert self.talk.vehicle is not None
-        return self.talk.vehicle
+        assert self.client.vehicle is not None
+        return self.client.vehicle
 
 
 @contextmanager
-def session(options: Options, integers: Collection[str] = ()) -> Iterator[Session]:
+def open_session(options: LinkOptions, integers: Collection[str] = ()) -> Iterator[Session]:
     """Open a link and close it again."""
     opened = Session(options, integers)
     try:

@@ -1,9 +1,9 @@
-"""The transaction: all values on the vehicle, verified, or the old ones back, or told exactly what is left.
+"""Parameter upload as a transaction: all new values verified, or rolled back, or the remaining values reported.
 
-MAVLink has no transaction for parameters, and a half-applied matrix is a controller that nobody tuned. So the old
-values are known before the first write, each write is believed only on an echo with the same bits and on a
-reading of its own afterwards, and whatever goes wrong puts the old values back and reads those, too. A vehicle may
-still restart as it stores, clamp late, or be written by another station: so all is read once more when that has passed.
+MAVLink has no transaction for parameters, and a partly written matrix is an untuned controller. So the old values are
+read before the first write. A write counts only after an echo with the same bits and a separate reading. After any
+failure the old values are written back and verified, too. A vehicle may still restart while it stores, clamp late, or
+be written by another ground station. So all values are read once more after its storage time.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import Steps, shortest
-from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Answer, Conversation
+from mimopilot.sitl.mavlink.ground_station.events import Exchange, shortest
+from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Answer, ParameterClient
 from mimopilot.sitl.mavlink.ground_station.vehicle_contact import FRESH_S
 
-#: PX4 and ArduPilot do not save a value that differs from the old one by less (the epsilon of single precision).
+#: PX4 and ArduPilot do not save a smaller change of a value (the epsilon of single precision, rounded up).
 SMALLEST_CHANGE = 1.2e-7
 
 
-class NoneHeldError(SitlError):
-    """The vehicle has none of the parameters that it was asked for."""
+class NoParametersError(SitlError):
+    """The vehicle has none of the requested parameters."""
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """How a transaction ended.
+class UploadOutcome:
+    """Result of an upload.
 
     Attributes
     ----------
@@ -34,13 +34,13 @@ class Outcome:
         ``verified``: every new value was read back. ``untouched``: nothing was written. ``rolled back``: every old
         value was read back. ``mixed``: anything else.
     reason : str
-        Why it is not verified.
+        Why it is not verified; empty if it is.
     held : mapping
-        Name -> the values that the vehicle may hold now; one when it is known.
+        Name -> the values that the vehicle may hold now; a single one if it is known.
     storage : str
-        See `parameter_protocol.Conversation.store`; empty when there was nothing to store or no link to do it.
+        See `parameter_protocol.ParameterClient.store`; empty if nothing was stored or the link was lost.
     armed : bool
-        The vehicle said after the first write that it is armed.
+        The vehicle reported armed after the first write.
     """
 
     state: str
@@ -50,102 +50,104 @@ class Outcome:
     armed: bool = False
 
 
-def read(talk: Conversation, names: Sequence[str]) -> Steps[dict[str, float]]:
+def read_values(client: ParameterClient, names: Sequence[str]) -> Exchange[dict[str, float]]:
     """Values that the vehicle holds.
 
     Raises
     ------
     NoneHeldError
-        When the vehicle is there, and answers for none of them.
+        If the vehicle is present, but answers for none of them.
     SitlError
-        When one is not answered, refused, or no float.
+        If one is not answered, refused, or not a float.
     """
-    answers = yield from talk.ask(names, "reading")
+    answers = yield from client.read(names, "reading")
     reason = _problem(answers)
     if reason:
-        none = talk.silence < FRESH_S and all(answer.absent for answer in answers.values())
-        raise (NoneHeldError if none else SitlError)(f"{reason}; nothing was written", exit_code=1)
+        none = client.heartbeat_age < FRESH_S and all(answer.absent for answer in answers.values())
+        raise (NoParametersError if none else SitlError)(f"{reason}; nothing was written", exit_code=1)
     return {name: answer.value for name, answer in answers.items() if answer.value is not None}
 
 
-def apply(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float], store: bool = True) -> Steps[Outcome]:
-    """Write what differs, read back everything, store, read it once more; on any failure put the old values back.
+def write_and_verify(
+    client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float], store: bool = True
+) -> Exchange[UploadOutcome]:
+    """Write the differences, verify all, store, verify all again; on any failure roll back.
 
     Parameters
     ----------
-    talk : Conversation
-        With the vehicle known.
+    client : ParameterClient
+        After `await_heartbeat`.
     new : mapping
         Name -> value in single precision.
     old : mapping
-        Name -> what the vehicle holds, at least of the same names; those that are not in `new` must stay as they are.
+        Name -> value on the vehicle, for at least the same names; names that are not in `new` must not change.
     store : bool
-        False: the values are not meant to outlast the flight, and the first reading is the last.
+        False: the values are for this flight only; do not store, verify once.
     """
     expected = {**old, **new}
-    talk.possible = {name: {value} for name, value in old.items()}
-    talk.watch(True)
+    client.possible = {name: {value} for name, value in old.items()}
+    client.check_contradictions(True)
     storage = ""
-    reason = yield from _write(talk, new, old)
+    reason = yield from _write(client, new, old)
     if not reason:
-        reason = yield from _verify(talk, expected)
+        reason = yield from _verify(client, expected)
     if not reason and store:
-        storage = yield from talk.store()
-        reason = (yield from talk.outlast()) or (yield from _verify(talk, expected))
+        storage = yield from client.store()
+        reason = (yield from client.wait_for_autosave()) or (yield from _verify(client, expected))
     state = "verified"
     if reason:
-        state, storage = yield from _put_back(talk, new, old, store)
-    talk.watch(False)
-    held = {name: tuple(sorted(values)) for name, values in talk.possible.items()}
-    return Outcome(state, reason, held, storage, talk.was_armed)
+        state, storage = yield from _roll_back(client, new, old, store)
+    client.check_contradictions(False)
+    held = {name: tuple(sorted(values)) for name, values in client.possible.items()}
+    return UploadOutcome(state, reason, held, storage, client.was_armed)
 
 
-def _put_back(
-    talk: Conversation, new: Mapping[str, float], old: Mapping[str, float], store: bool
-) -> Steps[tuple[str, str]]:
-    """Put the old values back; the state of the vehicle and of its storage."""
-    if not talk.written:
+def _roll_back(
+    client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float], store: bool
+) -> Exchange[tuple[str, str]]:
+    """Write the old values back; returns the state of the upload and of the storage."""
+    if not client.written:
         return "untouched", ""
-    talk.watch(True)
-    yield from talk.settle()
-    back = {name: old[name] for name in new if name in talk.written or talk.possible[name] != {old[name]}}
-    yield from talk.tell(back, "putting back", keep_going=True)
-    if talk.gone:
+    client.check_contradictions(True)
+    yield from client.wait_until_quiet()
+    back = {name: old[name] for name in new if name in client.written or client.possible[name] != {old[name]}}
+    yield from client.write(back, "rolling back", keep_going=True)
+    if client.lost:
         return "mixed", ""
-    yield from talk.settle()
+    yield from client.wait_until_quiet()
     storage = ""
     if store:
-        storage = yield from talk.store()
-        yield from talk.outlast(keep_going=True)
-    answers = yield from talk.ask(list(old), "verifying", keep_going=True)
-    restored = all(answers[name].value == old[name] and talk.possible[name] == {old[name]} for name in old)
+        storage = yield from client.store()
+        yield from client.wait_for_autosave(keep_going=True)
+    answers = yield from client.read(list(old), "verifying", keep_going=True)
+    restored = all(answers[name].value == old[name] and client.possible[name] == {old[name]} for name in old)
     return "rolled back" if restored else "mixed", storage
 
 
-def _write(talk: Conversation, new: Mapping[str, float], old: Mapping[str, float]) -> Steps[str]:
-    """Write what differs; why that failed, empty when it did not."""
-    yield from talk.settle()
+def _write(client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float]) -> Exchange[str]:
+    """Write the differences; returns why that failed, empty: it did not."""
+    yield from client.wait_until_quiet()
     changed = {name: value for name, value in new.items() if value != old[name]}
-    answers = yield from talk.tell(changed, "writing")
-    reason = talk.trouble or _problem(answers, old, new)
+    answers = yield from client.write(changed, "writing")
+    reason = client.failure or _problem(answers, old, new)
     if not reason:
-        yield from talk.settle()
+        yield from client.wait_until_quiet()
     return reason
 
 
-def _verify(talk: Conversation, expected: Mapping[str, float]) -> Steps[str]:
-    """Read everything; what is not as expected, empty when all is."""
-    answers = yield from talk.ask(list(expected), "verifying")
+def _verify(client: ParameterClient, expected: Mapping[str, float]) -> Exchange[str]:
+    """Read all; returns the first difference from what is expected, empty: none."""
+    answers = yield from client.read(list(expected), "verifying")
     for name, answer in answers.items():
         if answer.value is not None and answer.value != expected[name]:
             return f"{name}: reads back as {shortest(answer.value)}, expected {shortest(expected[name])}"
-    return talk.trouble or _problem(answers)
+    return client.failure or _problem(answers)
 
 
 def _problem(
     answers: Mapping[str, Answer], old: Mapping[str, float] | None = None, new: Mapping[str, float] | None = None
 ) -> str:
-    """The first problem, and how many more requests it left unanswered."""
+    """The first problem and the number of further ones; empty: none."""
     bad = {name: answer for name, answer in answers.items() if answer.problem}
     if not bad:
         return ""

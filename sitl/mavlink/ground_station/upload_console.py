@@ -1,4 +1,4 @@
-"""What a user of `upload` and `restore` sees: tables before and after, the question, how it ended."""
+"""The commands `upload` and `restore`: tables before and after, confirmation, snapshot, result."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import typer
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Heartbeat, shortest
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S
-from mimopilot.sitl.mavlink.ground_station.profiles import Plan, out_of_range
-from mimopilot.sitl.mavlink.ground_station.session import Options, Session, session
-from mimopilot.sitl.mavlink.ground_station.upload import SMALLEST_CHANGE, Outcome, apply
+from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, violated_range
+from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
+from mimopilot.sitl.mavlink.ground_station.upload import SMALLEST_CHANGE, UploadOutcome, write_and_verify
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.gains import Gains, Triple
@@ -21,6 +21,7 @@ from mimopilot.tuning.gains import Gains, Triple
 from mimopilot.common.console import print_json, print_table
 from mimopilot.common.files import write_atomically
 
+#: `UploadOutcome.storage` -> message.
 STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",
     "autosave": f"storage was not acknowledged: waited {AUTOSAVE_S:g} s, in which PX4 and ArduPilot save by themselves",
@@ -28,17 +29,17 @@ STORAGE = {
     "failed": "not stored: the vehicle could not (PREFLIGHT_STORAGE: MAV_RESULT_FAILED)",
     "": "the link was lost before storage was acknowledged",
 }
-#: Ends of storage that leave the vehicle with values that it loses.
+#: Results of storage after which the vehicle loses the values when it restarts.
 UNSTORED = ("denied", "failed")
 
 
 def parse_scale(text: str | None) -> Triple | Literal["flown"] | None:
-    """``--moment-scale``: three numbers above zero, or ``flown``.
+    """Parse ``--moment-scale``: three positive numbers (N m), or ``flown``.
 
     Raises
     ------
     SitlError
-        When it is neither.
+        If it is neither.
     """
     if text is None or text == "flown":
         return text  # type: ignore[return-value]
@@ -51,40 +52,42 @@ def parse_scale(text: str | None) -> Triple | Literal["flown"] | None:
     return r, p, y
 
 
-def transact(
-    plan: Plan, options: Options, gains: Gains | None = None, scale: Triple | Literal["flown"] | None = None
+def upload_and_verify(
+    plan: UploadPlan, options: LinkOptions, gains: Gains | None = None, scale: Triple | Literal["flown"] | None = None
 ) -> None:
-    """Read, check, show, ask, save the old values, write and verify; report how it ended.
+    """Read, check, show, confirm, save the old values, write and verify; print the result.
 
     Parameters
     ----------
-    plan : Plan
+    plan : UploadPlan
         What to write.
-    options : Options
-        How.
+    options : LinkOptions
+        How to reach the vehicle, and what to ask.
     gains : Gains, optional
-        What the plan was made from: then the unit of moment must be the vehicle's.
+        The gains of the plan: their unit of torque must then be the vehicle's.
     scale : tuple of 3 float (N m), or ``flown``, optional
-        The vehicle's unit of moment, or the word that the gains were tuned in it; by default the vehicle is asked.
+        The vehicle's unit of torque, or ``flown``: the gains were tuned in it. By default it is read from the vehicle.
 
     Raises
     ------
     SitlError
-        Unless every value was read back, or it was a dry run.
+        Unless every value was read back and stored, or it was a dry run.
     """
     if not (options.yes or options.dry_run) and (options.as_json or not sys.stdin.isatty()):
-        raise SitlError("there is nobody to ask: give --yes to write, or --dry-run to compare")
+        raise SitlError("no terminal to ask for confirmation: give --yes to write, or --dry-run to compare")
     if options.snapshot is not None and options.snapshot.exists():
-        raise SitlError(f"{options.snapshot}: exists already, and may be the only copy of older values; name another")
+        raise SitlError(
+            f"{options.snapshot}: exists already, and may be the only copy of older values; name another file"
+        )
     if gains is not None and isinstance(scale, tuple):
         check_moment_scale(gains, scale, "the vehicle")
     ask_scale = gains is not None and scale is None
     if ask_scale and not plan.scale:
         raise SitlError(
-            "a stock vehicle does not say how many N m one unit of its moment stands for; give --moment-scale "
-            "ROLL,PITCH,YAW, or --moment-scale flown when the gains come from a log of this very vehicle"
+            "a stock vehicle does not publish how many N m one unit of its torque is; give --moment-scale "
+            "ROLL,PITCH,YAW, or --moment-scale flown if the gains come from a log of this vehicle"
         )
-    with session(options) as vehicle:
+    with open_session(options) as vehicle:
         held = vehicle.read([*plan.values, *plan.fixed, *(plan.scale if ask_scale else ())], plan.profile)
         _check_vehicle(plan, held, vehicle, options)
         if ask_scale and gains is not None:
@@ -94,20 +97,22 @@ def transact(
         changes = [name for name, value in plan.values.items() if value != held[name]]
         snapshot = None
         if options.dry_run:
-            outcome = Outcome("dry run", "", {name: (held[name],) for name in plan.values})
+            outcome = UploadOutcome("dry run", "", {name: (held[name],) for name in plan.values})
         else:
             if changes and not options.yes:
                 typer.confirm(f"Write {len(changes)} parameters to vehicle {vehicle.vehicle.system}?", abort=True)
                 vehicle.link.discard()
-                vehicle.talk.resume(vehicle.link.now())
+                vehicle.client.resume(vehicle.link.now())
                 if vehicle.read(list(held), plan.profile) != held:
-                    raise SitlError("the vehicle's values changed while the question stood: run it again", exit_code=1)
+                    raise SitlError(
+                        "the vehicle's values changed while waiting for the answer: run it again", exit_code=1
+                    )
             snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
-            outcome = vehicle.run(apply(vehicle.talk, plan.values, held))
+            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held))
         _report(plan, held, vehicle.vehicle, outcome, snapshot, options)
 
 
-def _check_vehicle(plan: Plan, held: Mapping[str, float], vehicle: Session, options: Options) -> None:
+def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session, options: LinkOptions) -> None:
     for name, value in plan.fixed.items():
         if held[name] != value:
             raise SitlError(
@@ -117,20 +122,20 @@ def _check_vehicle(plan: Plan, held: Mapping[str, float], vehicle: Session, opti
     for name in plan.values:
         if not abs(held[name]) < float("inf"):
             raise SitlError(
-                f"{name}: the vehicle holds {held[name]}, which could not be put back; set it by hand first"
+                f"{name}: the vehicle holds {held[name]}, which could not be restored; set it by hand first"
             )
-        expected = out_of_range(name, held[name])
+        expected = violated_range(name, held[name])
         if expected:
             raise SitlError(
-                f"{name}: the vehicle holds {held[name]:.6g}, expected {expected}: restore would not put it back; set "
-                "it by hand first"
+                f"{name}: the vehicle holds {held[name]:.6g}, expected {expected}: restore would refuse it; set it by "
+                "hand first"
             )
     if vehicle.vehicle.armed and not (options.force_armed or options.dry_run):
         raise SitlError("the vehicle is armed: nothing was written; disarm it, or give --force-armed", exit_code=1)
 
 
-def _save_snapshot(plan: Plan, held: Mapping[str, float], vehicle: Heartbeat, options: Options) -> Path:
-    """Write the old values to a file of their own: an older snapshot may be the only copy of what is wanted back."""
+def _save_snapshot(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat, options: LinkOptions) -> Path:
+    """Write the old values to a new file: an older snapshot may be the only copy of its values."""
     path, number = options.snapshot, 0
     while path is None or path.exists():
         number += 1
@@ -138,13 +143,15 @@ def _save_snapshot(plan: Plan, held: Mapping[str, float], vehicle: Heartbeat, op
     old = {name: held[name] for name in plan.values}
     write_atomically(path, parameter_text("qgc", old, vehicle.system, vehicle.component))
     if read_parameters(path) != old:
-        raise SitlError(f"{path}: does not read back as it was written; nothing was sent to the vehicle", exit_code=1)
+        raise SitlError(
+            f"{path}: does not read back as written; nothing was sent to the vehicle; check the disk", exit_code=1
+        )
     if not options.as_json:
         print(f"old values saved: {path}")
     return path
 
 
-def _show_plan(plan: Plan, held: Mapping[str, float], vehicle: Heartbeat) -> None:
+def _show_plan(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat) -> None:
     rows = []
     for setting in plan.settings:
         change = setting.value - held[setting.name]
@@ -162,7 +169,7 @@ def _show_plan(plan: Plan, held: Mapping[str, float], vehicle: Heartbeat) -> Non
     for code, share in plan.dropped.items():
         print(f"dropped: {code}, {share:.1%} of its diagonal")
     if plan.dropped:
-        print("dropped: the certificate, if any, is of the full matrices")
+        print("dropped: the certificate, if any, is for the full matrices")
     for name in (s.name for s in plan.settings if 0 < abs(s.value - held[s.name]) < SMALLEST_CHANGE):
         print(f"note: {name}: PX4 and ArduPilot do not save a change below {SMALLEST_CHANGE:g}")
     for note in plan.notes:
@@ -170,14 +177,14 @@ def _show_plan(plan: Plan, held: Mapping[str, float], vehicle: Heartbeat) -> Non
 
 
 def _report(
-    plan: Plan,
+    plan: UploadPlan,
     held: Mapping[str, float],
     vehicle: Heartbeat,
-    outcome: Outcome,
+    outcome: UploadOutcome,
     snapshot: Path | None,
-    options: Options,
+    options: LinkOptions,
 ) -> None:
-    """Print how it ended, and raise unless all is well."""
+    """Print the result; raise unless it is verified and stored, or a dry run."""
     if options.as_json:
         print_json(
             {
@@ -215,19 +222,19 @@ def _report(
         raise SitlError(_failure(outcome, held, snapshot, options), exit_code=1)
 
 
-def _failure(outcome: Outcome, held: Mapping[str, float], snapshot: Path | None, options: Options) -> str:
+def _failure(outcome: UploadOutcome, held: Mapping[str, float], snapshot: Path | None, options: LinkOptions) -> str:
     if outcome.state == "untouched":
         return f"{outcome.reason}; nothing was written"
     armed = ", although the vehicle was armed" if outcome.armed else ""
     stored = f"; {STORAGE[outcome.storage]}" if outcome.storage in UNSTORED else ""
     if outcome.state == "rolled back":
-        return f"{outcome.reason}; the old values were put back and read back{armed}{stored}"
+        return f"{outcome.reason}; the old values were restored and read back{armed}{stored}"
     left = [
         f"{name} holds {' or '.join(shortest(value) for value in values)}"
         for name, values in outcome.held.items()
         if values != (held[name],)
     ]
-    rest = "the others hold their old values" if left else "the old values were put back, but not all were read back"
+    rest = "the others hold their old values" if left else "the old values were written, but not all were read back"
     sent = f"old values were sent{armed}" if armed else ""
     again = f"restore with: mimopilot restore {snapshot} --connect {options.connect}"
     return "; ".join(part for part in [outcome.reason, *left, rest, sent, again] if part) + stored

@@ -1,6 +1,6 @@
-"""Who is on the link: the one vehicle that is talked to, what it says of itself, and what speaks against it.
+"""State of the contact with one vehicle: its HEARTBEAT, other autopilots on the link, contradictions.
 
-No socket and no clock: see `sitl.mavlink.ground_station.events` for how a conversation is driven.
+No socket and no clock: see `sitl.mavlink.ground_station.events` for how an exchange is run.
 """
 
 from __future__ import annotations
@@ -11,65 +11,66 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
     AUTOPILOT,
     HEARTBEAT,
-    Ack,
     Address,
-    Beat,
+    CommandAck,
+    Exchange,
+    FlightReport,
+    GroundHeartbeat,
     Heartbeat,
     Outgoing,
-    Refusal,
-    RequestOnce,
-    Sight,
-    Steps,
-    Turn,
-    Value,
+    ParameterRefusal,
+    ParameterValue,
+    RequestMessage,
+    SendAndWait,
     shortest,
 )
 
-#: One try, s; how many. At 30 % loss each way 24 tries lose 1 exchange in 10^7.
+#: Wait for an answer to one try (s), number of tries. At 30 % loss each way 24 tries lose 1 exchange in 10^7.
 TRY_S, TRIES = 0.5, 24
-#: A HEARTBEAT older than this (s) does not tell whether the vehicle is armed now: it comes once a second.
+#: Beyond this age (s) a HEARTBEAT no longer shows whether the vehicle is armed. Its period is 1 s.
 FRESH_S = 1.5
-#: Whoever sends HEARTBEAT once a second, as MAVLink asks, is heard in this time (s).
+#: Listening time (s) in which every autopilot is heard: the HEARTBEAT period of 1 s, and a margin.
 LISTEN_S = 1.2
+#: Period of our own HEARTBEAT (s), as MAVLink asks.
 BEAT_S = 1.0
 
 
-class Contact:
-    """State of a talk with one vehicle, from its first HEARTBEAT on.
+class VehicleContact:
+    """State of the contact with one vehicle, from its first HEARTBEAT on.
 
     Parameters
     ----------
     now : float, s
         Time at the start.
     tries : int
-        How often a request is sent before its silence is final.
+        How often a request is sent before it counts as unanswered.
     system : int
-        The vehicle's system number; 0: the first that is heard.
+        The vehicle's system number; 0: the first one heard.
     force_armed : bool
-        Write even while it is armed.
+        Write even if it is armed.
 
     Attributes
     ----------
     vehicle : Heartbeat or None
         Its last HEARTBEAT.
     address : Address or None
-        Where its first HEARTBEAT came from: all is sent there, and only what comes from there counts.
+        Sender of its first HEARTBEAT. Messages go only there; those from elsewhere are ignored.
     others : set of int
         Systems of other autopilots on the link.
     interrupted : bool
-        Set from outside (Ctrl-C): reading and writing end, putting back does not.
+        Set by the caller (Ctrl-C): ends reading and writing, but not a roll-back.
     possible : dict
-        Name -> every value that the vehicle may hold now, given what was sent and heard.
+        Name -> every value that the vehicle may hold now, given all messages sent and received.
     written : set of str
-        Names for which a write was ever sent.
+        Names of which a write was sent.
     was_armed : bool
-        It said so after the first write.
+        It reported armed after the first write.
     contradiction : str
-        What it stated against a value that was agreed on; empty: nothing.
+        A reported value that differs from the one agreed on; empty: none.
     progress : callable
-        Told (phase, done, of) after each answer.
-    witness : callable
-        Told what else the vehicle says, whatever the talk is about.
+        Called with (phase, done, of) after each answer.
+    on_report : callable
+        Called with each `FlightReport` of the vehicle.
     """
 
     def __init__(self, now: float, tries: int = TRIES, system: int = 0, force_armed: bool = False) -> None:
@@ -82,60 +83,62 @@ class Contact:
         self.written: set[str] = set()
         self.contradiction = ""
         self.progress: Callable[[str, int, int], None] = lambda phase, done, of: None
-        self.witness: Callable[[Sight], None] = lambda sight: None
+        self.on_report: Callable[[FlightReport], None] = lambda report: None
         self._agreed: dict[str, float] | None = None
-        self._doubled = ""
+        self._duplicate = ""
         self._heartbeat_at = self._heard_at = now
         self._beat_due = self._request_due = now
 
     @property
-    def patience(self) -> float:
-        """Silence that is taken for the end, s."""
+    def timeout(self) -> float:
+        """Time without a message after which the vehicle counts as lost, s."""
         return self.tries * TRY_S
 
     @property
-    def silence(self) -> float:
+    def heartbeat_age(self) -> float:
         """Age of the last HEARTBEAT, s."""
         return self.now - self._heartbeat_at
 
     @property
-    def gone(self) -> bool:
-        """True when the link is closed, or the vehicle silent for too long."""
-        return self.closed or self.now - self._heard_at >= self.patience
+    def lost(self) -> bool:
+        """True if the link is closed, or no message came within `timeout`."""
+        return self.closed or self.now - self._heard_at >= self.timeout
 
     @property
-    def trouble(self) -> str:
-        """What was heard that forbids success from now on; empty: nothing."""
+    def failure(self) -> str:
+        """Why the upload can no longer succeed; empty: it can."""
         if self.was_armed and not self.force_armed:
             return "the vehicle was armed before the last reading"
-        return self._doubled or self.contradiction
+        return self._duplicate or self.contradiction
 
-    def watch(self, on: bool) -> None:
-        """From now on what contradicts a value that was read counts, or (False) no longer."""
+    def check_contradictions(self, on: bool) -> None:
+        """Start or stop checking reported values against those agreed on."""
         self._agreed = {} if on else None
         self.contradiction = ""
 
-    def agree(self, name: str, value: float | None) -> None:
-        """A value was read, or (None) the vehicle is told another."""
+    def _set_agreed(self, name: str, value: float | None) -> None:
+        """Record a value that was read; None: another is being written, nothing is agreed on."""
         if self._agreed is not None and value is not None:
             self._agreed[name] = value
         elif self._agreed is not None:
             self._agreed.pop(name, None)
 
     def resume(self, now: float) -> None:
-        """Go on after a pause in which nobody listened: writing waits for another HEARTBEAT."""
+        """Continue after a pause without receiving: writing waits for a new HEARTBEAT."""
         self.now = self._heard_at = now
         self._heartbeat_at = now - FRESH_S
 
-    def turn(self, send: Sequence[Outgoing], wake: float) -> Steps[list[Value | Refusal | Ack]]:
-        """Send, wait, and return what the vehicle itself said; every other speaker is ignored."""
+    def send_and_wait(
+        self, send: Sequence[Outgoing], wake: float
+    ) -> Exchange[list[ParameterValue | ParameterRefusal | CommandAck]]:
+        """Send, wait, and return the vehicle's own answers; every other sender is ignored."""
         if self.now >= self._beat_due:
-            send = [Beat(), *send]
+            send = [GroundHeartbeat(), *send]
             self._beat_due = self.now + BEAT_S
-        event = yield Turn(send, min(wake, self._beat_due), self.address)
+        event = yield SendAndWait(send, min(wake, self._beat_due), self.address)
         self.now, self.closed = event.now, event.closed
-        heard: list[Value | Refusal | Ack] = []
-        for origin, message in event.heard:
+        answers: list[ParameterValue | ParameterRefusal | CommandAck] = []
+        for origin, message in event.received:
             if message.component != AUTOPILOT:
                 continue
             if self.vehicle is None and isinstance(message, Heartbeat) and self.system in (0, message.system):
@@ -145,46 +148,47 @@ class Contact:
                     self.others.add(message.system)
                 continue
             if origin != self.address:
-                self._find_double(origin)
+                self._report_duplicate(origin)
                 continue
             self._heard_at = self.now
             if isinstance(message, Heartbeat):
                 self.vehicle, self._heartbeat_at = message, self.now
                 self.was_armed |= message.armed and bool(self.written)
-            elif isinstance(message, Value | Refusal | Ack):
-                self._compare(message)
-                heard.append(message)
+            elif isinstance(message, ParameterValue | ParameterRefusal | CommandAck):
+                self._check_against_agreed(message)
+                answers.append(message)
             else:
-                self.witness(message)
-        return heard
+                self.on_report(message)
+        return answers
 
-    def _find_double(self, origin: Address) -> None:
+    def _report_duplicate(self, origin: Address) -> None:
         assert self.vehicle is not None
         assert self.address is not None
         first, second = (f"{host}:{port}" for host, port in (self.address, origin))
-        self._doubled = (
+        self._duplicate = (
             f"system {self.vehicle.system} is heard from two addresses, {first} and {second}: "
             "take one vehicle off the link, or give it another system number"
         )
 
-    def _compare(self, message: Value | Refusal | Ack) -> None:
-        """See whether a value contradicts what was agreed on."""
-        if not isinstance(message, Value) or self._agreed is None:
+    def _check_against_agreed(self, message: ParameterValue | ParameterRefusal | CommandAck) -> None:
+        """Record a value that contradicts the one agreed on."""
+        if not isinstance(message, ParameterValue) or self._agreed is None:
             return
         agreed = self._agreed.get(message.name, message.value)
         if message.value != agreed:
             self.possible[message.name].add(message.value)
-            self.contradiction = f"{message.name}: {shortest(message.value)}, after the vehicle said {shortest(agreed)}"
+            values = f"{shortest(message.value)}, after the vehicle reported {shortest(agreed)}"
+            self.contradiction = f"{message.name}: {values}"
 
-    def meet(self) -> Steps[Heartbeat]:
-        """Wait for the vehicle's HEARTBEAT, and hear who else is there.
+    def await_heartbeat(self) -> Exchange[Heartbeat]:
+        """Wait for the vehicle's HEARTBEAT, and find out which other autopilots are on the link.
 
         Raises
         ------
         SitlError
-            When none comes in time, or it is not clear which vehicle is meant.
+            If none comes in time, or it is ambiguous which vehicle is meant.
         """
-        deadline, until = self.now + self.patience, self.now + LISTEN_S
+        deadline, until = self.now + self.timeout, self.now + LISTEN_S
         while self.vehicle is None or self.now < until:
             if self.interrupted:
                 raise SitlError("interrupted; nothing was written", exit_code=1)
@@ -192,22 +196,22 @@ class Contact:
                 raise SitlError("the link was lost; nothing was written", exit_code=1)
             if self.vehicle is None and self.now >= deadline:
                 whose = f"of system {self.system}" if self.system else "of an autopilot"
-                raise SitlError(f"no HEARTBEAT {whose} in {self.patience:g} s", exit_code=1)
+                raise SitlError(f"no HEARTBEAT {whose} in {self.timeout:g} s", exit_code=1)
             unknown = self.vehicle is None
-            yield from self.turn([], deadline if unknown else until)
+            yield from self.send_and_wait([], deadline if unknown else until)
             if unknown:
                 until = self.now + LISTEN_S
         if self.others and not self.system:
             systems = ", ".join(map(str, sorted({self.vehicle.system, *self.others})))
-            raise SitlError(f"several vehicles are on this link (systems {systems}); say which with --system")
-        if self._doubled:
-            raise SitlError(f"{self._doubled}; nothing was written")
+            raise SitlError(f"several vehicles are on this link (systems {systems}); choose one with --system")
+        if self._duplicate:
+            raise SitlError(f"{self._duplicate}; nothing was written")
         return self.vehicle
 
     def request_heartbeat(self) -> list[Outgoing]:
-        """What asks for a HEARTBEAT, at most once a try."""
+        """Request for a HEARTBEAT, at most once every `TRY_S`."""
         assert self.vehicle is not None
         if self.now < self._request_due:
             return []
         self._request_due = self.now + TRY_S
-        return [RequestOnce(self.vehicle.system, self.vehicle.component, HEARTBEAT)]
+        return [RequestMessage(self.vehicle.system, self.vehicle.component, HEARTBEAT)]

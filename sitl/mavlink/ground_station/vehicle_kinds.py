@@ -1,4 +1,4 @@
-"""What a vehicle says that it is, and which profile fits it."""
+"""Vehicle types and autopilots, and the profiles that fit them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import GENERIC, Heartbeat
 from pymavlink.dialects.v20 import common as mavlink
 
-#: MAV_TYPE that a multirotor's rate controller flies, VTOLs in hover among them.
+#: MAV_TYPE flown by a multirotor's rate controller; VTOLs in hover included.
 MULTIROTORS = frozenset(
     {
         GENERIC,
@@ -17,19 +17,19 @@ MULTIROTORS = frozenset(
         mavlink.MAV_TYPE_DODECAROTOR,
         mavlink.MAV_TYPE_DECAROTOR,
         mavlink.MAV_TYPE_GENERIC_MULTIROTOR,
-        *range(19, 26),  # MAV_TYPE_VTOL_*, whose names differ between editions of the dialect
+        *range(19, 26),  # MAV_TYPE_VTOL_*; the names differ between versions of the dialect
     }
 )
-#: MAV_AUTOPILOT -> its name, and the profiles that it can take; the first is the one of its own controller.
+#: MAV_AUTOPILOT -> its name, and the profiles that fit; the first is that of its own controller.
 AUTOPILOTS: dict[int, tuple[str, tuple[str, ...]]] = {
     mavlink.MAV_AUTOPILOT_GENERIC: ("generic autopilot", ("mimo",)),
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ("ArduPilot", ("ardupilot-stock",)),
     mavlink.MAV_AUTOPILOT_PX4: ("PX4", ("px4-stock", "mimo")),
 }
-#: MAV_AUTOPILOT that can fly our module -> a parameter that its own controller has, of every version.
+#: MAV_AUTOPILOT that can run our module -> a parameter of its own controller, in every version.
 STOCK_PARAMETERS = {mavlink.MAV_AUTOPILOT_PX4: "MC_ROLL_P"}
-#: MAV_TYPE -> the usual word, where its name in MAVLink is another.
-WORDS = {
+#: MAV_TYPE -> the usual name, where MAVLink's differs.
+USUAL_NAMES = {
     mavlink.MAV_TYPE_GENERIC: "vehicle",
     mavlink.MAV_TYPE_FIXED_WING: "plane",
     mavlink.MAV_TYPE_GROUND_ROVER: "rover",
@@ -38,34 +38,34 @@ WORDS = {
 
 
 def describe(vehicle: Heartbeat) -> str:
-    """Type and autopilot in words, such as ``a quadrotor with PX4``."""
+    """Type and autopilot, such as ``a quadrotor with PX4``."""
     number = f"MAV_AUTOPILOT {vehicle.autopilot}"
     kind, autopilot = mavlink.enums["MAV_TYPE"].get(vehicle.type), AUTOPILOTS.get(vehicle.autopilot, (number, ()))[0]
-    name = WORDS.get(vehicle.type) or (kind.name[len("MAV_TYPE_") :] if kind else f"MAV_TYPE {vehicle.type}")
-    words = f"{name.lower().replace('_', ' ')} with {autopilot}"
-    return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
+    name = USUAL_NAMES.get(vehicle.type) or (kind.name[len("MAV_TYPE_") :] if kind else f"MAV_TYPE {vehicle.type}")
+    text = f"{name.lower().replace('_', ' ')} with {autopilot}"
+    return f"{'an' if text[0] in 'aeiou' else 'a'} {text}"
 
 
 def check_kind(vehicle: Heartbeat, profile: str) -> None:
-    """Refuse a vehicle that a profile does not fit.
+    """Refuse a vehicle that does not fit a profile.
 
     Parameters
     ----------
     vehicle : Heartbeat
-        What it says that it is.
+        Its HEARTBEAT.
     profile : str
-        Key of `sitl.mavlink.ground_station.profiles.PROFILES`; empty: any vehicle will do.
+        Key of `sitl.mavlink.ground_station.profiles.PROFILES`; empty: any vehicle.
 
     Raises
     ------
     SitlError
-        Naming the vehicle, and the profile that fits.
+        If it does not fit; names the vehicle and the profile that fits.
     """
     if not profile:
         return
     if vehicle.type not in MULTIROTORS:
         raise SitlError(
-            f"the vehicle is {describe(vehicle)} (system {vehicle.system}): the gains are a multirotor's, and no "
+            f"the vehicle is {describe(vehicle)} (system {vehicle.system}): the gains are for a multirotor, and no "
             "profile fits; nothing was written"
         )
     fitting = AUTOPILOTS.get(vehicle.autopilot, ("", (profile,)))[1]
@@ -76,9 +76,9 @@ def check_kind(vehicle: Heartbeat, profile: str) -> None:
         )
 
 
-def without_module(vehicle: Heartbeat) -> str:
-    """What to say of a stock autopilot that could fly our module and does not."""
+def describe_missing_module(vehicle: Heartbeat) -> str:
+    """Message for an autopilot that could run our module, but runs only its stock controllers."""
     return (
         f"the vehicle is {describe(vehicle)} and its stock controllers, and has none of our parameters; the profile "
-        f"that fits is {AUTOPILOTS[vehicle.autopilot][1][0]}, or flash what `mimopilot generate` emits for mimo"
+        f"that fits is {AUTOPILOTS[vehicle.autopilot][1][0]}; for mimo, flash the firmware of `mimopilot generate`"
     )

@@ -1,7 +1,15 @@
-"""A vehicle in the air that is not ours: it has an injector, tells of its flight, and something happens to it."""
+"""A scripted flying vehicle with an injector: it streams its flight state, and events change it."""
 
 from mimopilot.sitl.autopilot.excitation_injector import AXIS, Conditions, Injector
-from mimopilot.sitl.mavlink.ground_station.events import Attitude, Excited, Heartbeat, Landed, Request, Text, Value
+from mimopilot.sitl.mavlink.ground_station.events import (
+    AttitudeReport,
+    Heartbeat,
+    InjectorState,
+    LandedState,
+    ParameterValue,
+    SetMessageInterval,
+    StatusText,
+)
 from mimopilot.tuning.parameters import EXCITATION
 
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle
@@ -11,8 +19,8 @@ TS = 0.02
 
 
 class FlyingVehicle(ScriptedVehicle):
-    """Hovers. `integers`: its whole numbers are INT32, as on a PX4; `then`: time (s) -> what happens then; `careless`:
-    its own injector stops for nothing."""
+    """Hovers. `integers`: integer parameters are INT32, as on PX4; `then`: time (s) -> event; `careless`: its own
+    injector never stops by itself."""
 
     def __init__(self, integers=False, then=None, careless=False, **values):
         names = {setting.name: setting.default for setting in EXCITATION}
@@ -30,7 +38,7 @@ class FlyingVehicle(ScriptedVehicle):
         return [] if "HEARTBEAT" in self.silent else [Heartbeat(1, 1, 12 if self.whole else 0, self.armed, self.mode)]
 
     def value(self, name):
-        return Value(1, 1, name, self.values[name], 6 if name in self.whole else 9)
+        return ParameterValue(1, 1, name, self.values[name], 6 if name in self.whole else 9)
 
     def store(self, name, value):
         answer = super().store(name, value)
@@ -38,13 +46,13 @@ class FlyingVehicle(ScriptedVehicle):
         return answer
 
     def answer(self, order):
-        if isinstance(order, Request):
+        if isinstance(order, SetMessageInterval):
             self.asked.add(order.message)
             return []
         return super().answer(order)
 
-    def tell(self, now):
-        """What it tells ten times a second."""
+    def stream(self, now):
+        """Messages that it streams, at 10 Hz."""
         for at in [at for at in self.then if at <= now]:
             self.then.pop(at)(self)
         while self.stepped < now:
@@ -53,14 +61,14 @@ class FlyingVehicle(ScriptedVehicle):
             conditions = Conditions(self.armed and self.landed == 2, mode, (self.tilt, 0.0), (0.0,) * 4)
             hover = Conditions(True, 4, (0.0, 0.0), (0.0,) * 4)
             self.moments.append(self.injector.step(hover if self.careless else conditions))
-        said = [Text(1, 1, text) for text in self.injector.said]
+        said = [StatusText(1, 1, text) for text in self.injector.said]
         self.injector.said.clear()
-        told = {
-            30: Attitude(1, 1, self.tilt, 0.0),
-            250: Excited(1, 1, self.injector.phase.published, round(1e6 * now)),
-            245: Landed(1, 1, self.landed),
+        streamed = {
+            30: AttitudeReport(1, 1, self.tilt, 0.0),
+            250: InjectorState(1, 1, self.injector.phase.published, round(1e6 * now)),
+            245: LandedState(1, 1, self.landed),
         }
-        return said + [word for number, word in told.items() if number in self.asked - self.silent]
+        return said + [message for number, message in streamed.items() if number in self.asked - self.silent]
 
     @property
     def exciting(self):
@@ -68,5 +76,5 @@ class FlyingVehicle(ScriptedVehicle):
 
     @property
     def settings(self):
-        """Its parameters, but for the one that starts."""
+        """Its parameters, except the one that starts the injector."""
         return {name: value for name, value in self.values.items() if name != AXIS}

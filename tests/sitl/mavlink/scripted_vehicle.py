@@ -1,7 +1,7 @@
-"""A vehicle that is not ours: it holds parameters, and fails in one named way. And a link that is simulated in time.
+"""A scripted vehicle with parameters and one fault, and a link in simulated time.
 
-The vehicle hears and says the events of `sitl.mavlink.ground_station.events`; `UdpVehicle` puts it behind a real
-socket with pymavlink's own packing, for the commands.
+The vehicle receives and sends the messages of `sitl.mavlink.ground_station.events`. `UdpVehicle` connects it to a real
+socket with pymavlink's own packing, for tests of the commands.
 """
 
 import contextlib
@@ -18,22 +18,22 @@ import tty
 
 from mimopilot.sitl.mavlink.ground_station.events import (
     HEARTBEAT,
-    THE_PEER,
-    Ack,
-    Heard,
+    SOLE_PEER,
+    CommandAck,
     Heartbeat,
-    Read,
-    Refusal,
-    RequestOnce,
-    Store,
-    Value,
-    Write,
+    ParameterRefusal,
+    ParameterValue,
+    ReadParameter,
+    Received,
+    RequestMessage,
+    SetParameter,
+    StoreParameters,
 )
 from pymavlink.dialects.v20 import common as mavlink
 
 SYSTEM, COMPONENT = 1, 1
-TELL_S = 0.1
-#: Faults that must end in anything but success, whatever the link does.
+STREAM_S = 0.1
+#: Faults after which no upload may be reported as verified, on any link.
 FAILING = (
     *("echoes", "echoes one", "ignores", "clamps", "rounds", "out of range", "read only", "denies"),
     *("deaf to one", "arms", "dies", "forgets", "swaps", "integer"),
@@ -45,36 +45,36 @@ def float32(value):
 
 
 class ScriptedVehicle:
-    """Parameters and one fault, which concerns the parameter `victim`; it begins after `after` writes."""
+    """Parameters and one fault, of the parameter `faulty`, which begins after `after` writes."""
 
-    def __init__(self, values, fault="", victim="", after=0, storage=0):
+    def __init__(self, values, fault="", faulty="", after=0, storage=0):
         self.values = {name: float32(value) for name, value in values.items()}
-        self.fault, self.victim, self.after, self.storage = fault, victim, after, storage
+        self.fault, self.faulty, self.after, self.storage = fault, faulty, after, storage
         self.armed = self.dead = False
         self.autopilot, self.type = 12, 2  # a quadrotor with PX4
-        self.first = self.values.get(victim, 0.0)
+        self.first = self.values.get(faulty, 0.0)
         self.writes = self.reads = self.stored = 0
 
     def heartbeat(self):
         return [] if self.dead else [Heartbeat(SYSTEM, COMPONENT, self.autopilot, self.armed, 0, self.type)]
 
     def value(self, name):
-        kind = 6 if self.fault == "integer" and name == self.victim else 9
-        return Value(SYSTEM, COMPONENT, name, self.values[name], kind)
+        kind = 6 if self.fault == "integer" and name == self.faulty else 9
+        return ParameterValue(SYSTEM, COMPONENT, name, self.values[name], kind)
 
     def answer(self, order):
         if self.dead:
             return []
-        if isinstance(order, Store):
+        if isinstance(order, StoreParameters):
             self.stored += 1
-            return [] if self.storage is None else [Ack(SYSTEM, COMPONENT, 245, self.storage)]
-        if order == RequestOnce(SYSTEM, COMPONENT, HEARTBEAT):
+            return [] if self.storage is None else [CommandAck(SYSTEM, COMPONENT, 245, self.storage)]
+        if order == RequestMessage(SYSTEM, COMPONENT, HEARTBEAT):
             return self.heartbeat()
-        if not isinstance(order, Read | Write) or (order.system, order.component) != (SYSTEM, COMPONENT):
+        if not isinstance(order, ReadParameter | SetParameter):
             return []
-        if order.name not in self.values:
-            return []  # as PX4 up to 1.17
-        if isinstance(order, Read):
+        if (order.system, order.component) != (SYSTEM, COMPONENT) or order.name not in self.values:
+            return []  # a missing parameter is not answered, as by PX4 up to 1.17
+        if isinstance(order, ReadParameter):
             self.reads += 1
             return [self.value(order.name)]
         return self.write(order.name, float32(order.value))
@@ -91,14 +91,14 @@ class ScriptedVehicle:
         return self.store(name, value)
 
     def store(self, name, value):
-        hit = name == self.victim
+        hit = name == self.faulty
         if self.fault == "echoes" or (self.fault == "echoes one" and hit):
-            return [Value(SYSTEM, COMPONENT, name, value)]
+            return [ParameterValue(SYSTEM, COMPONENT, name, value)]
         if self.fault == "ignores" and hit:
             return [self.value(name)]
         reasons = {"out of range": 2, "denies": 3, "read only": 5}
         if self.fault in reasons and hit:
-            return [Refusal(SYSTEM, COMPONENT, name, reasons[self.fault]), self.value(name)]
+            return [ParameterRefusal(SYSTEM, COMPONENT, name, reasons[self.fault]), self.value(name)]
         if self.fault == "deaf to one" and hit:
             return []
         if self.fault == "clamps" and hit:
@@ -119,10 +119,10 @@ class ScriptedVehicle:
 
 
 class SimulatedLink:
-    """A link with loss, duplicates, reordering and latency each way, in simulated time; see words.Link."""
+    """A link with loss, duplicates, reordering and latency each way, in simulated time; see events.Link."""
 
     def __init__(self, vehicle, seed=0, loss=0.0, duplicate=0.0, reorder=0.0, latency=0.05, noise=()):
-        self.vehicles, self.closed, self.time = {THE_PEER: vehicle}, False, 0.0
+        self.vehicles, self.closed, self.time = {SOLE_PEER: vehicle}, False, 0.0
         self.random = random.Random(seed)
         self.loss, self.duplicate, self.reorder, self.latency = loss, duplicate, reorder, latency
         self.order = itertools.count()
@@ -130,12 +130,12 @@ class SimulatedLink:
         self.up = True
         self.noise = noise
         self.log = []
-        self.schedule(self.random.random(), "beat", THE_PEER)
-        if hasattr(vehicle, "tell"):
-            self.schedule(0.0, "tell", None)
+        self.schedule(self.random.random(), "beat", SOLE_PEER)
+        if hasattr(vehicle, "stream"):
+            self.schedule(0.0, "stream", None)
 
     def join(self, at, origin, vehicle):
-        """Another vehicle at another address, from a time (s) on."""
+        """Add a vehicle at another address from a time (s) on."""
         self.vehicles[origin] = vehicle
         self.schedule(at, "beat", origin)
 
@@ -146,7 +146,7 @@ class SimulatedLink:
         heapq.heappush(self.queue, (at, next(self.order), kind, message))
 
     def carry(self, kind, message):
-        """One message on its way, or none, or two."""
+        """Deliver a message once, twice or not at all."""
         chance = self.random.random
         for _ in range(1 + (chance() < self.duplicate)):
             if self.up and chance() >= self.loss:
@@ -159,11 +159,11 @@ class SimulatedLink:
             for target in self.vehicles if to is None else [to]:
                 self.carry("to vehicle", (target, message))
 
-    def say(self, messages, origin=THE_PEER):
+    def say(self, messages, origin=SOLE_PEER):
         for message in messages:
-            self.carry("to ground", Heard(origin, message))
+            self.carry("to ground", Received(origin, message))
             for other in self.noise:
-                self.carry("to ground", Heard(origin, other(message)))
+                self.carry("to ground", Received(origin, other(message)))
 
     def receive(self, until):
         while self.queue and self.queue[0][0] <= until:
@@ -172,9 +172,9 @@ class SimulatedLink:
             if kind == "beat":
                 self.say(self.vehicles[message].heartbeat(), message)
                 self.schedule(at + 1.0, "beat", message)
-            elif kind == "tell":
-                self.say(self.vehicles[THE_PEER].tell(at))
-                self.schedule(at + TELL_S, "tell", None)
+            elif kind == "stream":
+                self.say(self.vehicles[SOLE_PEER].stream(at))
+                self.schedule(at + STREAM_S, "stream", None)
             elif self.up and kind == "to vehicle":
                 target, order = message
                 self.say(self.vehicles[target].answer(order), target)
@@ -185,37 +185,37 @@ class SimulatedLink:
 
 
 def encode(message):
-    """pymavlink's message for a word of the vehicle."""
+    """pymavlink's message of a message of the vehicle."""
     if isinstance(message, Heartbeat):
         mode = 128 if message.armed else 0
         return mavlink.MAVLink_heartbeat_message(message.type, message.autopilot, mode, 0, 4, 3)
-    if isinstance(message, Value):
+    if isinstance(message, ParameterValue):
         # Index 65535: unknown.
         return mavlink.MAVLink_param_value_message(message.name.encode(), message.value, message.kind, 100, 65535)
-    if isinstance(message, Refusal):
+    if isinstance(message, ParameterRefusal):
         return mavlink.MAVLink_param_error_message(255, 190, message.name.encode(), -1, message.reason)
     return mavlink.MAVLink_command_ack_message(message.command, message.result)
 
 
 def decode(message):
-    """Word that the vehicle understands, of a pymavlink message; None when it is none of them."""
+    """Message to the vehicle, from pymavlink's; None if the vehicle does not know it."""
     kind = message.get_type()
     if kind == "PARAM_REQUEST_READ":
         assert message.param_index == -1
-        return Read(message.target_system, message.target_component, message.param_id)
+        return ReadParameter(message.target_system, message.target_component, message.param_id)
     if kind == "PARAM_SET":
         assert message.param_type == 9
-        return Write(message.target_system, message.target_component, message.param_id, message.param_value)
+        return SetParameter(message.target_system, message.target_component, message.param_id, message.param_value)
     if kind == "COMMAND_LONG":
         if message.command == 512:
-            return RequestOnce(message.target_system, message.target_component, message.param1)
+            return RequestMessage(message.target_system, message.target_component, message.param1)
         assert (message.command, message.param1) == (245, 1.0)
-        return Store(message.target_system, message.target_component)
+        return StoreParameters(message.target_system, message.target_component)
     return None
 
 
 class ByteVehicle:
-    """A scripted vehicle that speaks MAVLink in a thread; the transport gives it `receive` and `transmit`."""
+    """A scripted vehicle that runs MAVLink in a thread; subclasses add `receive` and `transmit`."""
 
     def __init__(self, vehicle, beat=0.1, delay=0.0, key=None, late=0.0):
         self.vehicle, self.beat, self.delay = vehicle, beat, delay
@@ -230,7 +230,7 @@ class ByteVehicle:
         self.thread = threading.Thread(target=self.run)
 
     def set_clock(self):
-        """Its own time of signing, `late` s behind."""
+        """Set its signing clock `late` s behind."""
         self.mav.signing.timestamp = int((time.time() - 1420070400 - self.late) * 1e5)
 
     def __enter__(self):
@@ -254,7 +254,7 @@ class ByteVehicle:
                 message = outbox.pop(0)[1]
                 self.mav.srcSystem, self.mav.srcComponent = message.system, message.component
                 if self.late:
-                    self.set_clock()  # pymavlink would take over the time of whom it hears
+                    self.set_clock()  # pymavlink advances it to the time of received messages
                 self.transmit(encode(message).pack(self.mav))
                 self.mav.seq = (self.mav.seq + 1) % 256
             wake = min([due, *(at for at, _ in outbox[:1])])
@@ -262,12 +262,12 @@ class ByteVehicle:
             for message in self.mav.parse_buffer(data) or [] if data else []:
                 order = decode(message)
                 if order is not None:
-                    # The whole round trip is put on the way back: the ground cannot tell.
+                    # The whole round trip delays the answer: the ground station cannot see the difference.
                     outbox += [(time.monotonic() + self.delay, answer) for answer in self.vehicle.answer(order)]
 
 
 class UdpVehicle(ByteVehicle):
-    """Behind a UDP socket: it speaks to a ground station's port first."""
+    """On a UDP socket: it sends to a ground station's port first."""
 
     def __init__(self, vehicle, **keywords):
         super().__init__(vehicle, **keywords)
@@ -292,7 +292,7 @@ class UdpVehicle(ByteVehicle):
 
 
 class TcpVehicle(ByteVehicle):
-    """Behind a TCP port: the ground station connects."""
+    """On a TCP port: the ground station connects."""
 
     def __init__(self, vehicle, **keywords):
         super().__init__(vehicle, **keywords)
@@ -325,7 +325,7 @@ class TcpVehicle(ByteVehicle):
 
 
 class SerialVehicle(ByteVehicle):
-    """Behind a serial port: a pseudo-terminal."""
+    """On a serial port: a pseudo-terminal."""
 
     def __init__(self, vehicle, **keywords):
         super().__init__(vehicle, **keywords)

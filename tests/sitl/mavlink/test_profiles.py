@@ -1,4 +1,4 @@
-"""What gains become in the parameters of our module and of stock autopilots."""
+"""Conversion of gains to the parameters of our module and of stock autopilots."""
 
 import dataclasses
 import math
@@ -9,7 +9,7 @@ from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import single
-from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, off_diagonals, restoration
+from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, make_restore_plan, off_diagonal_shares
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.parameters import MATRICES, PARAMETERS
@@ -17,12 +17,12 @@ from mimopilot.tuning.parameters import MATRICES, PARAMETERS
 
 @pytest.fixture
 def diagonal(gains):
-    """The set without its off-diagonals, and with a gentle yaw."""
+    """The gains without their off-diagonals."""
     matrices = {name: np.diag(np.diag(getattr(gains, name))) for name in MATRICES}
     return dataclasses.replace(gains, **matrices)
 
 
-def test_our_module_gets_every_writable_parameter_with_the_bits_of_the_struct(gains):
+def test_our_module_receives_every_writable_parameter_bit_identical_to_the_struct(gains):
     plan = make_plan(gains)
     array = {p.name: float(v) for p, v in zip(PARAMETERS, to_array(gains), strict=True)}
     assert plan.fixed == {"MIMO_TS": array.pop("MIMO_TS")}
@@ -32,7 +32,7 @@ def test_our_module_gets_every_writable_parameter_with_the_bits_of_the_struct(ga
 
 
 def test_px4s_parameters_describe_the_same_controller(diagonal):
-    """The log reader's own table, which knows nothing of profiles, finds the gains again."""
+    """The log reader, whose table is independent of the profiles, recovers the gains."""
     plan = make_plan(diagonal, "px4-stock")
     found = flown_gains(plan.values, diagonal.Ts)
     for code, value in diagonal.elements().items():
@@ -44,7 +44,7 @@ def test_px4s_parameters_describe_the_same_controller(diagonal):
     assert any("moment_max (pitch, yaw)" in note for note in plan.notes)
 
 
-def test_ardupilots_parameters_are_the_diagonal_in_its_units(diagonal):
+def test_ardupilots_parameters_are_the_diagonal_gains_in_its_units(diagonal):
     values = make_plan(diagonal, "ardupilot-stock").values
     for axis, name in enumerate(("RLL", "PIT", "YAW")):
         if axis == 2:
@@ -62,24 +62,24 @@ def test_ardupilots_parameters_are_the_diagonal_in_its_units(diagonal):
 
 
 @pytest.mark.parametrize("profile", ["px4-stock", "ardupilot-stock"])
-def test_large_off_diagonals_are_not_dropped_unasked(gains, profile):
+def test_large_off_diagonals_are_dropped_only_on_request(gains, profile):
     with pytest.raises(SitlError, match=rf"R[PD]_RP: the {profile} controller has no off-diagonals, .* 13% of"):
         make_plan(gains, profile)
     plan = make_plan(gains, profile, drop=True)
-    assert plan.dropped == off_diagonals(gains)
+    assert plan.dropped == off_diagonal_shares(gains)
     assert plan.dropped["RP_RP"] == pytest.approx(0.02 / 0.15)
     assert plan.dropped["AP_PR"] == pytest.approx(0.2 / 5.5)
     assert len(plan.dropped) == 10
 
 
-def test_an_off_diagonal_beside_a_zero_counts_as_infinite(diagonal):
+def test_an_off_diagonal_in_a_row_with_zero_diagonal_has_an_infinite_share(diagonal):
     odd = dataclasses.replace(diagonal, Kff_i=np.array([[0.0, 0.001], [0.0, 0.0]]))
-    assert off_diagonals(odd) == {"RF_RP": math.inf}
+    assert off_diagonal_shares(odd) == {"RF_RP": math.inf}
     with pytest.raises(SitlError, match="RF_RP"):
         make_plan(odd, "px4-stock")
 
 
-def test_small_off_diagonals_are_dropped_and_told(diagonal):
+def test_small_off_diagonals_are_dropped_and_reported(diagonal):
     small = dataclasses.replace(diagonal, Kp_i=np.array([[0.15, 0.003], [0.0, 0.13]]))
     assert make_plan(small, "px4-stock").dropped == {"RP_RP": pytest.approx(0.02)}
 
@@ -99,30 +99,30 @@ def test_small_off_diagonals_are_dropped_and_told(diagonal):
         ("betaflight", {}, "--profile: got 'betaflight', expected one of mimo, px4-stock, ardupilot-stock"),
     ],
 )
-def test_what_a_vehicle_would_take_without_a_word_is_refused_here(diagonal, profile, change, message):
+def test_values_out_of_range_that_a_vehicle_would_accept_are_refused(diagonal, profile, change, message):
     with pytest.raises((SitlError, CodegenError), match=message):
         make_plan(dataclasses.replace(diagonal, **change), profile)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_every_name_and_value_can_go_over_the_wire(diagonal, profile):
+def test_every_name_and_value_fits_a_mavlink_message(diagonal, profile):
     for name, value in make_plan(diagonal, profile).values.items():
         assert len(name) <= 16
         assert name == name.upper()
         assert value == single(value)
 
 
-def test_a_snapshot_is_a_whole_set_within_our_ranges(diagonal):
+def test_a_snapshot_must_be_complete_and_within_our_ranges(diagonal):
     values = make_plan(diagonal).values
-    plan = restoration(values | {"MIMO_TS": 0.004, "SYS_X": 1e9}, "old.params")
+    plan = make_restore_plan(values | {"MIMO_TS": 0.004, "SYS_X": 1e9}, "old.params")
     assert plan.values == values | {"SYS_X": 1e9}
     assert (plan.fixed, plan.profile) == ({"MIMO_TS": 0.004}, "mimo")
     assert [s.unit for s in plan.settings][:1] == ["1/s"]
     with pytest.raises(SitlError, match=r"old\.params: MIMO_RP_RR: got 99, expected -?[0-9.e-]+ to 5 s"):
-        restoration(values | {"MIMO_RP_RR": 99.0}, "old.params")
+        make_restore_plan(values | {"MIMO_RP_RR": 99.0}, "old.params")
     with pytest.raises(SitlError, match=r"holds 33 of our 35 gains and lacks MIMO_RP_RP and 1 more"):
-        restoration({n: v for n, v in values.items() if n not in ("MIMO_RP_RP", "MIMO_D_POLE")}, "old.params")
-    foreign = restoration({"MC_ROLL_P": 99.0}, "px4.params")
+        make_restore_plan({n: v for n, v in values.items() if n not in ("MIMO_RP_RP", "MIMO_D_POLE")}, "old.params")
+    foreign = make_restore_plan({"MC_ROLL_P": 99.0}, "px4.params")
     assert (foreign.values, foreign.profile) == ({"MC_ROLL_P": 99.0}, "px4-stock")
-    assert restoration({"ATC_ANG_RLL_P": 5.0}, "x").profile == "ardupilot-stock"
-    assert restoration({"WPNAV_SPEED": 5.0}, "x").profile == ""
+    assert make_restore_plan({"ATC_ANG_RLL_P": 5.0}, "x").profile == "ardupilot-stock"
+    assert make_restore_plan({"WPNAV_SPEED": 5.0}, "x").profile == ""
