@@ -371,7 +371,7 @@ def upload(
     """
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
-    from mimopilot.sitl.mavlink.ground_station.transaction import transact
+    from mimopilot.sitl.mavlink.ground_station.transaction import upload_and_verify
     from mimopilot.tuning.acceptance import check_verdict
 
     loaded = _gains(gains)
@@ -388,7 +388,9 @@ def upload(
         snapshot=Path(snapshot) if snapshot else None,
         stem=source.with_name(source.name.removesuffix(".toml").removesuffix(".gains")),
     )
-    return transact(make_plan(loaded, profile, drop_off_diagonals), options, loaded, moment_scale)
+    done = upload_and_verify(make_plan(loaded, profile, drop_off_diagonals), options, loaded, moment_scale)
+    done.check()
+    return done.outcome
 
 
 def vehicle(airframe: PathLike | Airframe, gains: GainSet | None = None) -> tuple[Airframe, Gains]:

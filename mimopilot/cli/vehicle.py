@@ -74,7 +74,7 @@ def upload(
 
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
-    from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, upload_and_verify
+    from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, upload_with_dialogue
     from mimopilot.tuning.acceptance import check_verdict
     from mimopilot.tuning.gains_file import load_gains
 
@@ -88,7 +88,7 @@ def upload(
     options = LinkOptions(
         connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, gains.with_name(stem)
     )
-    upload_and_verify(plan, options, loaded, scale)
+    upload_with_dialogue(plan, options, loaded, scale)
 
 
 def restore(
@@ -109,7 +109,7 @@ def restore(
     """
     from mimopilot.sitl.mavlink.ground_station.profiles import make_restore_plan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
-    from mimopilot.sitl.mavlink.ground_station.upload_console import upload_and_verify
+    from mimopilot.sitl.mavlink.ground_station.upload_console import upload_with_dialogue
     from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 
     plan = make_restore_plan(read_parameters(parameters), str(parameters))
@@ -117,7 +117,7 @@ def restore(
         re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
     )  # a snapshot's next one is its sister
     options = LinkOptions(connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, stem)
-    upload_and_verify(plan, options)
+    upload_with_dialogue(plan, options)
 
 
 def params(

@@ -1,4 +1,4 @@
-"""The commands `upload` and `restore`: tables before and after, confirmation, snapshot, result."""
+"""What a user of `upload` and `restore` sees: the tables before and after, and the question."""
 
 from __future__ import annotations
 
@@ -10,27 +10,13 @@ from typing import Literal
 import typer
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Heartbeat, shortest
-from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S
-from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, violated_range
-from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
-from mimopilot.sitl.mavlink.ground_station.upload import SMALLEST_CHANGE, UploadOutcome, write_and_verify
-from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
-from mimopilot.sitl.physics.moment_scale import check_moment_scale
+from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan
+from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+from mimopilot.sitl.mavlink.ground_station.transaction import STORAGE, Upload, upload_and_verify
+from mimopilot.sitl.mavlink.ground_station.upload import SMALLEST_CHANGE
 from mimopilot.tuning.gains import Gains, Triple
 
 from mimopilot.common.console import print_json, print_table
-from mimopilot.common.files import write_atomically
-
-#: `UploadOutcome.storage` -> message.
-STORAGE = {
-    "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",
-    "autosave": f"storage was not acknowledged: waited {AUTOSAVE_S:g} s, in which PX4 and ArduPilot save by themselves",
-    "denied": "not stored: the vehicle refused it (PREFLIGHT_STORAGE: MAV_RESULT_DENIED)",
-    "failed": "not stored: the vehicle could not (PREFLIGHT_STORAGE: MAV_RESULT_FAILED)",
-    "": "the link was lost before storage was acknowledged",
-}
-#: Results of storage after which the vehicle loses the values when it restarts.
-UNSTORED = ("denied", "failed")
 
 
 def parse_scale(text: str | None) -> Triple | Literal["flown"] | None:
@@ -52,21 +38,26 @@ def parse_scale(text: str | None) -> Triple | Literal["flown"] | None:
     return r, p, y
 
 
-def upload_and_verify(
+class TerminalDialogue:
+    """Tables and a question on the terminal."""
+
+    def show_plan(self, plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat) -> None:
+        """Print old and new values."""
+        _show_plan(plan, held, vehicle)
+
+    def confirm(self, changes: int, system: int) -> None:
+        """Ask; ends the command where the answer is no."""
+        typer.confirm(f"Write {changes} parameters to vehicle {system}?", abort=True)
+
+    def saved(self, path: Path) -> None:
+        """Print where the old values are."""
+        print(f"old values saved: {path}")
+
+
+def upload_with_dialogue(
     plan: UploadPlan, options: LinkOptions, gains: Gains | None = None, scale: Triple | Literal["flown"] | None = None
 ) -> None:
-    """Read, check, show, confirm, save the old values, write and verify; print the result.
-
-    Parameters
-    ----------
-    plan : UploadPlan
-        What to write.
-    options : LinkOptions
-        How to reach the vehicle, and what to ask.
-    gains : Gains, optional
-        The gains of the plan: their unit of torque must then be the vehicle's.
-    scale : tuple of 3 float (N m), or ``flown``, optional
-        The vehicle's unit of torque, or ``flown``: the gains were tuned in it. By default it is read from the vehicle.
+    """An upload, or with ``--dry-run`` a comparison, as the command line shows it; see `upload_and_verify`.
 
     Raises
     ------
@@ -75,80 +66,15 @@ def upload_and_verify(
     """
     if not (options.yes or options.dry_run) and (options.as_json or not sys.stdin.isatty()):
         raise SitlError("no terminal to ask for confirmation: give --yes to write, or --dry-run to compare")
-    if options.snapshot is not None and options.snapshot.exists():
-        raise SitlError(
-            f"{options.snapshot}: exists already, and may be the only copy of older values; name another file"
-        )
-    if gains is not None and isinstance(scale, tuple):
-        check_moment_scale(gains, scale, "the vehicle")
-    ask_scale = gains is not None and scale is None
-    if ask_scale and not plan.scale:
-        raise SitlError(
-            "a stock vehicle does not publish how many N m one unit of its torque is; give --moment-scale "
-            "ROLL,PITCH,YAW, or --moment-scale flown if the gains come from a log of this vehicle"
-        )
-    with open_session(options) as vehicle:
-        held = vehicle.read([*plan.values, *plan.fixed, *(plan.scale if ask_scale else ())], plan.profile)
-        _check_vehicle(plan, held, vehicle, options)
-        if ask_scale and gains is not None:
-            check_moment_scale(gains, [held[name] for name in plan.scale], "the vehicle")
-        if not options.as_json:
-            _show_plan(plan, held, vehicle.vehicle)
-        changes = [name for name, value in plan.values.items() if value != held[name]]
-        snapshot = None
-        if options.dry_run:
-            outcome = UploadOutcome("dry run", "", {name: (held[name],) for name in plan.values})
-        else:
-            if changes and not options.yes:
-                typer.confirm(f"Write {len(changes)} parameters to vehicle {vehicle.vehicle.system}?", abort=True)
-                vehicle.link.discard()
-                vehicle.client.resume(vehicle.link.now())
-                if vehicle.read(list(held), plan.profile) != held:
-                    raise SitlError(
-                        "the vehicle's values changed while waiting for the answer: run it again", exit_code=1
-                    )
-            snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
-            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held))
-        _report(plan, held, vehicle.vehicle, outcome, snapshot, options)
-
-
-def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session, options: LinkOptions) -> None:
-    for name, value in plan.fixed.items():
-        if held[name] != value:
-            raise SitlError(
-                f"{name}: the vehicle has {held[name]:.6g}, the gains are for {value:.6g}; generate its firmware "
-                "again, or tune for what it has"
-            )
-    for name in plan.values:
-        if not abs(held[name]) < float("inf"):
-            raise SitlError(
-                f"{name}: the vehicle holds {held[name]}, which could not be restored; set it by hand first"
-            )
-        expected = violated_range(name, held[name])
-        if expected:
-            raise SitlError(
-                f"{name}: the vehicle holds {held[name]:.6g}, expected {expected}: restore would refuse it; set it by "
-                "hand first"
-            )
-    if vehicle.vehicle.armed and not (options.force_armed or options.dry_run):
-        raise SitlError("the vehicle is armed: nothing was written; disarm it, or give --force-armed", exit_code=1)
-
-
-def _save_snapshot(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat, options: LinkOptions) -> Path:
-    """Write the old values to a new file: an older snapshot may be the only copy of its values."""
-    path, number = options.snapshot, 0
-    while path is None or path.exists():
-        number += 1
-        path = options.stem.with_name(f"{options.stem.name}.before-{number}.params")
-    old = {name: held[name] for name in plan.values}
-    write_atomically(path, parameter_text("qgc", old, vehicle.system, vehicle.component))
-    if read_parameters(path) != old:
-        raise SitlError(
-            f"{path}: does not read back as written; nothing was sent to the vehicle; check the disk", exit_code=1
-        )
-    if not options.as_json:
-        print(f"old values saved: {path}")
-    return path
+    done = upload_and_verify(plan, options, gains, scale, None if options.as_json else TerminalDialogue())
+    if options.as_json:
+        _print_json(done)
+    elif done.outcome.state == "verified":
+        rows = [[s.name, s.unit, shortest(done.outcome.held[s.name][0])] for s in plan.settings]
+        print_table("read back from the vehicle", ["parameter", "unit", "value"], rows)
+        written = sum(s.value != done.held[s.name] for s in plan.settings)
+        print(f"{len(rows)} parameters verified, {written} of them written; {STORAGE[done.outcome.storage]}")
+    done.check()
 
 
 def _show_plan(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat) -> None:
@@ -176,65 +102,21 @@ def _show_plan(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat) 
         print(f"note: {note}")
 
 
-def _report(
-    plan: UploadPlan,
-    held: Mapping[str, float],
-    vehicle: Heartbeat,
-    outcome: UploadOutcome,
-    snapshot: Path | None,
-    options: LinkOptions,
-) -> None:
-    """Print the result; raise unless it is verified and stored, or a dry run."""
-    if options.as_json:
-        print_json(
-            {
-                "vehicle": vehicle._asdict(),
-                "state": outcome.state,
-                "reason": outcome.reason,
-                "storage": outcome.storage,
-                "armed": outcome.armed,
-                "snapshot": str(snapshot) if snapshot else None,
-                "parameters": {
-                    s.name: {
-                        "unit": s.unit,
-                        "before": held[s.name],
-                        "new": s.value,
-                        "held": outcome.held[s.name],
-                    }
-                    for s in plan.settings
-                },
-                "dropped": plan.dropped,
-                "notes": plan.notes,
-            }
-        )
-    if outcome.state == "verified":
-        if not options.as_json:
-            rows = [[s.name, s.unit, shortest(outcome.held[s.name][0])] for s in plan.settings]
-            print_table("read back from the vehicle", ["parameter", "unit", "value"], rows)
-            written = sum(s.value != held[s.name] for s in plan.settings)
-            print(f"{len(rows)} parameters verified, {written} of them written; {STORAGE[outcome.storage]}")
-        if outcome.storage in UNSTORED:
-            raise SitlError(
-                f"all values were read back, but {STORAGE[outcome.storage]}: it loses them when it restarts",
-                exit_code=1,
-            )
-    elif outcome.state != "dry run":
-        raise SitlError(_failure(outcome, held, snapshot, options), exit_code=1)
-
-
-def _failure(outcome: UploadOutcome, held: Mapping[str, float], snapshot: Path | None, options: LinkOptions) -> str:
-    if outcome.state == "untouched":
-        return f"{outcome.reason}; nothing was written"
-    armed = ", although the vehicle was armed" if outcome.armed else ""
-    stored = f"; {STORAGE[outcome.storage]}" if outcome.storage in UNSTORED else ""
-    if outcome.state == "rolled back":
-        return f"{outcome.reason}; the old values were restored and read back{armed}{stored}"
-    left = [
-        f"{name} holds {' or '.join(shortest(value) for value in values)}"
-        for name, values in outcome.held.items()
-        if values != (held[name],)
-    ]
-    rest = "the others hold their old values" if left else "the old values were written, but not all were read back"
-    sent = f"old values were sent{armed}" if armed else ""
-    again = f"restore with: mimopilot restore {snapshot} --connect {options.connect}"
-    return "; ".join(part for part in [outcome.reason, *left, rest, sent, again] if part) + stored
+def _print_json(done: Upload) -> None:
+    outcome = done.outcome
+    print_json(
+        {
+            "vehicle": done.vehicle._asdict(),
+            "state": outcome.state,
+            "reason": outcome.reason,
+            "storage": outcome.storage,
+            "armed": outcome.armed,
+            "snapshot": str(done.snapshot) if done.snapshot else None,
+            "parameters": {
+                s.name: {"unit": s.unit, "before": done.held[s.name], "new": s.value, "held": outcome.held[s.name]}
+                for s in done.plan.settings
+            },
+            "dropped": done.plan.dropped,
+            "notes": done.plan.notes,
+        }
+    )
