@@ -69,14 +69,10 @@ def altitude_hold(altitude, climb, target, hover, tilt):  # type: ignore[no-unty
 
 
 @compiled
-def tick(loop, collective, altitude, measurement, row):  # type: ignore[no-untyped-def]
-    """One control period: `row.setpoint` and `row.excitation` are given, the rest of `row` is filled.
-
-    `altitude` is the one to hold (m) and `collective` then the thrust fraction of hover. When `altitude` is NaN, the
-    collective is given. Motor commands are 0 while the vehicle is disarmed.
-    """
+def tick_unpacked(step_address, state, input_rows, output_rows, allocation, collective, altitude, measurement, row):  # type: ignore[no-untyped-def]
+    """`tick` for compiled loops: with a tuple, numba counts the references of its arrays in each call."""
     roll, pitch, yaw = euler_angles(measurement[0], measurement[1], measurement[2], measurement[3])
-    inputs = loop.inputs[0]
+    inputs = input_rows[0]
     inputs.attitude[0], inputs.attitude[1], inputs.attitude[2] = roll, pitch, yaw
     for i in range(4):
         row.quaternion[i] = measurement[i]
@@ -86,8 +82,8 @@ def tick(loop, collective, altitude, measurement, row):  # type: ignore[no-untyp
         inputs.excitation[i] = row.excitation[i]
         row.attitude[i] = inputs.attitude[i]
         row.rates[i] = inputs.rates[i]
-    call_step(loop.step_address, loop.state.ctypes.data, loop.inputs.ctypes.data, loop.outputs.ctypes.data)
-    outputs = loop.outputs[0]
+    call_step(step_address, state.ctypes.data, input_rows.ctypes.data, output_rows.ctypes.data)
+    outputs = output_rows[0]
     for i in range(3):
         row.moment[i] = outputs.moment[i]
         row.rates_setpoint[i] = outputs.rates_setpoint[i]
@@ -99,7 +95,7 @@ def tick(loop, collective, altitude, measurement, row):  # type: ignore[no-untyp
         # A measurement holds millimetres and cm/s.
         row.collective = altitude_hold(measurement[7] / 1000.0, measurement[8] / 100.0, altitude, collective, tilt)
     if inputs.armed != 0:
-        allocate(row.moment, row.collective, loop.allocation, row.commands, row.unallocated)
+        allocate(row.moment, row.collective, allocation, row.commands, row.unallocated)
     else:
         for i in range(row.commands.shape[0]):
             row.commands[i] = 0.0
@@ -107,6 +103,17 @@ def tick(loop, collective, altitude, measurement, row):  # type: ignore[no-untyp
             row.unallocated[i] = 0.0
     for i in range(3):
         inputs.saturation[i] = int(row.unallocated[i])
+
+
+@compiled
+def tick(loop, collective, altitude, measurement, row):  # type: ignore[no-untyped-def]
+    """One control period: `row.setpoint` and `row.excitation` are given, the rest of `row` is filled.
+
+    `altitude` is the one to hold (m) and `collective` then the thrust fraction of hover. When `altitude` is NaN, the
+    collective is given. Motor commands are 0 while the vehicle is disarmed.
+    """
+    step_address, state, inputs, outputs, allocation = loop
+    tick_unpacked(step_address, state, inputs, outputs, allocation, collective, altitude, measurement, row)
 
 
 class Autopilot:

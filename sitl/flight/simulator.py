@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick
+from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick_unpacked
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT, MAX_TILT_SECONDS
 from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.flight.scenario import Scenario
@@ -115,24 +115,30 @@ def _repeat_outputs(before, record, k):  # type: ignore[no-untyped-def]
 
 @compiled
 def _fly(body, measuring, autopilot, link, before, record, truth):  # type: ignore[no-untyped-def]
-    loop, collective, altitude = autopilot
-    state, measurement = body.state, measuring.measurement
+    # Unpacked once: numba counts the references of a tuple's arrays at each access.
+    (step_address, controller, inputs, outputs, allocation), collective, altitude = autopilot
+    plant, state, steps, step = body
+    sensors, measurement, noise = measuring
+    runs, delays, history, first = link
+    rotors = allocation.mixer.shape[0]
     for k in range(record.shape[0]):
         row, true = record[k], truth[k]
-        measure(state, measuring.noise[k], measuring.sensors, measurement)
-        if link.runs[k] == 0:
+        measure(state, noise[k], sensors, measurement)
+        if runs[k] == 0:
             _repeat_outputs(before, record, k)
-        for _ in range(link.runs[k]):
-            tick(loop, collective, altitude, measurement, row)
+        for _ in range(runs[k]):
+            tick_unpacked(
+                step_address, controller, inputs, outputs, allocation, collective, altitude, measurement, row
+            )
         before = row
         roll, pitch, yaw = euler_angles(state[6], state[7], state[8], state[9])
         true.attitude[0], true.attitude[1], true.attitude[2] = roll, pitch, yaw
         for i in range(3):
             true.position[i], true.velocity[i], true.rates[i] = state[i], state[3 + i], state[10 + i]
-        now = link.first + k
-        for i in range(loop.allocation.mixer.shape[0]):
-            link.history[now % COMMAND_HISTORY, i] = row.commands[i]
-        advance(state, link.history[(now - link.delays[k]) % COMMAND_HISTORY], body.plant, body.steps, body.step)
+        now = first + k
+        for i in range(rotors):
+            history[now % COMMAND_HISTORY, i] = row.commands[i]
+        advance(state, history[(now - delays[k]) % COMMAND_HISTORY], plant, steps, step)
 
 
 class Simulator(SimulatedPlant):

@@ -129,7 +129,7 @@ def test_take_off_climbs_to_the_height_above_the_ground(bench, message, height):
     (ack,) = bench.commands.answer(received(message))
     assert ack.result == ACCEPTED
     assert bench.vehicle.mode is Mode.TAKEOFF
-    assert bench.vehicle._height == pytest.approx(100 + height)
+    assert bench.vehicle._takeoff_altitude == pytest.approx(100 + height)
 
 
 def test_a_take_off_that_is_too_high_is_denied_and_one_unarmed_only_now(bench):
