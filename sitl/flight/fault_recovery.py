@@ -112,7 +112,7 @@ def detection(flight: Flight, begin: int) -> tuple[int, str] | None:
         "motors": _first(record["unallocated"] != 0, persistence),
         "altitude": _first(sunk[:, None], 1),
         "attitude": _first(tilted[:, None], max(1, round(MAX_TILT_SECONDS / Ts))),
-        "set-point": _stale(flight, begin),
+        "set-point": _stale(flight, begin),  # this spelling is a JSON value
     }
     detected = [(sample, how) for how, sample in signs.items() if sample is not None]
     if not detected:

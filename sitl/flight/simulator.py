@@ -127,9 +127,7 @@ def _fly(body, measuring, autopilot, link, before, record, truth):  # type: igno
         if runs[k] == 0:
             _repeat_outputs(before, record, k)
         for _ in range(runs[k]):
-            tick_unpacked(
-                step_address, controller, inputs, outputs, allocation, collective, altitude, measurement, row
-            )
+            tick_unpacked(step_address, controller, inputs, outputs, allocation, collective, altitude, measurement, row)
         before = row
         roll, pitch, yaw = euler_angles(state[6], state[7], state[8], state[9])
         true.attitude[0], true.attitude[1], true.attitude[2] = roll, pitch, yaw
