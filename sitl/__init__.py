@@ -1,4 +1,4 @@
-"""The bench: airframes, plant, sensors, allocation, scenarios, the autopilot host and MAVLink.
+"""Software in the loop: airframes, plant, sensors, autopilot host, faults, flights, MAVLink, campaigns and studies.
 
-This room knows neither how gains were found nor how C++ is rendered; only `sitl.studies` calls tuning.
+Apart from `sitl.studies`, nothing here knows how gains are tuned or how the C++ is rendered.
 """

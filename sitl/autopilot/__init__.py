@@ -1,1 +1,1 @@
-"""The autopilot around the generated controller: estimate, altitude, flight modes, control allocation."""
+"""The autopilot around the generated controller: altitude control, flight modes, setpoints, excitation."""

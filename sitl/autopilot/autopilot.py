@@ -1,12 +1,12 @@
 """One control period of the autopilot host: estimate, altitude hold, the compiled C++, control allocation.
 
-`tick` is compiled by numba and calls the controller's machine code directly; the in-process loop and the
-MAVLink host call this same function.
+`tick` is compiled by numba and calls the machine code of the controller directly. The in-process loop and the MAVLink
+host call this same function.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mimopilot.codegen.cortex_m4 import EmulatedController
@@ -14,16 +14,17 @@ from mimopilot.codegen.layout import INPUT, OUTPUT
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.sitl.physics.compiled import call_step, compiled, inlined
-from mimopilot.sitl.physics.mixer import allocate
+from mimopilot.sitl.physics.mixer import Allocation, allocate
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
-from mimopilot.sitl.physics.rigid_body import GRAVITY
+from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS
 from mimopilot.sitl.physics.state_estimate import euler_angles
 from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
-MAX_ROTORS = 16
+MIN_THRUST_RATIO, MAX_THRUST_RATIO = 0.5, 1.5  # of hover; chosen: altitude hold accelerates by at most half of g
+MIN_TILT_COSINE = 0.5  # 60 degrees, the largest tilt of a setpoint: beyond it thrust is not increased further
 
-#: What one period leaves behind: the signals of a flight log.
+#: Inputs and outputs of one period: the signals of a flight log.
 RECORD = np.dtype(
     [
         ("setpoint", "f4", 3),
@@ -41,44 +42,59 @@ RECORD = np.dtype(
 )
 
 
+class ControlLoop(NamedTuple):
+    """The compiled controller and the allocation, as `tick` takes them.
+
+    Attributes
+    ----------
+    step_address : int
+        Address of the step function of the controller.
+    state, inputs, outputs : one-row arrays
+        State, inputs and outputs of the controller; the saturation of the last period stays in `inputs`.
+    allocation : Allocation
+    """
+
+    step_address: int
+    state: NDArray[Any]
+    inputs: NDArray[Any]
+    outputs: NDArray[Any]
+    allocation: Allocation
+
+
 @inlined
 def altitude_hold(altitude, climb, target, hover, tilt):  # type: ignore[no-untyped-def]
     """Collective that holds an altitude: 1 rad/s, critically damped, corrected for the tilt (its cosine)."""
-    lift = 1.0 + ((target - altitude) - 2.0 * climb) / GRAVITY
-    return hover * min(max(lift, 0.5), 1.5) / min(max(tilt, 0.5), 1.0)
+    ratio = 1.0 + ((target - altitude) - 2.0 * climb) / GRAVITY
+    return hover * min(max(ratio, MIN_THRUST_RATIO), MAX_THRUST_RATIO) / min(max(tilt, MIN_TILT_COSINE), 1.0)
 
 
 @compiled
-def tick(step_address, state, controls, outputs, allocation, hover, altitude, measurement, row):  # type: ignore[no-untyped-def]
-    """One period: `row.setpoint` and `row.excitation` are given, everything else of `row` is filled.
-
-    `controls` and `outputs` are one-row arrays of the controller's input and output; the saturation of the
-    last period is kept in `controls`. `hover` is the collective that carries the weight; where no altitude is
-    held (NaN) it is the collective itself. The motors of a vehicle that is not armed stand.
-    """
+def tick_unpacked(step_address, state, input_rows, output_rows, allocation, collective, altitude, measurement, row):  # type: ignore[no-untyped-def]
+    """`tick` for compiled loops: with a tuple, numba counts the references of its arrays in each call."""
     roll, pitch, yaw = euler_angles(measurement[0], measurement[1], measurement[2], measurement[3])
-    given = controls[0]
-    given.attitude[0], given.attitude[1], given.attitude[2] = roll, pitch, yaw
+    inputs = input_rows[0]
+    inputs.attitude[0], inputs.attitude[1], inputs.attitude[2] = roll, pitch, yaw
     for i in range(4):
         row.quaternion[i] = measurement[i]
     for i in range(3):
-        given.rates[i] = measurement[4 + i]
-        given.attitude_setpoint[i] = row.setpoint[i]
-        given.excitation[i] = row.excitation[i]
-        row.attitude[i] = given.attitude[i]
-        row.rates[i] = given.rates[i]
-    call_step(step_address, state.ctypes.data, controls.ctypes.data, outputs.ctypes.data)
-    made = outputs[0]
+        inputs.rates[i] = measurement[4 + i]
+        inputs.attitude_setpoint[i] = row.setpoint[i]
+        inputs.excitation[i] = row.excitation[i]
+        row.attitude[i] = inputs.attitude[i]
+        row.rates[i] = inputs.rates[i]
+    call_step(step_address, state.ctypes.data, input_rows.ctypes.data, output_rows.ctypes.data)
+    outputs = output_rows[0]
     for i in range(3):
-        row.moment[i] = made.moment[i]
-        row.rates_setpoint[i] = made.rates_setpoint[i]
-    row.fault = made.fault
+        row.moment[i] = outputs.moment[i]
+        row.rates_setpoint[i] = outputs.rates_setpoint[i]
+    row.fault = outputs.fault
     if np.isnan(altitude):
-        row.collective = hover
+        row.collective = collective
     else:
         tilt = np.cos(roll) * np.cos(pitch)
-        row.collective = altitude_hold(measurement[7] / 1000.0, measurement[8] / 100.0, altitude, hover, tilt)
-    if given.armed != 0:
+        # A measurement holds millimetres and cm/s.
+        row.collective = altitude_hold(measurement[7] / 1000.0, measurement[8] / 100.0, altitude, collective, tilt)
+    if inputs.armed != 0:
         allocate(row.moment, row.collective, allocation, row.commands, row.unallocated)
     else:
         for i in range(row.commands.shape[0]):
@@ -86,27 +102,45 @@ def tick(step_address, state, controls, outputs, allocation, hover, altitude, me
         for i in range(3):
             row.unallocated[i] = 0.0
     for i in range(3):
-        given.saturation[i] = int(row.unallocated[i])
+        inputs.saturation[i] = int(row.unallocated[i])
+
+
+@compiled
+def tick(loop, collective, altitude, measurement, row):  # type: ignore[no-untyped-def]
+    """One control period: `row.setpoint` and `row.excitation` are given, the rest of `row` is filled.
+
+    `altitude` is the one to hold (m) and `collective` then the thrust fraction of hover. When `altitude` is NaN, the
+    collective is given. Motor commands are 0 while the vehicle is disarmed.
+    """
+    step_address, state, inputs, outputs, allocation = loop
+    tick_unpacked(step_address, state, inputs, outputs, allocation, collective, altitude, measurement, row)
 
 
 class Autopilot:
-    """The autopilot of one vehicle: a compiled controller and what surrounds it.
+    """The autopilot of one vehicle: a compiled controller, altitude hold and control allocation.
 
     Parameters
     ----------
     airframe : Airframe
-        The vehicle that it flies.
+        The vehicle.
     gains : Gains
-        What the controller starts with.
+        Initial gains of the controller.
     controller : NativeController or EmulatedController, optional
         A loaded controller; by default one is generated from the gains and compiled for this machine.
     altitude : float, m
         Altitude to hold.
 
+    Attributes
+    ----------
+    hover : float
+        Collective that carries the weight, thrust fraction.
+    loop : ControlLoop
+        What `tick` needs of this autopilot.
+
     Raises
     ------
     SitlError
-        When the gains are for another unit of moment than this airframe's allocator has, or do not say.
+        When the gains are for another unit of torque than that of this airframe, or do not state theirs.
     """
 
     def __init__(
@@ -119,34 +153,24 @@ class Autopilot:
         check_moment_scale(gains, airframe.moment_scale(), airframe.name)
         self.gains = gains
         self.controller = controller or NativeController(load_native(gains), gains)
-        self.step_address = self.controller.step_address
-        self.allocation = airframe.allocation()
         self.hover = airframe.plant().mass * GRAVITY / (len(airframe.rotors) * airframe.motors.thrust_max)
         self.altitude = altitude
         self.controls: NDArray[Any] = np.zeros(1, INPUT)
         self.controls["armed"] = 1
-        self.outputs: NDArray[Any] = np.zeros(1, OUTPUT)
-        self._fresh = self.controller.state.copy()
+        outputs: NDArray[Any] = np.zeros(1, OUTPUT)
+        self.loop = ControlLoop(
+            self.controller.step_address, self.controller.state, self.controls, outputs, airframe.allocation()
+        )
+        self._initial_state = self.controller.state.copy()
 
     def restart(self) -> None:
-        """As it was when it was made, for another flight."""
-        self.controller.state[:] = self._fresh
+        """Return to the initial state, for another flight."""
+        self.controller.state[:] = self._initial_state
         self.controls["saturation"] = 0
 
     def warm_up(self) -> None:
         """Compile `tick` now, so that the first period in flight is no slower than the others."""
         controls, state = self.controls.copy(), self.controller.state.copy()
-        tick(*self.arguments(), np.array([1.0, 0, 0, 0, 0, 0, 0, 0, 0]), np.zeros(1, RECORD)[0])
+        measurement = np.array([1.0, 0, 0, 0, 0, 0, 0, 0, 0])
+        tick(self.loop, self.hover, self.altitude, measurement, np.zeros(1, RECORD)[0])
         self.controls[:], self.controller.state[:] = controls, state
-
-    def arguments(self) -> tuple[Any, ...]:
-        """What `tick` is called with, up to the measurement."""
-        return (
-            self.step_address,
-            self.controller.state,
-            self.controls,
-            self.outputs,
-            self.allocation,
-            self.hover,
-            self.altitude,
-        )

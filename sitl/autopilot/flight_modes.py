@@ -1,7 +1,7 @@
-"""The vehicle as its pilot meets it: armed or not, flight modes, refusals and what it does when nobody steers.
+"""Arming, flight modes and failsafes of one vehicle, as PX4's commander has them.
 
-No sockets and no clock: time is given. Whoever owns the vehicle calls `Vehicle.step` once a control period and
-hands on what it says.
+There are no sockets and no clock: time is an argument. The owner calls `Commander.step` once in each control period and
+passes its texts on.
 """
 
 from __future__ import annotations
@@ -10,21 +10,30 @@ import math
 from enum import Enum
 from typing import NamedTuple
 
-from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS, Attitude, Pose, Sticks, Stream, turned
-from mimopilot.sitl.autopilot.vertical import Estimate, Lift
+from mimopilot.sitl.autopilot.failure_detector import MAX_TILT, MAX_TILT_SECONDS
+from mimopilot.sitl.autopilot.setpoints import (
+    STALE_SECONDS,
+    AttitudeSetpoint,
+    Pose,
+    Sticks,
+    Stream,
+    earth_to_heading,
+)
+from mimopilot.sitl.autopilot.vertical import Estimate, VerticalControl
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 
-LEVEL_SECONDS = 2.0  # without set-points the vehicle is kept level for so long, and lands
-MAX_ARM_TILT = math.radians(15.0)
-MAX_ARM_RATE = 0.5  # rad/s
-MAX_TILT = math.radians(60.0)  # of a set-point, and of a vehicle that is not lost
-LOST_SECONDS = 0.3
-STICK_TILT, STICK_YAW, STICK_CLIMB = math.radians(35.0), 1.5, 1.5  # rad, rad/s, m/s at full deflection
+# Chosen, unless another source is given.
+LEVEL_SECONDS = 2.0  # level flight after the setpoint timeout, in case setpoints return; then the vehicle lands
+MAX_ARM_TILT = math.radians(15.0)  # a slope from which the vehicle takes off safely
+MAX_ARM_RATE = 0.5  # rad/s; far above the noise of the estimate
+STICK_TILT = math.radians(35.0)  # rad at full deflection; PX4's default of MPC_MAN_TILT_MAX
+STICK_YAW, STICK_CLIMB = 1.5, 1.5  # rad/s, m/s at full deflection
 CLIMB_SPEED, SINK_SPEED = 1.0, 1.0  # m/s
 TOUCHDOWN_SPEED, TOUCHDOWN_HEIGHT = 0.4, 3.0  # m/s below this height, m
 MIN_HEIGHT, MAX_HEIGHT = 0.5, 100.0  # m, of a take-off
-ARRIVED = 0.2  # m
-HOLD_TILT = math.radians(10.0)  # farthest that it leans to hold a position
+ARRIVED = 0.2  # m, from the take-off height
+HOLD_TILT = math.radians(10.0)  # largest tilt of the position hold: 1.7 m/s^2
+MAX_PERIOD = 0.1  # s; a longer gap in the clock counts as this
 
 
 class Mode(Enum):
@@ -38,25 +47,25 @@ class Mode(Enum):
 
 
 class Severity(Enum):
-    """How urgent a text is, by MAVLink's numbers."""
+    """Severity of a text, numbered as MAV_SEVERITY."""
 
     EMERGENCY, CRITICAL, WARNING, INFO = 0, 2, 4, 6
 
 
 class Refused(Exception):  # noqa: N818 - an answer, not an error
-    """The vehicle does not do that now: the message says why."""
+    """The vehicle refuses a command now; the message gives the reason (MAV_RESULT_TEMPORARILY_REJECTED)."""
 
 
 class Denied(Refused):
-    """Neither now nor later."""
+    """The vehicle refuses a command now and later (MAV_RESULT_DENIED)."""
 
 
 class Failed(Refused):
-    """It was tried, in vain."""
+    """A command was tried and failed (MAV_RESULT_FAILED)."""
 
 
 class Demand(NamedTuple):
-    """What one period is to fly: angles (rad), altitude to hold (m; NaN: none) and collective."""
+    """Demand of one period: angles (rad), altitude to hold (m; NaN: none) and collective (thrust fraction)."""
 
     roll: float
     pitch: float
@@ -65,74 +74,74 @@ class Demand(NamedTuple):
     collective: float
 
 
-class Vehicle:
-    """State of one vehicle.
+class Commander:
+    """Arming state and flight mode of one vehicle.
 
     Parameters
     ----------
     hover : float
-        Collective that carries its weight, thrust fraction.
+        Collective that carries the weight, thrust fraction.
 
     Attributes
     ----------
     armed, mode
         As ground stations show them.
-    obstacles : dict
-        What forbids arming and is known outside only (no plant, a bad parameter): subject -> reason.
+    arming_blockers : dict
+        Reasons against arming that only the owner knows (no plant, a bad parameter): subject -> reason.
     said : list of (Severity, text)
-        For the pilot; whoever owns the vehicle empties it.
+        For the pilot; the owner empties it.
     """
 
     def __init__(self, hover: float) -> None:
-        self.lift = Lift(hover)
+        self.vertical = VerticalControl(hover)
         self.mode = Mode.HOLD
         self.armed = False
-        self.obstacles: dict[str, str] = {}
+        self.arming_blockers: dict[str, str] = {}
         self.said: list[tuple[Severity, str]] = []
-        self.attitude = Stream(Attitude(0.0, 0.0, 0.0, None))
+        self.attitude = Stream(AttitudeSetpoint(0.0, 0.0, 0.0, None))
         self.sticks = Stream(Sticks(0.0, 0.0, 0.0, 0.0))
         self.pose = Stream(Pose(0.0, 0.0, 0.0, 0.0))
         self.estimate = Estimate()
         self.now = -math.inf
-        self._forget()
+        self._reset_manoeuvre()
 
-    def _forget(self) -> None:
-        """Leave what belonged to the manoeuvre before."""
-        self._yaw = self.estimate.yaw
-        self._height = 0.0
-        self._place: tuple[float, float] | None = None
-        self._stale = False
-        self._tilted = 0.0
+    def _reset_manoeuvre(self) -> None:
+        """Clear the state of the previous manoeuvre."""
+        self._yaw = self.estimate.yaw  # rad, to hold
+        self._takeoff_altitude = 0.0  # m
+        self._held: tuple[float, float] | None = None  # m, position to hold
+        self._timed_out = False
+        self._tilted = 0.0  # s, beyond `MAX_TILT`
 
     @property
-    def in_trouble(self) -> bool:
-        """Whether it flies otherwise than it was told."""
-        return self._stale
+    def in_failsafe(self) -> bool:
+        """Whether a failsafe flies the vehicle."""
+        return self._timed_out
 
     def say(self, severity: Severity, text: str) -> None:
-        """Tell the pilot."""
+        """Add a text for the pilot."""
         self.said.append((severity, text))
 
-    # What the pilot asks for.
+    # Commands of the pilot.
 
-    def complaints(self) -> list[str]:
-        """Why the vehicle cannot be armed, the most fundamental reason first; empty: it can."""
-        found = list(self.obstacles.values())
+    def arming_problems(self) -> list[str]:
+        """Reasons against arming, the most fundamental first; empty: the vehicle can be armed."""
+        found = list(self.arming_blockers.values())
         if found or self.armed:
             return found
-        if not self._upright(MAX_ARM_TILT):
+        if not self._within_tilt(MAX_ARM_TILT):
             tilt = math.degrees(max(abs(self.estimate.roll), abs(self.estimate.pitch)))
-            found.append(f"not level: tilted by {tilt:.0f} degrees, at most {math.degrees(MAX_ARM_TILT):.0f}")
+            found.append(f"not level: tilted by {tilt:.0f} degrees, expected at most {math.degrees(MAX_ARM_TILT):.0f}")
         if not all(abs(rate) <= MAX_ARM_RATE for rate in self.estimate.rates):
-            found.append("it turns")
-        if not self.lift.landed:
-            found.append("not on the ground, or it moves")
-        if self._unsteered(self.mode):
-            found.append(f"mode {self.mode.value}, but no set-points arrive")
+            found.append(f"rotating faster than {MAX_ARM_RATE:g} rad/s")
+        if not self.vertical.landed:
+            found.append("not on the ground, or moving")
+        if self._lacks_setpoints(self.mode):
+            found.append(f"mode {self.mode.value}, but no setpoints arrive")
         return found
 
     def arm(self, force: bool = False) -> None:
-        """Start the rotors; `force` overrides all complaints but those of `obstacles`.
+        """Start the rotors; `force` overrides all reasons but those in `arming_blockers`.
 
         Raises
         ------
@@ -141,17 +150,17 @@ class Vehicle:
         """
         if self.armed:
             return
-        found = list(self.obstacles.values()) if force else self.complaints()
+        found = list(self.arming_blockers.values()) if force else self.arming_problems()
         if found:
             raise Refused(f"not armed: {found[0]}")
         if self.mode in (Mode.TAKEOFF, Mode.LAND):
             self.mode = Mode.HOLD
-        self._forget()
+        self._reset_manoeuvre()
         self.armed = True
         self.say(Severity.INFO, "armed")
 
     def disarm(self, force: bool = False, why: str = "") -> None:
-        """Stop the rotors; in the air only by `force`.
+        """Stop the rotors; in the air only with `force`.
 
         Raises
         ------
@@ -160,7 +169,7 @@ class Vehicle:
         """
         if not self.armed:
             return
-        if not (self.lift.landed or force):
+        if not (self.vertical.landed or force):
             raise Refused("not disarmed: in the air; land, or force it (21196)")
         self.armed = False
         self.mode = Mode.HOLD if self.mode in (Mode.TAKEOFF, Mode.LAND) else self.mode
@@ -178,10 +187,10 @@ class Vehicle:
             raise Denied(f"no take-off to {height:g} m: expected {MIN_HEIGHT:g} to {MAX_HEIGHT:g} m")
         if not self.armed:
             raise Refused("no take-off: not armed")
-        if not self.lift.landed:
-            raise Refused("no take-off: in the air already")
+        if not self.vertical.landed:
+            raise Refused("no take-off: already in the air")
         self._enter(Mode.TAKEOFF)
-        self._height = self.lift.ground + height
+        self._takeoff_altitude = self.vertical.ground + height
 
     def enter(self, mode: Mode) -> None:
         """Change the flight mode.
@@ -192,42 +201,47 @@ class Vehicle:
             With the reason.
         """
         if mode is Mode.TAKEOFF:
-            raise Denied("take-off is a command, with a height: NAV_TAKEOFF")
+            raise Denied("mode take-off refused: send the command NAV_TAKEOFF with a height")
         if mode is Mode.LAND and not self.armed:
             raise Refused("no landing: not armed")
-        if self._unsteered(mode):
-            raise Refused(f"mode {mode.value} refused: no set-points arrive, send them first")
+        if self._lacks_setpoints(mode):
+            raise Refused(f"mode {mode.value} refused: no setpoints arrive; send them first")
         self._enter(mode)
 
-    def _unsteered(self, mode: Mode) -> bool:
-        """Whether a mode flies by set-points and there are none."""
-        return (mode is Mode.OFFBOARD and not self.attitude.fresh(self.now)) or (
-            mode is Mode.ALTITUDE and not self.sticks.fresh(self.now)
-        )
+    def _setpoints_of(self, mode: Mode) -> Stream[AttitudeSetpoint] | Stream[Sticks] | None:
+        """The setpoints that a mode flies by; None: the vehicle flies by itself."""
+        if mode is Mode.OFFBOARD:
+            return self.attitude
+        return self.sticks if mode is Mode.ALTITUDE else None
+
+    def _lacks_setpoints(self, mode: Mode) -> bool:
+        """Whether a mode flies by setpoints and they have timed out."""
+        stream = self._setpoints_of(mode)
+        return stream is not None and not stream.fresh(self.now)
 
     def _enter(self, mode: Mode) -> None:
         if mode is not self.mode:
             self.say(Severity.INFO, f"mode {mode.value}")
         self.mode = mode
-        self._forget()
+        self._reset_manoeuvre()
 
     def plant_lost(self, why: str) -> None:
-        """The body is gone: whatever flew flies no more."""
-        self.obstacles["plant"] = why
-        self.say(Severity.CRITICAL, f"{why}{', in flight' if self.armed and not self.lift.landed else ''}")
+        """Disarm, because the plant is gone."""
+        self.arming_blockers["plant"] = why
+        self.say(Severity.CRITICAL, f"{why}{', in flight' if self.armed and not self.vertical.landed else ''}")
         self.armed = False
         self.mode = Mode.HOLD
-        self.lift = Lift(self.lift.hover)
+        self.vertical = VerticalControl(self.vertical.hover)
 
     def plant_back(self) -> None:
-        """A body is there, its clock may be another one."""
-        self.obstacles.pop("plant", None)
+        """Start again with a plant, whose clock may differ."""
+        self.arming_blockers.pop("plant", None)
         self.now = -math.inf
         for stream in (self.attitude, self.sticks, self.pose):
             stream.time = -math.inf
         self.say(Severity.INFO, "plant connected")
 
-    # What happens once a period.
+    # Once in each period.
 
     def step(self, now: float, estimate: Estimate) -> Demand:
         """One control period.
@@ -235,91 +249,94 @@ class Vehicle:
         Parameters
         ----------
         now : float, s
-            The vehicle's clock.
+            Clock of the vehicle.
         estimate : Estimate
-            Its motion.
+            Its estimated motion.
         """
-        dt = min(max(now - self.now, 0.0), 0.1)
+        dt = min(max(now - self.now, 0.0), MAX_PERIOD)
         self.now, self.estimate = now, estimate
         if self.armed:
-            self._watch(dt)
+            self._stop_when_lost(dt)
         if not self.armed:
-            self.lift.rest(dt, estimate)
-            self._forget()
+            self.vertical.rest(dt, estimate)
+            self._reset_manoeuvre()
             return Demand(0.0, 0.0, estimate.yaw, math.nan, 0.0)
-        attitude, speed = self._steer(dt)
+        attitude, speed = self._update_setpoint(dt)
         if attitude.thrust is not None:
-            altitude, collective = self.lift.thrust(dt, estimate, attitude.thrust)
+            altitude, collective = self.vertical.thrust(dt, estimate, attitude.thrust)
         else:
-            altitude, collective = self.lift.climb(dt, estimate, speed)
-        if self.mode is Mode.LAND and self.lift.landed:
+            altitude, collective = self.vertical.climb(dt, estimate, speed)
+        if self.mode is Mode.LAND and self.vertical.landed:
             self.disarm(why=": landed")
             return Demand(0.0, 0.0, estimate.yaw, math.nan, 0.0)
         return Demand(attitude.roll, attitude.pitch, attitude.yaw, altitude, collective)
 
-    def _watch(self, dt: float) -> None:
-        """Stop the rotors of a vehicle that is lost."""
-        self._tilted = 0.0 if self._upright(MAX_TILT) else self._tilted + dt
-        if self._tilted >= LOST_SECONDS:
-            self.say(Severity.EMERGENCY, "lost: tilted too far for too long, rotors stopped")
+    def _stop_when_lost(self, dt: float) -> None:
+        """Stop the rotors when the vehicle is lost, see `sitl.autopilot.failure_detector`."""
+        self._tilted = 0.0 if self._within_tilt(MAX_TILT) else self._tilted + dt
+        if self._tilted >= MAX_TILT_SECONDS:
+            self.say(Severity.EMERGENCY, f"lost: tilted beyond {math.degrees(MAX_TILT):.0f} degrees, rotors stopped")
             self.disarm(force=True)
 
-    def _upright(self, limit: float) -> bool:
-        """Whether it tilts by no more than a limit, rad; what is not finite does."""
+    def _within_tilt(self, limit: float) -> bool:
+        """Whether roll and pitch are within a limit, rad; values that are not finite are not."""
         return abs(self.estimate.roll) <= limit and abs(self.estimate.pitch) <= limit
 
-    def _steer(self, dt: float) -> tuple[Attitude, float]:
-        """Attitude set-point of the mode, and the speed to climb with where it gives no thrust."""
-        if self.mode is Mode.OFFBOARD and self._alive(self.attitude):
-            self._yaw = self.attitude.value.yaw
-            return self.attitude.value, 0.0
-        if self.mode is Mode.ALTITUDE and self._alive(self.sticks):
-            sticks = self.sticks.value
-            self._yaw = math.remainder(self._yaw + dt * STICK_YAW * sticks.yaw, math.tau)
-            return Attitude(STICK_TILT * sticks.roll, STICK_TILT * sticks.pitch, self._yaw, None), (
-                STICK_CLIMB * sticks.climb
-            )
-        roll, pitch = (0.0, 0.0) if self._stale else self._stay()
-        return Attitude(roll, pitch, self._yaw, None), self._speed()
+    def _update_setpoint(self, dt: float) -> tuple[AttitudeSetpoint, float]:
+        """Attitude setpoint of this period, and the climb speed (m/s) when it gives no thrust."""
+        stream = self._setpoints_of(self.mode)
+        if stream is not None and not stream.fresh(self.now):
+            self._handle_timeout(stream.time)
+        elif stream is not None:
+            self._timed_out = False
+            return self._follow_sticks(dt) if self.mode is Mode.ALTITUDE else self._follow_attitude()
+        roll, pitch = (0.0, 0.0) if self._timed_out else self._update_position_hold()
+        return AttitudeSetpoint(roll, pitch, self._yaw, None), self._update_climb()
 
-    def _speed(self) -> float:
-        """Of climbing, in the modes that the vehicle flies by itself."""
+    def _follow_attitude(self) -> tuple[AttitudeSetpoint, float]:
+        self._yaw = self.attitude.value.yaw
+        return self.attitude.value, 0.0
+
+    def _follow_sticks(self, dt: float) -> tuple[AttitudeSetpoint, float]:
+        sticks = self.sticks.value
+        self._yaw = math.remainder(self._yaw + dt * STICK_YAW * sticks.yaw, math.tau)
+        setpoint = AttitudeSetpoint(STICK_TILT * sticks.roll, STICK_TILT * sticks.pitch, self._yaw, None)
+        return setpoint, STICK_CLIMB * sticks.climb
+
+    def _handle_timeout(self, last: float) -> None:
+        """Failsafe when no setpoint has arrived since `last` (s): level, then land."""
+        if not self._timed_out:
+            self._timed_out = True
+            self.say(Severity.CRITICAL, f"no setpoints for {STALE_SECONDS:g} s: level")
+        elif self.now - last > STALE_SECONDS + LEVEL_SECONDS:
+            self.say(Severity.CRITICAL, f"no setpoints for {STALE_SECONDS + LEVEL_SECONDS:g} s: landing")
+            self._enter(Mode.LAND)
+
+    def _update_climb(self) -> float:
+        """Climb speed (m/s) in the modes that the vehicle flies by itself; ends a take-off that has arrived."""
         if self.mode is Mode.TAKEOFF:
-            if abs(self._height - self.estimate.altitude) > ARRIVED:
-                return min(CLIMB_SPEED, self._height - self.lift.target)
-            self.lift.target = self._height
+            if abs(self._takeoff_altitude - self.estimate.altitude) > ARRIVED:
+                return min(CLIMB_SPEED, self._takeoff_altitude - self.vertical.target)
+            self.vertical.target = self._takeoff_altitude
             self._enter(Mode.HOLD)
         if self.mode is Mode.LAND:
-            high = self.estimate.altitude - self.lift.ground > TOUCHDOWN_HEIGHT
+            high = self.estimate.altitude - self.vertical.ground > TOUCHDOWN_HEIGHT
             return -SINK_SPEED if high else -TOUCHDOWN_SPEED
         return 0.0
 
-    def _alive(self, stream: Stream[Attitude] | Stream[Sticks]) -> bool:
-        """Whether set-points arrive; when not, the vehicle levels, and lands when that lasts."""
-        if stream.fresh(self.now):
-            self._stale = False
-            return True
-        if not self._stale:
-            self._stale = True
-            self.say(Severity.CRITICAL, f"no set-points for {STALE_SECONDS:g} s: level")
-        elif self.now - stream.time > STALE_SECONDS + LEVEL_SECONDS:
-            self.say(Severity.CRITICAL, f"no set-points for {STALE_SECONDS + LEVEL_SECONDS:g} s: landing")
-            self._enter(Mode.LAND)
-        return False
-
-    def _stay(self) -> tuple[float, float]:
-        """Roll and pitch that hold the place where motion capture sees the vehicle; level without it."""
-        if not self.pose.fresh(self.now) or self.lift.landed:
-            self._place = None
+    def _update_position_hold(self) -> tuple[float, float]:
+        """Roll and pitch (rad) that hold the position seen by motion capture; level without it."""
+        if not self.pose.fresh(self.now) or self.vertical.landed:
+            self._held = None
             return 0.0, 0.0
         pose, estimate = self.pose.value, self.estimate
-        self._place = self._place or (pose.x, pose.y)
-        x, y = turned(self._place[0] - pose.x, self._place[1] - pose.y, pose.yaw)
-        u, v = turned(estimate.north, estimate.east, estimate.yaw)
-        # 1 rad/s, critically damped, as the altitude is held.
-        ahead, right = x - 2.0 * u, y - 2.0 * v
+        self._held = self._held or (pose.x, pose.y)
+        x, y = earth_to_heading(self._held[0] - pose.x, self._held[1] - pose.y, pose.yaw)
+        u, v = earth_to_heading(estimate.north, estimate.east, estimate.yaw)
+        # 1 rad/s, critically damped, like the altitude hold.
+        forward, right = x - 2.0 * u, y - 2.0 * v
 
-        def lean(acceleration: float) -> float:
+        def tilt(acceleration: float) -> float:
             return min(max(acceleration / GRAVITY, -HOLD_TILT), HOLD_TILT)
 
-        return lean(right), -lean(ahead)
+        return tilt(right), -tilt(forward)

@@ -1,17 +1,17 @@
-"""What arrives from outside again and again: set-points, sticks, motion capture; each with its age."""
+"""Inputs that arrive repeatedly from outside: attitude setpoints, sticks, motion capture; each with its age."""
 
 from __future__ import annotations
 
 import math
 from typing import Generic, NamedTuple, TypeVar
 
-STALE_SECONDS = 0.5  # older ones count no more
+STALE_SECONDS = 0.5  # timeout; PX4 too needs offboard setpoints at 2 Hz or more
 
 T = TypeVar("T")
 
 
-class Attitude(NamedTuple):
-    """Set-point from outside: angles (rad) and collective (thrust fraction; None: hold the altitude)."""
+class AttitudeSetpoint(NamedTuple):
+    """Attitude setpoint: angles (rad) and collective (thrust fraction; None: hold the altitude)."""
 
     roll: float
     pitch: float
@@ -20,7 +20,7 @@ class Attitude(NamedTuple):
 
 
 class Sticks(NamedTuple):
-    """Deflections -1..1: roll right, nose up, nose right, climb."""
+    """Stick deflections -1..1: roll right, nose up, nose right, climb."""
 
     roll: float
     pitch: float
@@ -29,7 +29,7 @@ class Sticks(NamedTuple):
 
 
 class Pose(NamedTuple):
-    """From motion capture: position (m, its own frame, down positive) and heading in it (rad)."""
+    """Pose from motion capture: position (m, in its own frame, down positive) and heading in that frame (rad)."""
 
     x: float
     y: float
@@ -38,7 +38,7 @@ class Pose(NamedTuple):
 
 
 class Stream(Generic[T]):
-    """The latest of what arrives again and again, and when (s) it did; nothing arrives while it is cut."""
+    """The latest value of a repeated input and its time of arrival (s); nothing is taken over while it is cut."""
 
     def __init__(self, value: T) -> None:
         self.value = value
@@ -46,16 +46,16 @@ class Stream(Generic[T]):
         self.cut = False
 
     def put(self, value: T, now: float) -> None:
-        """A new one."""
+        """Take over a new value."""
         if not self.cut:
             self.value, self.time = value, now
 
     def fresh(self, now: float) -> bool:
-        """Whether it still counts."""
+        """Whether the value has not timed out."""
         return now - self.time <= STALE_SECONDS
 
 
-def turned(north: float, east: float, yaw: float) -> tuple[float, float]:
-    """A level vector seen from the vehicle: ahead and to the right."""
+def earth_to_heading(north: float, east: float, yaw: float) -> tuple[float, float]:
+    """Rotate a horizontal vector from earth axes into the heading: forward and right."""
     c, s = math.cos(yaw), math.sin(yaw)
     return c * north + s * east, c * east - s * north

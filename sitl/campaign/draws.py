@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.campaign.variation import Distribution, FaultVariation, Variation
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_plant import check_fault
 from mimopilot.sitl.faults.kinds import Fault, make_fault
 from mimopilot.sitl.flight.flight_log import quaternions
-from mimopilot.sitl.flight.scenario import MAX_ANGLE, Scenario
+from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.physics.airframe import MAX_HOVER, Airframe
-from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, hover_state, is_of_a_body
+from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, hover_state, is_physical_inertia
 from numpy.typing import NDArray
 
 ATTEMPTS = 1000  # draws for one run before the specification is refused
@@ -169,7 +170,7 @@ class Variator:
         factor = 1.0
         if "amplitude_deg" in values:
             amplitude = values["amplitude_deg"]
-            if not 0 <= amplitude <= math.degrees(MAX_ANGLE):
+            if not 0 <= amplitude <= math.degrees(MAX_TILT):
                 raise ImpossibleError(f"the amplitude is {amplitude:.4g} degrees, expected 0 to 60")
             factor = amplitude / self.amplitude_deg
         drawn = (self._fault(i, fault, values) for i, fault in enumerate(self.variation.fault))
@@ -210,7 +211,7 @@ class Variator:
         for name, value in products.items():
             i, j = _place(name)
             inertia[i, j] = inertia[j, i] = value
-        if not is_of_a_body(inertia):
+        if not is_physical_inertia(inertia):
             raise ImpossibleError(f"no body has the inertia {inertia.tolist()} kg m^2")
         return inertia
 

@@ -17,7 +17,7 @@ from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot
 from mimopilot.sitl.campaign.draws import Draw, Variator
 from mimopilot.sitl.campaign.plan import Plan, plan_from_files
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.faults.inject_plant import Injection
+from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.flight.metrics import Performance, performance
 from mimopilot.sitl.flight.models import reference_models
 from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, first_loss
@@ -72,10 +72,10 @@ class Stand:
         simulator.restart(draw.state.copy())
         autopilot.restart()
         seed = [self.plan.description.seed, draw.run, 1]
-        injection = Injection(draw.faults, self.plan.airframe, simulator, scenario.Ts, seed, autopilot)
+        injection = FaultInjection(draw.faults, self.plan.airframe, simulator, scenario.Ts, seed, autopilot=autopilot)
         record["setpoint"] = injection.setpoints(draw.factor * scenario.setpoint)
         self.runs[:] = 1
-        for piece, runs, delays in injection.stretches(0, len(record)):
+        for piece, runs, delays in injection.segments(0, len(record)):
             simulator.fly(autopilot, self.noise[piece], record[piece], self.truth[piece], runs, delays)
             if runs is not None:
                 self.runs[piece] = runs

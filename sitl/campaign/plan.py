@@ -16,7 +16,7 @@ from mimopilot.sitl.campaign.variation import Variation
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import parse_fault
 from mimopilot.sitl.flight.scenario import Scenario, make_scenario
-from mimopilot.sitl.physics.airframe import Airframe, Vehicle, airframe_from_toml
+from mimopilot.sitl.physics.airframe import Airframe, AirframeFile, airframe_from_toml
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml
 from pydantic import BaseModel, ConfigDict, Field
@@ -95,12 +95,12 @@ class Plan:
         return sha256(json.dumps(self.files, sort_keys=True))
 
 
-def make_plan(vehicle: Vehicle, gains: dict[str, Gains], **entries: Any) -> Plan:
+def make_plan(vehicle: AirframeFile, gains: dict[str, Gains], **entries: Any) -> Plan:
     """A plan from its parts.
 
     Parameters
     ----------
-    vehicle : Vehicle
+    vehicle : AirframeFile
         What flies.
     gains : dict of Gains
         By name.

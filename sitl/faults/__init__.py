@@ -1,1 +1,1 @@
-"""Faults: their kinds, and how they act on the plant and on the autopilot."""
+"""Faults: their kinds, and how they act on the plant, the link and the autopilot."""

@@ -1,23 +1,21 @@
-"""Faults that happen in the autopilot: corrupted gains, set-points that stop."""
+"""Applies faults to the autopilot during a flight: corrupted gains, missing setpoints."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.tuning.parameters import MATRICES, PARAMETERS
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from mimopilot.sitl.autopilot.autopilot import Autopilot
-
 
 class AutopilotFaults:
-    """Those of one flight; the others of a list are left alone.
+    """The autopilot faults of one flight; other faults in the list are ignored.
 
     Parameters
     ----------
@@ -26,7 +24,7 @@ class AutopilotFaults:
     Ts : float, s
         Control period.
     autopilot : Autopilot, optional
-        Whose gains are corrupted; None: there is no controller in this process.
+        The one whose gains are corrupted; None: the controller is not in this process.
 
     Attributes
     ----------
@@ -36,14 +34,14 @@ class AutopilotFaults:
     Raises
     ------
     SitlError
-        When a vehicle would refuse the corrupted gains.
+        When a vehicle would refuse the corrupted gains, or there is no controller in this process.
     """
 
     def __init__(self, faults: Sequence[Fault], Ts: float, autopilot: Autopilot | None) -> None:
         self.Ts, self.autopilot = Ts, autopilot
         self._gains = [(fault, *fault.span(Ts)) for fault in faults if fault.kind == "gain"]
         self._stale = [fault.span(Ts) for fault in faults if fault.kind == "stale"]
-        self._sound: NDArray[np.float32] | None = None  # while others are in the controller
+        self._healthy: NDArray[np.float32] | None = None  # while corrupted ones are in the controller
         for fault, _, _ in self._gains:
             self._check(fault)
         self.changes = {k for _, *span in self._gains for k in span}
@@ -58,20 +56,20 @@ class AutopilotFaults:
             if begin <= k < end:
                 factors[_elements(fault)] *= fault.magnitude
         corrupted = bool((factors != 1).any())
-        if self._sound is None and corrupted:
-            self._sound = controller.state["gains"][0].copy()
-        if self._sound is not None:
-            gains = self._sound * factors
-            if (gains != controller.state["gains"][0]).any():  # each write seats the integrators anew
+        if self._healthy is None and corrupted:
+            self._healthy = controller.state["gains"][0].copy()
+        if self._healthy is not None:
+            gains = self._healthy * factors
+            if (gains != controller.state["gains"][0]).any():  # each write adapts the integrators
                 controller.set_gains(gains)
-            self._sound = self._sound if corrupted else None
+            self._healthy = self._healthy if corrupted else None
 
     def stale(self, k: int) -> bool:
-        """Whether no set-point arrives in period `k`."""
+        """Whether no setpoint arrives in period `k`."""
         return any(begin <= k < end for begin, end in self._stale)
 
     def setpoints(self, setpoint: NDArray[Any]) -> NDArray[Any]:
-        """What the autopilot flies of the set-points (N, 3), rad, that are sent: level with its heading when stale.
+        """Setpoints (N, 3), rad, that the autopilot flies when these are sent: level, heading kept, while stale.
 
         The rule is that of `sitl.autopilot.flight_modes`.
         """
@@ -83,8 +81,9 @@ class AutopilotFaults:
         return flown
 
     def _check(self, fault: Fault) -> None:
+        """Refuse gains outside the ranges of the parameters."""
         if self.autopilot is None:
-            raise SitlError(f"fault {str(fault)!r}: there is no controller in this process")
+            raise SitlError(f"fault {str(fault)!r}: there is no controller in this process; give it to the autopilot")
         values = self.autopilot.controller.state["gains"][0] * np.float32(fault.magnitude)
         for i in _elements(fault):
             parameter = PARAMETERS[i]
@@ -96,7 +95,7 @@ class AutopilotFaults:
 
 
 def _elements(fault: Fault) -> range:
-    """Places of the gains that a fault changes, in the order of the parameter table."""
+    """Indices of the gains that a fault changes, in the order of the parameter table."""
     if fault.matrix is None:
         return range(4 * len(MATRICES))
     first = 4 * list(MATRICES).index(fault.matrix)

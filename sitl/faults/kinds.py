@@ -1,8 +1,8 @@
-"""Faults: what can go wrong in a flight, with its size and time.
+"""Faults of a flight: their kinds, sizes and times.
 
-On the command line and in tables a fault is written KIND[:TARGET][=SIZE]@AT[+DURATION], times in seconds from the
-start of the flight: ``motor:3=0.7@1.2`` is motor 3 with 0.7 of its thrust from 1.2 s on, ``gyro-stuck:roll@1.2+0.1``
-a roll rate that repeats its last value for 0.1 s. In a scenario file it is a ``[[fault]]`` table. `KINDS` lists all.
+On the command line and in tables a fault is written KIND[:TARGET][=SIZE]@AT[+DURATION], with times in seconds from the
+start of the flight. ``motor:3=0.7@1.2``: motor 3 gives 0.7 of its thrust from 1.2 s on. ``gyro-stuck:roll@1.2+0.1``:
+the roll rate repeats its last value for 0.1 s. In a scenario file a fault is a ``[[fault]]`` table. `KINDS` lists all.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from mimopilot.common.toml import complaint
 
 NOTATION = re.compile(r"([a-z-]+)(?::([^=@]+))?(?:=([^@]+))?@([^+]+)(?:\+(.+))?")
-FOR_EVER = 1 << 62  # periods
+FOR_EVER = 1 << 62  # periods; more than any flight has
 Place = Literal["plant", "link", "autopilot"]
 Target = Literal["motor", "axis", "position", "matrix"]
 
@@ -32,17 +32,17 @@ class Kind:
     Attributes
     ----------
     what : str
-        One line.
+        Description, one line.
     place : str
-        What it happens to: ``plant``, ``link`` (between plant and autopilot) or ``autopilot``.
+        Where it happens: ``plant``, ``link`` (between plant and autopilot) or ``autopilot``.
     unit : str or None
-        Of the size; None: it has none.
+        Unit of the size; None: it takes no size.
     smallest, largest : float
         Range of the size, both included.
     target : str or None
-        Which of the fault's fields says what is hit.
+        Field of the fault that names what is affected; None: it takes no target.
     needs_target : bool
-        False: without a target all are hit.
+        False: without a target all are affected.
     lasts : bool
         False: it takes no duration.
     """
@@ -59,10 +59,10 @@ class Kind:
 
 KINDS: dict[str, Kind] = {
     "motor": Kind(
-        "a motor gives this share of its thrust; 0: it is out", "plant", "share", target="motor", needs_target=True
+        "a motor gives this share of its thrust; 0: it stops", "plant", "share", target="motor", needs_target=True
     ),
     "battery": Kind(
-        "all motors sag to this share of their thrust, in a ramp as long as the duration, and stay there",
+        "thrust of all motors falls to this share, in a ramp as long as the duration, and stays there",
         "plant",
         "share",
     ),
@@ -77,26 +77,26 @@ KINDS: dict[str, Kind] = {
     ),
     "gyro-stuck": Kind("the measured rate repeats its last value", "plant", target="axis"),
     "gyro-bias": Kind("added to the measured rate", "plant", "rad/s", -100.0, 100.0, target="axis"),
-    "gyro-noise": Kind("standard deviation of the measured rates, in place of the vehicle's", "plant", "rad/s", 0, 100),
+    "gyro-noise": Kind("standard deviation of the measured rates, instead of the vehicle's", "plant", "rad/s", 0, 100),
     "gyro-nan": Kind("the measured rate is not a number", "plant", target="axis"),
-    "delay": Kind("from each measurement to the motors, in place of the vehicle's own; whole periods", "link", "s"),
-    "jitter": Kind("each command is late by a random time of 0 to this; whole periods", "link", "s"),
+    "delay": Kind("delay from each measurement to the motors, instead of the vehicle's; whole periods", "link", "s"),
+    "jitter": Kind("each command is delayed by a random time from 0 to this; whole periods", "link", "s"),
     "loss": Kind("each measurement is lost with this probability", "link", "probability"),
-    "duplicate": Kind("with this probability the autopilot runs twice on a measurement", "link", "probability"),
-    "skip": Kind("the autopilot misses so many ticks in a row", "link", "ticks", 1, 1e6, lasts=False),
+    "duplicate": Kind("the autopilot runs twice on a measurement with this probability", "link", "probability"),
+    "skip": Kind("the autopilot misses this number of consecutive ticks", "link", "ticks", 1, 1e6, lasts=False),
     "clock": Kind(
-        "the clock goes back by this; the autopilot takes nothing that is not newer", "link", "s", lasts=False
+        "the clock is set back by this; the autopilot ignores measurements that are not newer", "link", "s", lasts=False
     ),
-    "link": Kind("no measurement arrives, the motors hold their last command", "link"),
+    "link": Kind("no measurement arrives; the motors hold their last command", "link"),
     "gain": Kind(
-        "factor on the running gains (one matrix, or all), as a parameter write",
+        "factor on the gains in the controller (one matrix, or all), as by a parameter write",
         "autopilot",
         "factor",
         -1e3,
         1e3,
         target="matrix",
     ),
-    "stale": Kind("no set-point arrives", "autopilot"),
+    "stale": Kind("no setpoint arrives", "autopilot"),
 }
 
 
@@ -106,11 +106,11 @@ class Fault(BaseModel):
     Attributes
     ----------
     kind : str
-        One of `KINDS`, which says the unit and the range of the size.
+        One of `KINDS`, which gives the unit and the range of the size.
     at : float, s
-        When it begins, from the start of the flight.
+        Begin, from the start of the flight.
     duration : float, s, or None
-        How long it lasts; None: to the end of the flight. At least one control period.
+        At least one control period; None: to the end of the flight.
     size : float or None
     motor : int, optional
         From 1.
@@ -139,27 +139,27 @@ class Fault(BaseModel):
             raise ValueError(f"unknown kind {self.kind!r}, expected one of {', '.join(KINDS)}")
         kind = KINDS[self.kind]
         if kind.unit is None and self.size is not None:
-            raise ValueError(f"{self.kind} takes no size, got {self.size:g}")
+            raise ValueError(f"{self.kind} takes no size, got {self.size:g}; leave it out")
         if kind.unit is not None and not (self.size is not None and kind.smallest <= self.size <= kind.largest):
             got = "none" if self.size is None else f"{self.size:g}"
             raise ValueError(f"size: got {got}, expected {kind.smallest:g} to {kind.largest:g} ({kind.unit})")
         for target in ("motor", "axis", "position", "matrix"):
             if getattr(self, target) is not None and target != kind.target:
-                raise ValueError(f"{self.kind} takes no {target}")
+                raise ValueError(f"{self.kind} takes no {target}; leave it out")
         if kind.needs_target and self.target is None:
-            raise ValueError(f"{self.kind} does not say which {kind.target}")
+            raise ValueError(f"{self.kind} needs a {kind.target}, got none")
         if not kind.lasts and self.duration is not None:
-            raise ValueError(f"{self.kind} takes no duration: its size says how long it lasts")
+            raise ValueError(f"{self.kind} takes no duration: its size gives how long it lasts")
         return self
 
     @property
     def place(self) -> Place:
-        """What it happens to, see `Kind`."""
+        """Where it happens, see `Kind`."""
         return KINDS[self.kind].place
 
     @property
     def target(self) -> Any:
-        """The field that says what is hit; None: everything, or nothing to choose."""
+        """Value of the field that names what is affected; None: all, or the kind takes no target."""
         target = KINDS[self.kind].target
         return getattr(self, target) if target else None
 
@@ -170,16 +170,16 @@ class Fault(BaseModel):
 
     @property
     def motors(self) -> list[int]:
-        """Indices of the motors that are hit."""
+        """Indices of the affected motors."""
         return [] if self.motor is None else [self.motor - 1]
 
     @property
     def axes(self) -> list[int]:
-        """Indices of the axes that are hit."""
+        """Indices of the affected axes."""
         return [0, 1, 2] if self.axis is None else [AXES.index(self.axis)]
 
     def span(self, Ts: float) -> tuple[int, int]:
-        """First control period, of `Ts` s, in which it acts, and the first after it."""
+        """First control period (of `Ts` s) in which it acts, and the first after it."""
         begin = periods(self.at, Ts)
         if self.kind == "skip":
             return begin, begin + round(self.magnitude)
@@ -204,24 +204,24 @@ class Fault(BaseModel):
 
 
 def periods(seconds: float, Ts: float) -> int:
-    """Whole control periods of `Ts` s that come nearest to a time."""
+    """Number of whole control periods (of `Ts` s) nearest to a time."""
     return round(seconds / Ts)
 
 
 def _number(value: float) -> str:
-    """The shortest text that reads back as the same number."""
+    """Shortest text that reads back as the same number."""
     return repr(float(value)).removesuffix(".0").replace("e+", "e")
 
 
 def make_fault(table: dict[str, Any], where: str) -> Fault:
-    """A fault from the fields of a table.
+    """Make a fault from the fields of a table.
 
     Parameters
     ----------
     table : dict
         Fields of `Fault`.
     where : str
-        What the message begins with.
+        Begin of the error message.
 
     Raises
     ------
@@ -235,12 +235,12 @@ def make_fault(table: dict[str, Any], where: str) -> Fault:
 
 
 def parse_fault(text: str) -> Fault:
-    """A fault from KIND[:TARGET][=SIZE]@AT[+DURATION].
+    """Parse a fault written KIND[:TARGET][=SIZE]@AT[+DURATION].
 
     Raises
     ------
     SitlError
-        When the text is not of this form, or says something impossible.
+        When the text is not of this form, or a field is wrong.
     """
     where = f"fault {text!r}"
     match = NOTATION.fullmatch(text.strip())
@@ -252,39 +252,39 @@ def parse_fault(text: str) -> Fault:
     if target is not None:
         field = KINDS[kind].target if kind in KINDS else None
         if kind in KINDS and field is None:
-            raise SitlError(f"{where}: {kind} takes no target, got {target!r}")
+            raise SitlError(f"{where}: {kind} takes no target, got {target!r}; leave it out")
         if field is not None:
             table[field] = target.split(",") if field == "position" else target
     return make_fault(table, where)
 
 
 def parse_faults(texts: Iterable[str], allowed: tuple[Place, ...], who: str) -> tuple[Fault, ...]:
-    """Faults from the command line, for a program that can apply only some.
+    """Parse faults from the command line, for a program that can apply only some.
 
     Parameters
     ----------
     texts : iterable of str
         See `parse_fault`.
     allowed : tuple of str
-        Places that are within its reach.
+        Places in which it can apply faults.
     who : str
-        The program, for the message.
+        Name of the program, for the message.
 
     Raises
     ------
     SitlError
-        Also when one happens elsewhere.
+        When a fault is wrong, or happens in another place.
     """
     faults = tuple(map(parse_fault, texts))
     for fault in faults:
         if fault.place not in allowed:
-            raise SitlError(f"fault {str(fault)!r}: happens in the {fault.place}, which {who} does not hold")
+            raise SitlError(f"fault {str(fault)!r}: acts on the {fault.place}, which is not part of {who}")
     return faults
 
 
 def fault_help() -> str:
-    """What the command line says of all kinds, one line each."""
-    lines = ["KIND[:TARGET][=SIZE]@AT[+DURATION], times in s; without a duration it lasts to the end of the flight."]
+    """Help text of the command line: one line for each kind."""
+    lines = ["KIND[:TARGET][=SIZE]@AT[+DURATION], times in s. Without a duration, to the end of the flight."]
     return "\n".join([*lines, *(_kind_help(name, kind) for name, kind in KINDS.items())])
 
 

@@ -1,1 +1,1 @@
-"""Flights in process: scenarios, the simulator, logs, figures of merit."""
+"""In-process flights: scenarios, the simulator, logs, performance figures."""

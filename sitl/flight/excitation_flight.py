@@ -1,4 +1,4 @@
-"""The closed-loop experiment that gains are tuned from, once or many times."""
+"""The closed-loop experiment that gains are tuned from, flown once or many times."""
 
 from __future__ import annotations
 
@@ -20,23 +20,25 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.common.files import inside
 from mimopilot.common.parallel import processes, run_all
 
-#: Largest amplitude of the injected torque that is proposed, and the share of the motors' room that it may take.
-AMPLITUDE, ROOM = 0.15, 0.2
+#: Largest amplitude (normalised) of the injected torque that is proposed, as in the demo.
+AMPLITUDE = 0.15
+#: Share of the torque that saturates a motor in hover; chosen: the response of the loop and the other axes add to it.
+TORQUE_SHARE = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class ExperimentPlan:
-    """An experiment.
+    """Settings of an experiment.
 
     Attributes
     ----------
     airframe : Airframe
     gains : Gains
-        Under which it is flown.
+        The controller in flight.
     seconds_per_axis, amplitude, bandwidth : float
         See `sitl.flight.scenario.excitation_flight`.
     excitation_seed : int or None
-        Of the injected moment; None: that of the flight, so that each has another excitation.
+        Seed of the injected torque; None: that of the flight, so that each flight has another excitation.
     """
 
     airframe: Airframe
@@ -47,51 +49,51 @@ class ExperimentPlan:
     excitation_seed: int | None
 
     def fly(self, seed: int) -> Flight:
-        """Fly it; the seed is that of the measurement noise."""
+        """Fly the experiment; `seed` is that of the measurement noise."""
         generator = np.random.default_rng(seed if self.excitation_seed is None else self.excitation_seed)
         scenario = excitation_flight(self.seconds_per_axis, self.amplitude, self.bandwidth, self.gains.Ts, generator)
         return fly(self.airframe, Autopilot(self.airframe, self.gains), scenario, seed)
 
     def record(self, path: Path, seed: int) -> Flight:
-        """Fly it and write its log."""
+        """Fly the experiment and write its log."""
         flight = self.fly(seed)
         save_flight(path, flight, self.airframe, self.gains)
         return flight
 
 
 def default_amplitude(airframe: Airframe) -> float:
-    """Amplitude of the injected torque that leaves the motors room: 0.15, or less near an end of theirs.
+    """Amplitude of the injected torque (normalised) that saturates no motor: 0.15, or less when hover is near a limit.
 
-    The loop's own answer and the other axes' add to what is injected, so only a share of the room is taken.
+    The response of the loop and the other axes add to the injected torque, so only a share of the margin is used.
     """
     plant, allocation = airframe.plant(), airframe.allocation()
     hover = plant.mass * GRAVITY / (len(plant.rotors) * plant.thrust_max)
-    room = min(hover, 1 - hover) / float(np.abs(allocation.mixer[:, :2]).max())
-    return min(AMPLITUDE, float(f"{ROOM * room:.2g}"))
+    margin = min(hover, 1 - hover) / float(np.abs(allocation.mixer[:, :2]).max())
+    return min(AMPLITUDE, float(f"{TORQUE_SHARE * margin:.2g}"))
 
 
 def repeat_experiment(
     plan: ExperimentPlan, folder: Path, seeds: range, workers: int, done: Callable[[], Any]
 ) -> dict[int, float]:
-    """Write the log of an experiment for each seed: `flight-SEED.ulg`.
+    """Fly an experiment with each seed and write the logs `flight-SEED.ulg`.
 
     Parameters
     ----------
     plan : ExperimentPlan
-        What to fly.
+        The experiment.
     folder : Path
-        Where the logs go.
+        Folder of the logs.
     seeds : range
-        One flight each.
+        One flight with each.
     workers : int
-        Processes.
+        Number of processes.
     done : callable
         Called after each flight.
 
     Returns
     -------
     dict
-        Seeds of the vehicles that were lost -> when, s. Their logs are written too.
+        Seed of each flight in which the vehicle was lost -> time of the loss, s. Their logs are written too.
     """
     lost: dict[int, float] = {}
     first = plan.record(log_name(folder, seeds[0]), seeds[0])  # compiles before workers are forked
@@ -108,7 +110,7 @@ def repeat_experiment(
 
 
 def log_name(folder: Path, seed: int) -> Path:
-    """Where the log of a seed lies."""
+    """Path of the log of a seed."""
     return inside(folder, f"flight-{seed:04d}.ulg")
 
 

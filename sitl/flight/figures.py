@@ -1,4 +1,4 @@
-"""Figures of flights, as a control engineer draws them."""
+"""Figures of flights: time histories of a manoeuvre and of an experiment."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from mimopilot.sitl.flight.metrics import reference_responses
+from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.tuning.reference_model import ReferenceModel
 
 from mimopilot.common.charts import STYLES as STYLES
 from mimopilot.common.charts import svg as svg
 
-AXES = ("roll", "pitch")
 MODEL = {"color": "#888888", "linewidth": 3.0, "alpha": 0.6}
 SETPOINT = {"color": "black", "linewidth": 1.0}
 
 
 def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer: ReferenceModel) -> Figure:
-    """One manoeuvre under several gain sets: angle, off-axis angle, rate and moment over time.
+    """One manoeuvre under several gain sets: angle, off-axis angle, rate and torque over time.
 
     Parameters
     ----------
     flights : mapping
         Label -> flight; all of the same scenario.
     inner, outer : ReferenceModel
-        Of the rate and the attitude loop.
+        Of the rate loop and of the attitude loop.
     """
     first = next(iter(flights.values()))
     scenario, axis = first.scenario, first.scenario.axis
@@ -38,7 +38,7 @@ def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer
     panels: Any = figure.subplots(4, 1, sharex=True)
     model, _ = reference_responses(first, inner, outer)
     time, setpoint = time[shown], first.record["setpoint"][shown, axis]
-    panels[0].step(time, np.degrees(setpoint), where="post", label="set-point", **SETPOINT)
+    panels[0].step(time, np.degrees(setpoint), where="post", label="setpoint", **SETPOINT)
     panels[0].plot(time, np.degrees(model[shown]), label=f"reference model ({outer.label})", **MODEL)
     for (label, flight), (colour, style) in zip(flights.items(), STYLES, strict=False):
         line = {"color": colour, "linestyle": style, "linewidth": 1.6, "label": label}
@@ -53,7 +53,7 @@ def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer
             f"{AXES[axis]} angle [deg]",
             f"off-axis: {AXES[other]} [deg]",
             f"{AXES[axis]} rate [deg/s]",
-            f"{AXES[axis]} moment u [-]",
+            f"{AXES[axis]} torque u (normalised)",
         ),
         strict=True,
     ):
@@ -62,27 +62,27 @@ def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer
         panel.axvspan(0, (scenario.window[1] - scenario.window[0]) * scenario.Ts, color="#000000", alpha=0.04)
     panels[0].legend(loc="upper right", fontsize=9, ncols=2)
     panels[0].set_title(f"{AXES[axis].capitalize()} {scenario.name}", loc="left")
-    panels[3].set_xlabel("time from the start of the manoeuvre [s] (shaded: window of the figures)")
+    panels[3].set_xlabel("time from the start of the manoeuvre [s] (shaded: window of the performance figures)")
     panels[3].set_xlim(time[0], time[-1])
     figure.align_ylabels(panels)
     return figure
 
 
 def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
-    """The closed-loop data set: injected and total moment, rates and angles of both axes; on the right a stretch."""
+    """An experiment: injected and total torque, rates and angles of both axes; a detail on the right."""
     time = np.arange(len(flight.record)) * flight.scenario.Ts
     record = flight.record
     figure = Figure(figsize=(9, 7), layout="constrained")
     panels: Any = figure.subplots(4, 2, sharex="col", sharey="row", width_ratios=[3, 2])
     signals = (
-        ("injected moment [-]", record["excitation"]),
-        ("total moment u [-]", record["moment"]),
+        ("injected torque (norm.)", record["excitation"]),
+        ("total torque u (norm.)", record["moment"]),
         ("body rate [deg/s]", np.degrees(record["rates"])),
         ("angle [deg]", np.degrees(record["attitude"])),
     )
     middle = time[-1] / 2
     for row, (text, values) in zip(panels, signals, strict=True):
-        # The overview as pixels: as lines it would be most of a report's size.
+        # The overview is drawn as pixels: its lines would be most of the size of a report.
         for panel, width, pixels in zip(row, (0.4, 1.2), (True, False), strict=True):
             for axis, (colour, _) in enumerate((STYLES[1], STYLES[0])):
                 line = {"color": colour, "linewidth": width, "rasterized": pixels, "label": AXES[axis]}

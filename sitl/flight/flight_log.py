@@ -1,4 +1,4 @@
-"""A flight of the bench as a PX4 log: topics and fields as PX4 names them, so one reader serves both."""
+"""Simulated flights as PX4 logs: topics and fields have PX4's names, so one reader serves both."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from mimopilot.common.files import write_atomically
 
-EXCITATION_NAME = b"MIMO_EXC"
+EXCITATION_NAME = b"MIMO_EXC"  # of the debug_vect topic that carries the excitation, as in the firmware
 
 
 def quaternions(angles: NDArray[Any]) -> NDArray[np.float32]:
-    """Quaternions (N, 4), w first, of aeronautical angles (N, 3), rad."""
+    """Quaternions (N, 4), w first, of roll, pitch and yaw (N, 3), rad."""
     half = np.asarray(angles, np.float64).T / 2
     (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
     return np.column_stack(
@@ -34,20 +34,20 @@ def quaternions(angles: NDArray[Any]) -> NDArray[np.float32]:
     ).astype(np.float32)
 
 
-def record_flight(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
-    """The flight as a ULog file; u is logged after injection, the injected signal beside it.
+def flight_log_bytes(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
+    """The flight as a ULog file; u is logged with the injected torque, which has its own topic.
 
     Parameters
     ----------
     flight : Flight
-        What flew.
+        The flight.
     airframe : Airframe
         The vehicle.
     gains : Gains
-        The controller that flew: logged as the vehicle's parameters.
+        Gains in flight, logged as parameters of the vehicle.
     """
     truth = flight.truth
-    topics = _seen(flight.record, len(airframe.rotors)) | {
+    topics = _autopilot_topics(flight.record, len(airframe.rotors)) | {
         "vehicle_attitude_groundtruth": {"q": quaternions(truth["attitude"])},
         "vehicle_angular_velocity_groundtruth": {"xyz": truth["rates"].astype(np.float32)},
         "vehicle_local_position_groundtruth": {
@@ -56,35 +56,35 @@ def record_flight(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
             for i, name in enumerate(names.split())
         },
     }
-    return _file(flight.scenario.Ts, topics, to_array(gains), airframe)
+    return _ulog_file(flight.scenario.Ts, topics, to_array(gains), airframe)
 
 
 def vehicle_log(
     record: NDArray[Any], landed: NDArray[np.bool_], Ts: float, airframe: Airframe, gains: NDArray[np.float32]
 ) -> bytes:
-    """A flight of which only the vehicle's own view is known, from arming to disarming, as a ULog file.
+    """A flight without its true state, from arming to disarming, as a ULog file.
 
     Parameters
     ----------
     record : (N,) array of `sitl.autopilot.autopilot.RECORD`
-        What the autopilot saw and did.
+        Inputs and outputs of the autopilot.
     landed : (N,) array of bool
-        Whether it stood on the ground.
+        Whether the vehicle was on the ground.
     Ts : float, s
         Control period.
     airframe : Airframe
         The vehicle.
     gains : (36,) float32 array
-        What flew, in the order of `tuning.parameters.PARAMETERS`.
+        Gains in flight, in the order of `tuning.parameters.PARAMETERS`.
     """
-    topics = _seen(record, len(airframe.rotors)) | {
+    topics = _autopilot_topics(record, len(airframe.rotors)) | {
         "vehicle_land_detected": {"landed": landed.astype(np.uint8)},
         "actuator_armed": {"armed": np.ones(len(record), np.uint8)},
     }
-    return _file(Ts, topics, gains, airframe)
+    return _ulog_file(Ts, topics, gains, airframe)
 
 
-def _file(
+def _ulog_file(
     Ts: float, topics: dict[str, dict[str, NDArray[Any]]], gains: NDArray[np.float32], airframe: Airframe
 ) -> bytes:
     parameters = {parameter.name: float(value) for parameter, value in zip(PARAMETERS, gains, strict=True)}
@@ -98,10 +98,10 @@ def _file(
     return ulog_bytes(Ts, topics, parameters, information)
 
 
-def _seen(record: NDArray[Any], rotors: int) -> dict[str, dict[str, NDArray[Any]]]:
-    """Topics of what the autopilot saw and did."""
+def _autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, NDArray[Any]]]:
+    """Topics of the inputs and outputs of the autopilot."""
     excitation = record["excitation"]
-    # z is the axis that is being excited: 0 roll, 1 pitch, -1 none.
+    # z is the excited axis: 0 roll, 1 pitch, -1 none.
     active = np.where(excitation[:, 0] != 0, 0, np.where(excitation[:, 1] != 0, 1, -1)).astype(np.float32)
     thrust = np.zeros_like(excitation)
     thrust[:, 2] = -record["collective"]
@@ -127,5 +127,5 @@ def _seen(record: NDArray[Any], rotors: int) -> dict[str, dict[str, NDArray[Any]
 
 
 def save_flight(path: Path, flight: Flight, airframe: Airframe, gains: Gains) -> None:
-    """`record_flight` into a file, atomically."""
-    write_atomically(path, record_flight(flight, airframe, gains))
+    """Write `flight_log_bytes` to a file, atomically."""
+    write_atomically(path, flight_log_bytes(flight, airframe, gains))

@@ -1,4 +1,4 @@
-"""Performance figures of a flight, (6.1)-(6.4) of the thesis and what it describes in words."""
+"""Performance figures of a flight: (6.1)-(6.4) of the thesis, and those that it describes without a formula."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Performance:
-    """How one axis followed, over the manoeuvre's window.
+    """Tracking performance of one axis over the window of the manoeuvre.
 
     Attributes
     ----------
     J_M_o, J_M_i : float, rad^2, rad^2/s^2
-        Mean squared distance of the measured angle (rate) to the reference model driven by its set-point.
+        Mean squared error of the measured angle (rate) from the response of the reference model to its setpoint.
     J_r_o, J_r_i : float, rad^2, rad^2/s^2
-        The same to the set-point itself.
+        The same from the setpoint itself.
     peak_deg : float, deg
         Largest true angle of the axis from the start of the manoeuvre to the end of the flight.
     offaxis_peak_deg, offaxis_rms_deg : float, deg
-        True angle of the other axis: the estimate's noise would hide it.
+        True angle of the other axis, which is smaller than the noise of the estimate.
     effort_rms : float
-        RMS of the roll and pitch moments together, dimensionless.
+        RMS of the roll and pitch torques (normalised) together.
     saturated : int
-        Samples whose roll or pitch moment the motors could not give.
+        Samples in which the roll or pitch torque is saturated.
     """
 
     J_M_o: float
@@ -45,7 +45,7 @@ class Performance:
 def reference_responses(
     flight: Flight, inner: ReferenceModel, outer: ReferenceModel
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """What the reference models make of the flown set-points of the manoeuvre's axis.
+    """Responses of the reference models to the setpoints flown on the axis of the manoeuvre.
 
     Returns
     -------
@@ -65,14 +65,14 @@ def _responses(
 
 
 def performance(flight: Flight, inner: ReferenceModel, outer: ReferenceModel) -> Performance:
-    """Figures of a flight against the reference models of the axis that was moved.
+    """Performance of a flight against the reference models, on the axis of the manoeuvre.
 
     Parameters
     ----------
     flight : Flight
         A doublet, step or hover.
     inner, outer : ReferenceModel
-        Of the rate and the attitude loop.
+        Of the rate loop and of the attitude loop.
     """
     axis, (start, stop), record = flight.scenario.axis, flight.scenario.window, flight.record
     models = _responses(flight, inner, outer, stop)
@@ -83,7 +83,7 @@ def performance(flight: Flight, inner: ReferenceModel, outer: ReferenceModel) ->
 
 @compiled
 def _figures(signals, models, true_angles, axis, start, stop):  # type: ignore[no-untyped-def]
-    """Fields of `Performance` in one pass: campaigns compute them by the ten thousand."""
+    """Compute the fields of `Performance` in one pass, because campaigns need thousands of them."""
     attitude, rates, setpoint, rates_setpoint, moment, unallocated = signals
     angle_model, rate_model = models
     J_M_o = J_M_i = J_r_o = J_r_i = off_axis = effort = peak = off_axis_peak = 0.0

@@ -1,4 +1,4 @@
-"""What a flight is asked to do, and what goes wrong on the way: set-points, injected moments and faults over time.
+"""Scenarios: the setpoints, injected torques and faults of a flight over time.
 
 A scenario file names a manoeuvre and its faults:
 
@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import Fault, make_fault
 from mimopilot.tuning.excitation import hold_from_bandwidth, prbs
@@ -31,32 +32,31 @@ from pydantic import BaseModel, ConfigDict
 from mimopilot.common.toml import checked, read_toml
 
 AXES = ("roll", "pitch")
-LEAD = 1.0  # s of hover before a manoeuvre
-MAX_ANGLE = np.radians(60.0)  # a vehicle that tilts further counts as lost
-AMPLITUDE_DEG, PERIOD_S, TAIL_S = 22.5, 0.42, 1.5  # of a manoeuvre that says nothing else
-MIN_SAMPLES, MAX_SECONDS = 10, 3600.0
+LEAD = 1.0  # s of hover before a manoeuvre; chosen: the measured rates and the integrators have settled
+#: Defaults of a manoeuvre, deg, s, s: the doublet of the thesis; the tail is chosen.
+AMPLITUDE_DEG, PERIOD_S, TAIL_S = 22.5, 0.42, 1.5
+MIN_SAMPLES, MAX_SECONDS = 10, 3600.0  # of a manoeuvre; chosen: enough to judge, and bounded memory
 
 
 @dataclass(frozen=True, eq=False)
 class Scenario:
-    """One flight's inputs.
+    """Inputs of one flight.
 
     Attributes
     ----------
     name : str
-        What it is.
+        Kind of scenario.
     Ts : float, s
         Control period.
     setpoint : (N, 3) array, rad
-        Attitude set-point: roll, pitch, yaw.
+        Attitude setpoint: roll, pitch, yaw.
     excitation : (N, 3) array
-        Injected moment, dimensionless.
+        Injected torque (normalised).
     axis : int
         Axis of the manoeuvre: 0 roll, 1 pitch.
     window : (start, stop)
-        Samples over which the manoeuvre is judged.
+        Samples of the manoeuvre, over which performance is computed.
     faults : tuple of Fault
-        What goes wrong on the way.
     """
 
     name: str
@@ -80,15 +80,15 @@ def _check_length(name: str, seconds: float, Ts: float) -> None:
 
 
 def _check_angle(amplitude: float) -> None:
-    if not 0 < amplitude <= MAX_ANGLE:
-        got, limit = np.degrees(amplitude), np.degrees(MAX_ANGLE)
+    if not 0 < amplitude <= MAX_TILT:
+        got, limit = np.degrees(amplitude), np.degrees(MAX_TILT)
         raise SitlError(f"amplitude: got {got:.6g} degrees, expected above 0 and at most {limit:.0f}")
 
 
 def doublet(
     axis: str, amplitude: float, period: float, Ts: float, tail: float = TAIL_S, lead: float = LEAD
 ) -> Scenario:
-    """Set-point +A for half of `period`, -A for the other half, then level.
+    """Setpoint +A for half of `period`, -A for the other half, then level.
 
     Parameters
     ----------
@@ -101,9 +101,9 @@ def doublet(
     Ts : float, s
         Control period.
     tail : float, s
-        Level flight after it.
+        Level flight after the doublet.
     lead : float, s
-        Hover before it: what a vehicle that is out of balance needs to find its trim.
+        Hover before the doublet; an unbalanced vehicle needs it to trim.
     """
     _check_angle(amplitude)
     _check_length("period", period, Ts)
@@ -118,7 +118,7 @@ def doublet(
 
 
 def step(axis: str, amplitude: float, period: float, Ts: float) -> Scenario:
-    """Set-point A for `period` seconds; arguments as `doublet`."""
+    """Setpoint A for `period` seconds; arguments as `doublet`."""
     _check_angle(amplitude)
     _check_length("period", period, Ts)
     column = _axis_index(axis)
@@ -129,7 +129,7 @@ def step(axis: str, amplitude: float, period: float, Ts: float) -> Scenario:
 
 
 def hover(axis: str, period: float, Ts: float) -> Scenario:
-    """Level set-point for `period` seconds; arguments as `doublet`."""
+    """Level setpoint for `period` seconds; arguments as `doublet`."""
     _check_length("period", period, Ts)
     setpoint = np.zeros((round(period / Ts), 3))
     return Scenario("hover", Ts, setpoint, np.zeros_like(setpoint), _axis_index(axis), (0, len(setpoint)))
@@ -138,11 +138,11 @@ def hover(axis: str, period: float, Ts: float) -> Scenario:
 def make_scenario(
     name: str, axis: str, amplitude_deg: float, period: float, Ts: float, tail: float = TAIL_S
 ) -> Scenario:
-    """A scenario by name: ``doublet``, ``step`` or ``hover``; amplitude in degrees, period and tail in seconds."""
+    """Make a scenario by name: ``doublet``, ``step`` or ``hover``; amplitude in degrees, period and tail in seconds."""
     if name == "doublet":
         return doublet(axis, float(np.radians(amplitude_deg)), period, Ts, tail)
     if tail != TAIL_S:
-        raise SitlError(f"tail: belongs to a doublet, not to {name}")
+        raise SitlError(f"tail: only a doublet has one, not {name}; leave it out")
     if name == "step":
         return step(axis, float(np.radians(amplitude_deg)), period, Ts)
     if name == "hover":
@@ -150,8 +150,8 @@ def make_scenario(
     raise SitlError(f"scenario: got {name!r}, expected doublet, step or hover")
 
 
-class Task(BaseModel):
-    """The manoeuvre of a scenario file; arguments of `make_scenario`."""
+class ScenarioManoeuvre(BaseModel):
+    """The manoeuvre of a scenario file: arguments of `make_scenario`."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -162,38 +162,38 @@ class Task(BaseModel):
     tail_s: float = TAIL_S
 
 
-def read_scenario(path: Path) -> tuple[Task, tuple[Fault, ...]]:
-    """What a scenario file says: the manoeuvre and its faults.
+def read_scenario(path: Path) -> tuple[ScenarioManoeuvre, tuple[Fault, ...]]:
+    """Read the manoeuvre and the faults of a scenario file.
 
     Parameters
     ----------
     path : Path
-        See the module's text for an example; `sitl.faults.kinds.Fault` for the fields of a fault.
+        See the docstring of this module for an example and `sitl.faults.kinds.Fault` for the fields of a fault.
 
     Raises
     ------
-    TuningError, SitlError
+    InputFileError, SitlError
         When the file is not TOML, or an entry is unknown or wrong.
     """
     table = read_toml(path, "scenario file")
     faults = table.pop("fault", [])
     if not (isinstance(faults, list) and all(isinstance(fault, dict) for fault in faults)):
         raise SitlError(f"{path}: fault: expected [[fault]] tables")
-    task = checked(Task, table, str(path))
-    return task, tuple(make_fault(fault, f"{path}: fault {i + 1}") for i, fault in enumerate(faults))
+    manoeuvre = checked(ScenarioManoeuvre, table, str(path))
+    return manoeuvre, tuple(make_fault(fault, f"{path}: fault {i + 1}") for i, fault in enumerate(faults))
 
 
 def load_scenario(path: Path, Ts: float) -> Scenario:
-    """The scenario of a file, see `read_scenario`; its control period in s.
+    """Load the scenario of a file, see `read_scenario`, for a control period in s.
 
     Raises
     ------
     SitlError
         As `read_scenario` and `make_scenario`.
     """
-    task, faults = read_scenario(path)
+    asked, faults = read_scenario(path)
     try:
-        scenario = make_scenario(task.manoeuvre, task.axis, task.amplitude_deg, task.period_s, Ts, task.tail_s)
+        scenario = make_scenario(asked.manoeuvre, asked.axis, asked.amplitude_deg, asked.period_s, Ts, asked.tail_s)
     except SitlError as error:
         raise SitlError(f"{path}: {error}") from error
     return replace(scenario, faults=faults)
@@ -202,33 +202,33 @@ def load_scenario(path: Path, Ts: float) -> Scenario:
 def excitation_flight(
     seconds_per_axis: float, amplitude: float, bandwidth: float, Ts: float, generator: np.random.Generator
 ) -> Scenario:
-    """Hover with a PRBS moment injected on roll, then on pitch.
+    """Hover with a PRBS torque injected on roll, then on pitch.
 
     Parameters
     ----------
     seconds_per_axis : float, s
-        Length on each axis.
+        Duration on each axis.
     amplitude : float
-        Of the moment, dimensionless, at most 1.
+        Torque (normalised), at most 1.
     bandwidth : float, rad/s
-        Of the PRBS, see `tuning.excitation.hold_from_bandwidth`.
+        Bandwidth of the PRBS, see `tuning.excitation.hold_from_bandwidth`.
     Ts : float, s
         Control period.
     generator : numpy.random.Generator
-        Source of all randomness.
+        Source of the pulse lengths.
     """
     _check_length("seconds_per_axis", seconds_per_axis, Ts)
     if not 0 < amplitude <= 1:
-        raise SitlError(f"amplitude: got {amplitude}, expected above 0 and at most 1, the largest moment")
+        raise SitlError(f"amplitude: got {amplitude}, expected above 0 and at most 1, the largest torque")
     hold_min, hold_max = hold_from_bandwidth(bandwidth, Ts)
     if hold_max * Ts > seconds_per_axis:
         raise SitlError(
-            f"bandwidth: at {bandwidth:g} rad/s one pulse may last {hold_max * Ts:.3g} s, longer than the "
-            f"{seconds_per_axis:g} s on each axis"
+            f"bandwidth: at {bandwidth:g} rad/s a pulse may last {hold_max * Ts:.3g} s, longer than the "
+            f"{seconds_per_axis:g} s on each axis; raise one of them"
         )
     samples = round(seconds_per_axis / Ts)
     excitation = np.zeros((2 * samples, 3))
     for axis in range(2):
-        stretch = slice(axis * samples, (axis + 1) * samples)
-        excitation[stretch, axis] = prbs(samples, amplitude, hold_min, hold_max, generator)
+        samples_of_axis = slice(axis * samples, (axis + 1) * samples)
+        excitation[samples_of_axis, axis] = prbs(samples, amplitude, hold_min, hold_max, generator)
     return Scenario("experiment", Ts, np.zeros_like(excitation), excitation, 0, (0, len(excitation)))

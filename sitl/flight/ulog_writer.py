@@ -1,6 +1,6 @@
-"""Writing ULog files (PX4's log format): uniform records, any topics, nothing of the clock.
+"""Writes ULog files (PX4's log format) from arrays: uniform sampling, any topics, no wall-clock time.
 
-pyulog reads and copies ULog files but cannot make one from arrays; the format is documented by PX4.
+pyulog reads and copies ULog files but cannot make one from arrays. PX4's documentation describes the format.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-HEADER = b"ULog\x01\x12\x35\x01"
-EPOCH_US = 1_000_000  # time stamp of the first sample
+HEADER = b"ULog\x01\x12\x35\x01"  # magic, then version 1
+EPOCH_US = 1_000_000  # us, time stamp of the first sample; chosen: readers take 0 as no time
 
-#: Field of a topic: name -> (N,) or (N, m) array; the dtype says how it is stored.
+#: Fields of a topic: name -> (N,) or (N, m) array; the dtype gives the type in the file.
 Fields = Mapping[str, NDArray[Any]]
 
 _TYPES = {"f4": "float", "f8": "double", "u1": "uint8_t", "i4": "int32_t", "u2": "uint16_t", "S": "char"}
@@ -24,7 +24,7 @@ _TYPES = {"f4": "float", "f8": "double", "u1": "uint8_t", "i4": "int32_t", "u2":
 def ulog_bytes(
     Ts: float, topics: Mapping[str, Fields], parameters: Mapping[str, float], information: Mapping[str, str]
 ) -> bytes:
-    """A ULog file in which every topic has one message a sample.
+    """Make a ULog file in which every topic has one message for each sample.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ def ulog_bytes(
         Sampling period.
     topics : mapping
         Topic -> fields, all of the same length N. ``timestamp`` and ``timestamp_sample`` (microseconds)
-        are put in front of each.
+        are added in front.
     parameters : mapping
         Parameter name -> value, stored as float.
     information : mapping

@@ -1,1 +1,1 @@
-"""The vehicle: airframes, rigid body, motors, sensors, the ground."""
+"""The simulated vehicle: airframes, rigid body, motors, sensors and ground contact."""

@@ -1,4 +1,4 @@
-"""Airframes: a TOML file each; every physical constant is a line that a user can replace."""
+"""Airframes: one TOML file each, in which every physical constant is a line that a user can replace."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from mimopilot.common.files import read_text
 from mimopilot.common.toml import checked, parse_toml
 
-MAX_HOVER = 0.9  # share of the thrust that may carry the weight
+MAX_HOVER = 0.9  # weight over largest thrust; chosen: with less than 10 % to spare no torque can be given
 FOLDER = Path(__file__).resolve().parent / "airframes"
 
 Finite = Annotated[float, Field(ge=-1e6, le=1e6)]
@@ -29,19 +29,19 @@ Positive = Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
 NotNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
-class _Table(BaseModel):
+class _AirframeTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Rotor(_Table):
+class Rotor(_AirframeTable):
     """One rotor: position (m, FRD, from the reference point) and direction of rotation seen from above."""
 
     position: Vector
     direction: Literal["cw", "ccw"]
 
 
-class Motors(_Table):
-    """Constants shared by all motors; units as in `sitl.physics.rigid_body.PlantParameters`."""
+class MotorConstants(_AirframeTable):
+    """Constants of all motors; units as in `sitl.physics.rigid_body.PlantParameters`."""
 
     thrust_max: Positive
     time_constant: Positive
@@ -49,25 +49,25 @@ class Motors(_Table):
     torque_ratio: Positive
 
 
-class PointMass(_Table):
-    """Something attached: mass (kg) and position (m, FRD, from the reference point)."""
+class PointMass(_AirframeTable):
+    """An attached load: mass (kg) and position (m, FRD, from the reference point)."""
 
     mass: Positive
     position: Vector
 
 
-class Noise(_Table):
+class Noise(_AirframeTable):
     """Standard deviation of the state estimate: angle (rad) and body rate (rad/s)."""
 
     angle: NotNegative
     rate: NotNegative
 
 
-class Frame(_Table):
+class Frame(_AirframeTable):
     """A frame that bends on roll and pitch, see `sitl.physics.state_estimate.frame_mode`.
 
-    Frequency (Hz), share of critical damping, and modal gain over that of the rigid body, negative where the sensors
-    move against the rotors.
+    Frequency (Hz), damping ratio, and modal gain relative to the rigid body; negative where the sensors move against
+    the rotors.
     """
 
     frequency_hz: Annotated[float, Field(gt=0, le=500)]
@@ -75,27 +75,27 @@ class Frame(_Table):
     gain: Annotated[float, Field(ge=-2, le=2)]
 
 
-class Airframe(_Table):
-    """A vehicle as its TOML file describes it.
+class Airframe(_AirframeTable):
+    """A vehicle as described by its TOML file.
 
     Attributes
     ----------
     name, description : str
     mass : float, kg
-        Without point masses.
+        Without the point masses.
     inertia : 3x3, kg m^2
-        Tensor about the reference point, which is the centre of gravity without point masses.
+        Tensor about the reference point, which is the centre of gravity without the point masses.
     rate_damping : float, 1/s
         Damping moment is this times the diagonal of the inertia times the rate.
     drag : float, N s/m
     airmode : bool
         See `sitl.physics.mixer`.
     computing_delay : int, samples
-        Whole control periods between a measurement and the motor command made from it.
+        Whole control periods between a measurement and the motor command computed from it.
     gyro_cutoff_hz : float, Hz
-        Of the second-order low-pass that the measured rates pass; 0: none.
+        Cutoff of the second-order low-pass filter on the measured rates; 0: no filter.
     gains : str
-        The gains file that it flies under until tuned, beside the TOML file.
+        Its default gains file, beside the TOML file.
     motors, rotors, noise, point_masses, frame
         See their classes.
     """
@@ -110,7 +110,7 @@ class Airframe(_Table):
     computing_delay: Annotated[int, Field(ge=0, le=50)]
     gyro_cutoff_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     gains: str
-    motors: Motors
+    motors: MotorConstants
     rotors: Annotated[tuple[Rotor, ...], Field(min_length=4, max_length=16)]
     noise: Noise
     point_masses: tuple[PointMass, ...] = ()
@@ -122,18 +122,18 @@ class Airframe(_Table):
         return np.array([rotor.position for rotor in self.rotors]), spin
 
     def moment_scale(self) -> Vector:
-        """N m that u = 1 stands for on roll, pitch, yaw, for this vehicle's allocator."""
+        """Torque (N m) that u = 1 stands for on roll, pitch and yaw, with the allocation of this vehicle."""
         rotors, spin = self.geometry()
         roll, pitch, yaw = moment_scale(rotors, spin, self.motors.thrust_max, self.motors.torque_ratio)
         return float(roll), float(pitch), float(yaw)
 
     def allocation(self) -> Allocation:
-        """Mixer of the autopilot host: made from the geometry, it knows nothing of point masses."""
+        """Mixer of the autopilot host, made from the rotor geometry without the point masses."""
         rotors, spin = self.geometry()
         return make_allocation(rotors, spin, self.motors.thrust_max, self.motors.torque_ratio, self.airmode)
 
     def plant(self) -> PlantParameters:
-        """Physical constants about the true centre of gravity, point masses included."""
+        """Physical constants about the true centre of gravity, with the point masses."""
         rotors, spin = self.geometry()
         mass, centre, inertia = combine_masses(self.mass, np.array(self.inertia), self.point_masses)
         return PlantParameters(
@@ -156,7 +156,7 @@ class Airframe(_Table):
 def combine_masses(
     mass: float, inertia: NDArray[np.float64], added: tuple[PointMass, ...]
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-    """A body and point masses as one body (parallel-axis theorem).
+    """Combine a body and point masses into one body (parallel-axis theorem).
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def combine_masses(
     inertia : (3, 3) array, kg m^2
         Of the body, about the reference point.
     added : tuple of PointMass
-        What is attached.
+        The attached loads.
 
     Returns
     -------
@@ -185,35 +185,35 @@ def combine_masses(
 
 
 def _check_flies(airframe: Airframe) -> None:
-    """Refuse a vehicle that cannot lift itself with some authority left."""
+    """Refuse a vehicle whose thrust is too small for its weight."""
     weight, thrust = airframe.plant().mass * GRAVITY, len(airframe.rotors) * airframe.motors.thrust_max
     if weight > MAX_HOVER * thrust:
         raise SitlError(
             f"mass, motors.thrust_max: a weight of {weight:.4g} N against {thrust:.4g} N of thrust does not fly; "
-            f"expected at most {MAX_HOVER:.0%}"
+            f"expected at most {MAX_HOVER:.0%} of the thrust"
         )
 
 
 @dataclass(frozen=True, eq=False)
-class Vehicle:
-    """An airframe, where its file is and what stands in it: what commands work with."""
+class AirframeFile:
+    """An airframe with the path and the text of its file."""
 
     airframe: Airframe
     path: Path
     text: str
 
     def default_gains(self) -> Gains:
-        """The gains that the airframe's file names: a file beside it, else one that comes with mimopilot."""
+        """Load the gains that the airframe names: a file beside its own, else one that comes with mimopilot."""
         beside, shipped = self.path.parent / self.airframe.gains, FOLDER / self.airframe.gains
         return load_gains(shipped if shipped.is_file() and not beside.is_file() else beside)
 
     def gain_sets(self, files: Sequence[Path]) -> dict[str, Gains]:
-        """Gains files by their names, without the ending; `default_gains` when there are none.
+        """Load gains files, keyed by their names without the ending; `default_gains` when there are none.
 
         Raises
         ------
         SitlError
-            When two have the same name.
+            When two files have the same name.
         """
         names = [path.name.removesuffix(".toml").removesuffix(".gains") for path in files]
         if len(set(names)) < len(names):
@@ -226,14 +226,14 @@ def known_airframes() -> list[str]:
     return sorted(path.stem for path in FOLDER.glob("*.toml") if not path.name.endswith(".gains.toml"))
 
 
-def load_airframe(name_or_path: str) -> Vehicle:
+def load_airframe(name_or_path: str) -> AirframeFile:
     """Load an airframe by name, or by the path of a TOML file.
 
     Raises
     ------
     SitlError
         When the name is unknown (listing the known ones) or the vehicle cannot fly.
-    TuningError
+    InputFileError
         When the file cannot be read, is not TOML, or an entry is unknown or impossible.
     """
     path = FOLDER / f"{name_or_path}.toml"
@@ -241,14 +241,14 @@ def load_airframe(name_or_path: str) -> Vehicle:
         path = Path(name_or_path)
         if not os.path.lexists(path):
             raise SitlError(
-                f"unknown airframe {name_or_path!r}: neither a file nor one of {', '.join(known_airframes())}"
+                f"unknown airframe {name_or_path!r}: expected a file or one of {', '.join(known_airframes())}"
             )
     text = read_text(path, "airframe file")
-    return Vehicle(airframe_from_toml(text, str(path)), path, text)
+    return AirframeFile(airframe_from_toml(text, str(path)), path, text)
 
 
 def airframe_from_toml(text: str, where: str) -> Airframe:
-    """Parse the text of an airframe's file; `where` names it in messages. See `load_airframe`."""
+    """Parse the text of an airframe file; `where` names it in messages. Raises as `load_airframe`."""
     airframe = checked(Airframe, parse_toml(text, where), where)
     try:
         checked_inertia(airframe.inertia)

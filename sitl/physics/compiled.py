@@ -1,4 +1,4 @@
-"""What the bench needs of numba: the decorators, and calls of the generated C++ from compiled code."""
+"""The numba decorators of the simulation, and calls of the generated C++ from compiled code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numba.extending import intrinsic
 
 from mimopilot.common.compiled import compiled as compiled
 
-#: For small functions in the innermost loops: LLVM does not inline all of them by itself, which costs a factor of 2.5.
+#: For small functions in the innermost loops. LLVM does not inline all of them by itself, which costs a factor of 2.5.
 inlined = numba.njit(error_model="numpy", inline="always")
 
 

@@ -1,7 +1,7 @@
-"""The ground: a plane at altitude zero, and a foot of the vehicle below each rotor, level with the centre of gravity.
+"""Ground contact: a plane at altitude zero; one foot below each rotor, level with the centre of gravity.
 
-The plant knows nothing of the ground: it flies one control period, then `touch` gives the vehicle the impulses
-that the ground would have given it. Feet do not bounce; friction holds them. There is no ground effect.
+The plant flies one control period without ground. Then `apply_ground_contact` applies the impulses of the ground. Feet
+do not bounce, and friction holds them. There is no ground effect.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from mimopilot.sitl.physics.compiled import compiled, inlined
 from mimopilot.sitl.physics.rigid_body import QUATERNION, ROTORS, PlantParameters
 from numpy.typing import NDArray
 
-FRICTION = 0.7  # of a foot on the ground
-SWEEPS = 10  # over all feet; each removes most of what the others have left
-SKIN = 1e-4  # m; a foot so near the ground stands on it
+FRICTION = 0.7  # Coulomb coefficient of a foot; chosen: rubber on dry concrete
+SWEEPS = 10  # over all feet (Gauss-Seidel); chosen: a vehicle at rest then moves by less than 1e-7 m/s
+CONTACT_TOLERANCE = 1e-4  # m; chosen: a foot this near the ground counts as standing on it
 
 
 def ground_state(plant: PlantParameters) -> NDArray[np.float64]:
-    """State of a vehicle that stands at the origin, heading north, with standing rotors."""
+    """State (13 + n,) of a vehicle on the ground at the origin, heading north, its rotors stopped."""
     state = np.zeros(ROTORS + len(plant.rotors))
     state[QUATERNION] = 1.0
     return state
@@ -25,7 +25,7 @@ def ground_state(plant: PlantParameters) -> NDArray[np.float64]:
 
 @compiled
 def _rotation(q, R):  # type: ignore[no-untyped-def]
-    """Body to earth, into `R` (3, 3)."""
+    """Fill `R` (3, 3) with the rotation from body to earth axes."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
     R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
@@ -33,7 +33,7 @@ def _rotation(q, R):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _turn(state, a, b, c):  # type: ignore[no-untyped-def]
+def _rotate(state, a, b, c):  # type: ignore[no-untyped-def]
     """Rotate the attitude by a small angle (rad) about the body axes."""
     w, x, y, z = state[6], state[7], state[8], state[9]
     a, b, c = 0.5 * a, 0.5 * b, 0.5 * c
@@ -46,22 +46,22 @@ def _turn(state, a, b, c):  # type: ignore[no-untyped-def]
 
 @inlined
 def _lever(foot, axis, R, plant):  # type: ignore[no-untyped-def]
-    """Moment (body axes, m) about the centre of gravity of a unit force at a foot along an earth axis."""
+    """Moment (body axes, N m per N) about the centre of gravity of a force at a foot along an earth axis."""
     x, y = plant.rotors[foot, 0], plant.rotors[foot, 1]
     return y * R[axis, 2], -x * R[axis, 2], x * R[axis, 1] - y * R[axis, 0]
 
 
 @inlined
 def _depth(state, foot, R, plant):  # type: ignore[no-untyped-def]
-    """How far a foot is below the ground, m."""
+    """Depth of a foot below the ground, m."""
     return state[2] + R[2, 0] * plant.rotors[foot, 0] + R[2, 1] * plant.rotors[foot, 1]
 
 
 @compiled
-def _push(state, foot, axis, R, plant, given, least, most):  # type: ignore[no-untyped-def]
-    """Stop a foot along one earth axis by an impulse (N s) beside the one already `given`; the sum keeps its bounds.
+def _stop_foot(state, foot, axis, R, plant, given, least, most):  # type: ignore[no-untyped-def]
+    """Stop a foot along one earth axis by an impulse (N s) that adds to the one already `given`.
 
-    Returns the sum.
+    Returns the sum, which stays within `least` and `most`.
     """
     mx, my, mz = _lever(foot, axis, R, plant)
     J = plant.inertia_inverse
@@ -79,18 +79,18 @@ def _push(state, foot, axis, R, plant, given, least, most):  # type: ignore[no-u
 
 
 @compiled
-def _stand(state):  # type: ignore[no-untyped-def]
-    """On all its feet it is level: without this it would rock on three of them like a table."""
+def _level(state):  # type: ignore[no-untyped-def]
+    """Level a vehicle that stands on all feet; otherwise it would rock on three of them."""
     scale = 1.0 / np.sqrt(state[6] * state[6] + state[9] * state[9])
     state[6], state[7], state[8], state[9] = state[6] * scale, 0.0, 0.0, state[9] * scale
     state[2] = 0.0
 
 
 @compiled
-def touch(state, plant, Ts):  # type: ignore[no-untyped-def]
-    """Let the ground act on the vehicle at the end of a period of `Ts` s, in place.
+def apply_ground_contact(state, plant, Ts):  # type: ignore[no-untyped-def]
+    """Apply the impulses of the ground in place, at the end of a period of `Ts` s.
 
-    Returns the largest speed (m/s) at which a foot came down, or -1 when none touches.
+    Returns the largest touchdown speed of a foot (m/s), or -1 when no foot touches the ground.
     """
     n = plant.rotors.shape[0]
     reach = 0.0
@@ -112,21 +112,21 @@ def touch(state, plant, Ts):  # type: ignore[no-untyped-def]
     for _ in range(SWEEPS):
         for i in range(n):
             if _depth(before, i, R, plant) > 0.0:
-                impulses[i, 2] = _push(state, i, 2, R, plant, impulses[i, 2], -np.inf, 0.0)
-                hold = -FRICTION * impulses[i, 2]
+                impulses[i, 2] = _stop_foot(state, i, 2, R, plant, impulses[i, 2], -np.inf, 0.0)
+                friction = -FRICTION * impulses[i, 2]
                 for axis in range(2):
-                    impulses[i, axis] = _push(state, i, axis, R, plant, impulses[i, axis], -hold, hold)
-    # The ground has pushed throughout the period: half of the change of speed counts for the way.
+                    impulses[i, axis] = _stop_foot(state, i, axis, R, plant, impulses[i, axis], -friction, friction)
+    # The ground acted throughout the period, so half of the change of speed counts for the displacement.
     half = 0.5 * Ts
     for axis in range(3):
         state[axis] += half * (state[3 + axis] - before[3 + axis])
-    _turn(state, half * (state[10] - before[10]), half * (state[11] - before[11]), half * (state[12] - before[12]))
+    _rotate(state, half * (state[10] - before[10]), half * (state[11] - before[11]), half * (state[12] - before[12]))
     _rotation(state[6:10], R)
     deepest, shallowest = 0.0, np.inf
     for i in range(n):
         depth = _depth(state, i, R, plant)
         deepest, shallowest = max(deepest, depth), min(shallowest, depth)
     state[2] -= deepest
-    if R[2, 2] > 0.0 and shallowest - deepest > -SKIN:
-        _stand(state)
+    if R[2, 2] > 0.0 and shallowest - deepest > -CONTACT_TOLERANCE:
+        _level(state)
     return closing

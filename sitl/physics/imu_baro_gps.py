@@ -1,7 +1,7 @@
-"""What a vehicle's own instruments say, for an autopilot that has an estimator of its own.
+"""Raw sensors for an autopilot with its own estimator: accelerometer, gyro, magnetometer, barometer, GPS.
 
-Accelerometer (specific force), gyro, magnetometer and barometer, then a satellite receiver. The densities and
-deviations are those of the parts that small autopilots carry; each run draws its own constant biases.
+The noise densities, deviations and ranges are class values of the parts on small autopilots. Each run draws its own
+constant biases.
 """
 
 from __future__ import annotations
@@ -14,29 +14,31 @@ from mimopilot.sitl.physics.compiled import compiled
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from numpy.typing import NDArray
 
-GYRO_DENSITY = 1.75e-4  # rad/s/sqrt(Hz)
-GYRO_BIAS = 2e-3  # rad/s, deviation between runs
-GYRO_RANGE = math.radians(1999.0)  # rad/s
-ACCELEROMETER_DENSITY = 2e-3  # m/s^2/sqrt(Hz)
-ACCELEROMETER_BIAS = 0.03  # m/s^2
-ACCELEROMETER_RANGE = 15.9 * GRAVITY
-MAGNETOMETER_NOISE = 2e-3  # Gauss
-MAGNETOMETER_BIAS = 3e-3  # Gauss
-BAROMETER_NOISE = 0.012  # hPa, which is 0.1 m
+GYRO_DENSITY = 1.75e-4  # rad/s/sqrt(Hz): 0.01 deg/s/sqrt(Hz)
+GYRO_BIAS = 2e-3  # rad/s, standard deviation between runs
+GYRO_RANGE = math.radians(1999.0)  # rad/s; just below the +-2000 deg/s of the parts
+ACCELEROMETER_DENSITY = 2e-3  # m/s^2/sqrt(Hz): 0.2 mg/sqrt(Hz)
+ACCELEROMETER_BIAS = 0.03  # m/s^2, standard deviation between runs
+ACCELEROMETER_RANGE = 15.9 * GRAVITY  # m/s^2; just below the +-16 g of the parts
+MAGNETOMETER_NOISE = 2e-3  # Gauss, standard deviation
+MAGNETOMETER_BIAS = 3e-3  # Gauss, standard deviation between runs
+BAROMETER_NOISE = 0.012  # hPa, standard deviation: 0.1 m
 
-HOME_LATITUDE, HOME_LONGITUDE = 47.3977420, 8.5455940  # deg; home is at sea level
-DECLINATION, INCLINATION, FIELD = math.radians(3.4), math.radians(63.2), 0.482  # of the earth there, Gauss
-METRES_PER_DEGREE = 111_319.5
-SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE = 1013.25, 20.0  # hPa, deg C
-LAPSE = 0.0065  # K/m
+HOME_LATITUDE, HOME_LONGITUDE = 47.3977420, 8.5455940  # deg, PX4's default home of simulations; here at sea level
+DECLINATION, INCLINATION, FIELD = math.radians(3.4), math.radians(63.2), 0.482  # rad, rad, Gauss, at home
+METRES_PER_DEGREE = 111_319.5  # of latitude, on a sphere with the WGS 84 equatorial radius
+SEA_LEVEL_PRESSURE, SEA_LEVEL_TEMPERATURE = 1013.25, 20.0  # hPa (ISA), deg C (chosen)
+LAPSE = 0.0065  # K/m (ISA)
+PRESSURE_LAPSE, PRESSURE_EXPONENT = 2.25577e-5, 5.25588  # 1/m, -: barometric formula of the ISA below 11 km
+MIN_PRESSURE_BASE = 0.01  # keeps the power real above the altitude where the formula ends
 
-GPS_PERIOD = 0.1  # s
-GPS_HORIZONTAL, GPS_VERTICAL, GPS_SPEED = 0.1, 0.2, 0.05  # m, m, m/s, deviations of the noise
-GPS_EPH, GPS_EPV = 90, 150  # cm, what the receiver says of itself
-FIX_3D, SATELLITES = 3, 12
+GPS_PERIOD = 0.1  # s: 10 Hz receiver
+GPS_HORIZONTAL, GPS_VERTICAL, GPS_SPEED = 0.1, 0.2, 0.05  # m, m, m/s, standard deviations
+GPS_EPH, GPS_EPV = 90, 150  # cm, accuracies that the receiver reports
+FIX_3D, SATELLITES = 3, 12  # MAVLink's GPS_FIX_TYPE_3D_FIX; chosen
 
-READINGS = 15
-NOISES = 10
+READINGS = 15  # numbers in a reading, see `ImuBaroGps.read`
+SENSOR_NOISES = 10  # normal numbers for one reading: accelerometer, gyro, magnetometer (3 each), barometer
 
 EARTH_FIELD = FIELD * np.array(
     [
@@ -47,18 +49,18 @@ EARTH_FIELD = FIELD * np.array(
 )
 
 
-class Place(NamedTuple):
-    """A point on the earth as MAVLink writes it: 1e-7 deg, 1e-7 deg, mm."""
+class GlobalPosition(NamedTuple):
+    """A point on the earth in MAVLink units: 1e-7 deg, 1e-7 deg, mm."""
 
     latitude: int
     longitude: int
     altitude: int
 
 
-class Fix(NamedTuple):
-    """What the receiver says: where, how fast (cm/s: over ground, north, east, down), course (0.01 deg)."""
+class GpsFix(NamedTuple):
+    """A fix of the receiver: position, speeds (cm/s: over ground, north, east, down), course (0.01 deg)."""
 
-    place: Place
+    position: GlobalPosition
     speed: int
     north: int
     east: int
@@ -66,10 +68,10 @@ class Fix(NamedTuple):
     course: int
 
 
-def place(north: float, east: float, down: float) -> Place:
-    """Where on the earth a position (m, NED from home) is."""
+def global_position(north: float, east: float, down: float) -> GlobalPosition:
+    """Convert a position (m, NED from home) to a point on the earth."""
     eastward = METRES_PER_DEGREE * math.cos(math.radians(HOME_LATITUDE))
-    return Place(
+    return GlobalPosition(
         round((HOME_LATITUDE + north / METRES_PER_DEGREE) * 1e7),
         round((HOME_LONGITUDE + east / eastward) * 1e7),
         round(-1000.0 * down),
@@ -78,7 +80,7 @@ def place(north: float, east: float, down: float) -> Place:
 
 @compiled
 def _to_body(q, x, y, z):  # type: ignore[no-untyped-def]
-    """An earth vector in body axes."""
+    """Rotate a vector from earth to body axes."""
     w, a, b, c = q[0], q[1], q[2], q[3]
     return (
         (1 - 2 * (b * b + c * c)) * x + 2 * (a * b + w * c) * y + 2 * (a * c - w * b) * z,
@@ -88,12 +90,13 @@ def _to_body(q, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _read(state, before, Ts, biases, deviations, noise, field, out):  # type: ignore[no-untyped-def]
-    """Fill `out` (15,): accelerometer, gyro, magnetometer, pressure, its altitude, temperature, then the acceleration.
+def _read(state, before, Ts, errors, out):  # type: ignore[no-untyped-def]
+    """Fill `out` (15,), see `ImuBaroGps.read`.
 
-    `before` is the state one period ago: an accelerometer reports what happened between two samples, and so the
-    push of the ground is in it.
+    `before` is the state one period ago: an accelerometer reports the mean force between two samples, which includes
+    the ground contact. `errors` holds biases (9,), standard deviations (9,) and standard normal numbers (10,).
     """
+    biases, deviations, noise = errors
     q = np.empty(4)
     for i in range(4):
         q[i] = state[6 + i] + before[6 + i]
@@ -104,67 +107,68 @@ def _read(state, before, Ts, biases, deviations, noise, field, out):  # type: ig
     out[12], out[13], out[14] = _to_body(q, x, y, z)
     out[0], out[1], out[2] = _to_body(q, x, y, z - GRAVITY)
     out[3], out[4], out[5] = state[10], state[11], state[12]
-    out[6], out[7], out[8] = _to_body(state[6:10], field[0], field[1], field[2])
+    out[6], out[7], out[8] = _to_body(state[6:10], EARTH_FIELD[0], EARTH_FIELD[1], EARTH_FIELD[2])
     for i in range(9):
         out[i] += biases[i] + deviations[i] * noise[i]
     for i in range(3):
         out[i] = min(max(out[i], -ACCELEROMETER_RANGE), ACCELEROMETER_RANGE)
         out[3 + i] = min(max(out[3 + i], -GYRO_RANGE), GYRO_RANGE)
-    # The standard atmosphere, and back.
-    pressure = SEA_LEVEL_PRESSURE * max(1.0 + 2.25577e-5 * state[2], 0.01) ** 5.25588 + BAROMETER_NOISE * noise[9]
+    # From altitude to pressure, add noise, and back to altitude.
+    base = max(1.0 + PRESSURE_LAPSE * state[2], MIN_PRESSURE_BASE)
+    pressure = SEA_LEVEL_PRESSURE * base**PRESSURE_EXPONENT + BAROMETER_NOISE * noise[9]
     out[9] = pressure
-    out[10] = (1.0 - (pressure / SEA_LEVEL_PRESSURE) ** (1.0 / 5.25588)) / 2.25577e-5
+    out[10] = (1.0 - (pressure / SEA_LEVEL_PRESSURE) ** (1.0 / PRESSURE_EXPONENT)) / PRESSURE_LAPSE
     out[11] = SEA_LEVEL_TEMPERATURE + LAPSE * state[2]
 
 
-class Instruments:
-    """The instruments of one vehicle.
+class ImuBaroGps:
+    """The raw sensors of one vehicle.
 
     Parameters
     ----------
     state : (13 + n,) array
-        Where it starts, see `sitl.physics.rigid_body`.
+        Initial state, see `sitl.physics.rigid_body`.
     Ts : float, s
         Interval between readings.
     seed : int
-        Of noise and biases.
+        Seed of noise and biases.
     """
 
     def __init__(self, state: NDArray[np.float64], Ts: float, seed: int) -> None:
         self.Ts = Ts
-        self.inertial, self.satellites = (np.random.default_rng([seed, which]) for which in (1, 2))
+        self._generator, self._gps_generator = (np.random.default_rng([seed, which]) for which in (1, 2))
         bandwidth = math.sqrt(0.5 / Ts)
         deviations = ACCELEROMETER_DENSITY * bandwidth, GYRO_DENSITY * bandwidth, MAGNETOMETER_NOISE
         self.deviations = np.repeat(deviations, 3)
         spread = np.repeat((ACCELEROMETER_BIAS, GYRO_BIAS, MAGNETOMETER_BIAS), 3)
-        self.biases = spread * np.clip(self.inertial.standard_normal(9), -2.0, 2.0)
+        self.biases = spread * np.clip(self._generator.standard_normal(9), -2.0, 2.0)
         self.before = state.copy()
         self.out = np.zeros(READINGS)
 
     def read(self, state: NDArray[np.float64]) -> list[float]:
-        """Readings at the end of a period.
+        """Read all sensors but the GPS at the end of a period.
 
         Returns
         -------
         list of 15
-            Specific force (m/s^2), rates (rad/s) and magnetic field (Gauss) in body axes; pressure (hPa), the
-            altitude (m) that it stands for, temperature (deg C); and the true acceleration (m/s^2, body).
+            Specific force (3, m/s^2), rates (3, rad/s) and magnetic field (3, Gauss) in body axes; pressure (hPa),
+            pressure altitude (m), temperature (deg C); and the true acceleration (3, m/s^2, body axes).
         """
-        noise = self.inertial.standard_normal(NOISES)
-        _read(state, self.before, self.Ts, self.biases, self.deviations, noise, EARTH_FIELD, self.out)
+        noise = self._generator.standard_normal(SENSOR_NOISES)
+        _read(state, self.before, self.Ts, (self.biases, self.deviations, noise), self.out)
         self.before[:] = state
         readings: list[float] = self.out.tolist()
         return readings
 
-    def fix(self, state: NDArray[np.float64]) -> Fix:
-        """What the satellite receiver says now."""
+    def fix(self, state: NDArray[np.float64]) -> GpsFix:
+        """Fix of the GPS receiver."""
         deviations = (GPS_HORIZONTAL, GPS_HORIZONTAL, GPS_VERTICAL, GPS_SPEED, GPS_SPEED, GPS_SPEED)
-        x, y, z, north, east, down = (state[:6] + deviations * self.satellites.standard_normal(6)).tolist()
+        x, y, z, north, east, down = (state[:6] + deviations * self._gps_generator.standard_normal(6)).tolist()
         speed = math.hypot(north, east)
         course = round(math.degrees(math.atan2(east, north)) * 100) % 36000
-        return Fix(place(x, y, z), centi(speed), centi(north), centi(east), centi(down), course)
+        return GpsFix(global_position(x, y, z), centi(speed), centi(north), centi(east), centi(down), course)
 
 
 def centi(value: float) -> int:
-    """Hundredths, as many as 16 bits hold."""
+    """Convert to hundredths, clipped to 16 bits."""
     return max(-32768, min(32767, round(value * 100)))

@@ -1,8 +1,8 @@
-"""From moments and collective to motor commands: the autopilot host's control allocation.
+"""Control allocation: motor commands from the torque (normalised) on each axis and the collective.
 
-Commands are thrust fractions 0..1, f = mixer @ (roll, pitch, yaw, collective). Out of range, in this order:
-at the upper limit the collective is lowered, at the lower limit raised (airmode only), then yaw gives way,
-then roll and pitch are scaled together.
+Commands are thrust fractions 0..1, f = mixer @ (roll, pitch, yaw, collective). When one is out of range, in this order:
+the collective is lowered (upper limit) or raised (lower limit, airmode only), then the yaw torque is reduced, then the
+roll and pitch torques are scaled together.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.compiled import compiled, inlined
 from numpy.typing import NDArray
 
-ROUNDING = 1e-9  # of the thrust: a command this far out of range is clipped, not a lack of authority
+ROUNDING = 1e-9  # thrust fraction; a command out of range by less is clipped and not reported as saturation
 
 
 class Allocation(NamedTuple):
-    """Mixer of a vehicle.
+    """The mixer of a vehicle.
 
     Attributes
     ----------
     mixer : (n, 4) array
-        Thrust fraction of each motor for a unit of roll, pitch and yaw moment and of collective.
+        Thrust fraction of each motor for one unit of roll, pitch and yaw torque (normalised) and of collective.
     airmode : bool
-        Raise the collective to make room for moments.
+        Whether the collective may be raised so that the torques can be given.
     """
 
     mixer: NDArray[np.float64]
@@ -35,7 +35,7 @@ class Allocation(NamedTuple):
 def moment_scale(
     rotors: NDArray[np.float64], spin: NDArray[np.float64], thrust: float, ratio: float
 ) -> NDArray[np.float64]:
-    """Moment that u = 1 stands for: half of the motors at full thrust, the others off (M_max = 2 b T_max for a quad).
+    """Torque that u = 1 stands for: half of the motors at full thrust, the others off (2 b T_max for a quad).
 
     Parameters
     ----------
@@ -61,23 +61,29 @@ def moment_scale(
 def make_allocation(
     rotors: NDArray[np.float64], spin: NDArray[np.float64], thrust: float, ratio: float, airmode: bool
 ) -> Allocation:
-    """Mixer for any rotor geometry: pseudo-inverse of the normalised effectiveness. Arguments as `moment_scale`.
+    """Mixer of any rotor geometry: pseudo-inverse of the normalised effectiveness. Arguments as `moment_scale`.
 
     Raises
     ------
     SitlError
-        When the rotors cannot make roll, pitch, yaw and thrust independently, or one would have to pull down.
+        When the rotors cannot make roll, pitch, yaw and thrust independently, or one would need negative thrust.
     """
     scale = moment_scale(rotors, spin, thrust, ratio)
     if not (np.isfinite(scale).all() and (scale > 0).all()):
-        raise SitlError("rotors: these positions and directions make no moment on some axis")
+        raise SitlError("rotors: these positions and directions make no torque on some axis; move or reverse a rotor")
     moments = np.array([-rotors[:, 1], rotors[:, 0], spin * ratio]) * thrust / scale[:, None]
     effectiveness = np.vstack([moments, np.full(len(rotors), 1 / len(rotors))])
     if np.linalg.matrix_rank(effectiveness) < 4:
-        raise SitlError("rotors: these positions and directions cannot make roll, pitch, yaw and thrust independently")
+        raise SitlError(
+            "rotors: these positions and directions cannot make roll, pitch, yaw and thrust independently; move or "
+            "reverse a rotor"
+        )
     mixer = np.linalg.pinv(effectiveness)
     if (mixer[:, 3] <= 0).any():
-        raise SitlError("rotors: the centre is outside of the rotors, hovering would need negative thrust")
+        raise SitlError(
+            "rotors: the reference point is outside of the rotors, so hovering would need negative thrust; place "
+            "rotors around it"
+        )
     return Allocation(np.ascontiguousarray(mixer), airmode)
 
 
@@ -85,8 +91,8 @@ def make_allocation(
 def _largest_share(base, part, collective, allocation):  # type: ignore[no-untyped-def]
     """Largest s in 0..1 for which base + s part leaves a collective that keeps every motor within 0..1.
 
-    Motor i asks for c >= -(base_i + s part_i)/h_i, motor j for c <= (1 - base_j - s part_j)/h_j and, without
-    airmode, for c <= the commanded one: each pair is one linear inequality in s. -1 when no s will do.
+    Motor i needs c >= -(base_i + s part_i)/h_i, motor j needs c <= (1 - base_j - s part_j)/h_j. Without airmode c is
+    at most the commanded collective. Each pair is one linear inequality in s. Returns -1 when no s satisfies all.
     """
     n = base.shape[0]
     smallest, largest = 0.0, 1.0
@@ -95,27 +101,27 @@ def _largest_share(base, part, collective, allocation):  # type: ignore[no-untyp
         for j in range(n + 1):
             if j < n:
                 h_j = allocation.mixer[j, 3]
-                room = (1.0 - base[j]) / h_j + base[i] / h_i + ROUNDING
+                margin = (1.0 - base[j]) / h_j + base[i] / h_i + ROUNDING
                 slope = part[j] / h_j - part[i] / h_i
             elif allocation.airmode:
                 continue
             else:
-                room = collective + base[i] / h_i + ROUNDING
+                margin = collective + base[i] / h_i + ROUNDING
                 slope = -part[i] / h_i
-            if slope > room:
+            if slope > margin:
                 if slope <= 0.0:
-                    return -1.0  # even the whole part leaves too little room
-                largest = min(largest, room / slope)
-            if room < 0.0:
+                    return -1.0  # even the whole part leaves too little margin
+                largest = min(largest, margin / slope)
+            if margin < 0.0:
                 if slope >= 0.0:
                     return -1.0
-                smallest = max(smallest, room / slope)
+                smallest = max(smallest, margin / slope)
     return largest if largest >= smallest else -1.0
 
 
 @compiled
 def _shares(moments, collective, allocation):  # type: ignore[no-untyped-def]
-    """Largest shares of roll with pitch, and of yaw, that leave a collective: yaw gives way first."""
+    """Largest shares of roll and pitch together, and of yaw, for which a collective exists: yaw is reduced first."""
     n = allocation.mixer.shape[0]
     roll_pitch, yaw = np.empty(n), np.empty(n)
     for i in range(n):
@@ -129,9 +135,9 @@ def _shares(moments, collective, allocation):  # type: ignore[no-untyped-def]
 
 @inlined
 def _combine(moments, share, yaw_share, collective, allocation, commands):  # type: ignore[no-untyped-def]
-    """Commands for shares of the moments, with the nearest collective that keeps each within 0..1.
+    """Fill `commands` for shares of the torques, with the nearest collective that keeps each within 0..1.
 
-    False when there is none: the shares are too large.
+    Returns False when no collective does, because the shares are too large.
     """
     low, high = -np.inf, np.inf
     if not allocation.airmode:
@@ -150,8 +156,9 @@ def _combine(moments, share, yaw_share, collective, allocation, commands):  # ty
 
 @compiled
 def allocate(moments, collective, allocation, commands, unallocated):  # type: ignore[no-untyped-def]
-    """Motor commands for the moments (3,) and collective; fills `commands` (n,) and `unallocated` (3,), the sign of
-    the moment on each axis that could not be given.
+    """Fill the motor `commands` (n,) for torques (3,) (normalised) and a collective.
+
+    `unallocated` (3,) gets the sign of the torque on each axis that is saturated, else 0.
     """
     share, yaw_share = 1.0, 1.0
     if not _combine(moments, share, yaw_share, collective, allocation, commands):

@@ -1,6 +1,6 @@
-"""The vehicle's body: Newton-Euler equations, motors, drag; fixed-step Runge-Kutta, compiled by numba.
+"""The rigid body: Newton-Euler equations, motor lag and drag, integrated by a fixed-step Runge-Kutta scheme.
 
-Axes: body FRD, earth NED; the quaternion (w, x, y, z) rotates body vectors into earth. The state vector is
+Axes: body FRD, earth NED. The quaternion (w, x, y, z) rotates body vectors into earth axes. The state vector is
 position (3, m), velocity (3, m/s), quaternion (4), body rates (3, rad/s), rotor speeds (n, rad/s).
 """
 
@@ -14,8 +14,9 @@ from mimopilot.sitl.physics.compiled import compiled, inlined
 from numpy.typing import ArrayLike, NDArray
 
 GRAVITY = 9.80665  # m/s^2, standard gravity
-STEP = 1e-3  # s, of the Runge-Kutta scheme
-HISTORY = 256  # control periods that a command can be late, at most
+RUNGE_KUTTA_STEP = 1e-3  # s; chosen: a step of 0.1 ms moves half a second of flight by less than 1e-6 (m, m/s, rad/s)
+COMMAND_HISTORY = 256  # control periods of motor commands that are kept: about 1 s at 250 Hz; faults may delay by half
+MAX_ROTORS = 16  # HIL_ACTUATOR_CONTROLS carries 16 controls
 
 POSITION, QUATERNION, ROTORS = 0, 6, 13
 
@@ -47,7 +48,7 @@ class PlantParameters(NamedTuple):
     wind : (3,) array, m/s
         Velocity of the air, NED.
     effectiveness : (n,) array
-        Share of its thrust that each motor still gives; 1 for a sound one.
+        Share of its thrust that each motor still gives; 1 when healthy.
     """
 
     mass: float
@@ -65,9 +66,9 @@ class PlantParameters(NamedTuple):
     effectiveness: NDArray[np.float64]
 
 
-#: What the integrator carries in registers: velocity (3), quaternion (4), angular momentum in body axes (3).
-#: With the momentum in place of the rates Euler's equation needs one product with a matrix less; the scheme is
-#: the same, because the two are related linearly. The rotors' lag is linear too and is solved exactly.
+# The integrator keeps a tuple in registers: velocity (3), quaternion (4), angular momentum in body axes (3).
+# With momentum instead of rates, Euler's equation needs one matrix product less. The scheme is the same, because the
+# two are related linearly. The rotor lag is linear too and is solved exactly.
 
 
 @inlined
@@ -82,15 +83,15 @@ def _product(matrix, x, y, z):  # type: ignore[no-untyped-def]
 
 @inlined
 def _derivative(body, wrench, plant):  # type: ignore[no-untyped-def]
-    """Newton's and Euler's equations; the wrench is thrust (N), then moment (N m)."""
+    """Newton's and Euler's equations; the wrench is thrust (N), then the moment (3, N m)."""
     vx, vy, vz, w, x, y, z, hx, hy, hz = body
     thrust, L, M, N = wrench
     p, q, r = _product(plant.inertia_inverse, hx, hy, hz)
-    lift, drag = 2.0 * thrust * (1.0 / plant.mass), plant.drag / plant.mass
+    twice_thrust, drag = 2.0 * thrust * (1.0 / plant.mass), plant.drag / plant.mass
     return (
-        -(x * z + w * y) * lift - drag * (vx - plant.wind[0]),
-        -(y * z - w * x) * lift - drag * (vy - plant.wind[1]),
-        GRAVITY - (0.5 - x * x - y * y) * lift - drag * (vz - plant.wind[2]),
+        -(x * z + w * y) * twice_thrust - drag * (vx - plant.wind[0]),
+        -(y * z - w * x) * twice_thrust - drag * (vy - plant.wind[1]),
+        GRAVITY - (0.5 - x * x - y * y) * twice_thrust - drag * (vz - plant.wind[2]),
         0.5 * (-x * p - y * q - z * r),
         0.5 * (w * p + y * r - z * q),
         0.5 * (w * q + z * p - x * r),
@@ -102,8 +103,8 @@ def _derivative(body, wrench, plant):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _moved(a, h, k):  # type: ignore[no-untyped-def]
-    """A + h k, written out: tuples live in registers, arrays do not."""
+def _add_scaled(a, h, k):  # type: ignore[no-untyped-def]
+    """Return a + h k, written out: tuples stay in registers, arrays do not."""
     return (
         a[0] + h * k[0],
         a[1] + h * k[1],
@@ -122,58 +123,58 @@ def _moved(a, h, k):  # type: ignore[no-untyped-def]
 def _runge_kutta(body, step, before, middle, after, plant):  # type: ignore[no-untyped-def]
     """One step of the classical scheme, with the wrench at its beginning, middle and end.
 
-    Returns the body, and how far it went.
+    Returns the body and its displacement (3, m).
     """
     k1 = _derivative(body, before, plant)
-    second = _moved(body, 0.5 * step, k1)
+    second = _add_scaled(body, 0.5 * step, k1)
     k2 = _derivative(second, middle, plant)
-    third = _moved(body, 0.5 * step, k2)
+    third = _add_scaled(body, 0.5 * step, k2)
     k3 = _derivative(third, middle, plant)
-    fourth = _moved(body, step, k3)
+    fourth = _add_scaled(body, step, k3)
     k4 = _derivative(fourth, after, plant)
-    end = _moved(body, step / 6.0, _moved(_moved(k1, 1.0, k4), 2.0, _moved(k2, 1.0, k3)))
+    end = _add_scaled(body, step / 6.0, _add_scaled(_add_scaled(k1, 1.0, k4), 2.0, _add_scaled(k2, 1.0, k3)))
     vx, vy, vz, w, x, y, z, hx, hy, hz = end
-    scale = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)  # one step of Newton's towards length one
+    scale = 1.5 - 0.5 * (w * w + x * x + y * y + z * z)  # one Newton step that restores unit length
     sixth, third_part = step / 6.0, step / 3.0
-    way = (
+    displacement = (
         sixth * (body[0] + fourth[0]) + third_part * (second[0] + third[0]),
         sixth * (body[1] + fourth[1]) + third_part * (second[1] + third[1]),
         sixth * (body[2] + fourth[2]) + third_part * (second[2] + third[2]),
     )
-    return (vx, vy, vz, w * scale, x * scale, y * scale, z * scale, hx, hy, hz), way
+    return (vx, vy, vz, w * scale, x * scale, y * scale, z * scale, hx, hy, hz), displacement
 
 
 @inlined
-def _take(state, plant):  # type: ignore[no-untyped-def]
-    """The body from the state vector."""
+def _read_body(state, plant):  # type: ignore[no-untyped-def]
+    """Read the body from the state vector."""
     hx, hy, hz = _product(plant.inertia, state[10], state[11], state[12])
     return (state[3], state[4], state[5], state[6], state[7], state[8], state[9], hx, hy, hz)
 
 
 @inlined
-def _put(body, state, plant):  # type: ignore[no-untyped-def]
-    """The body into the state vector."""
+def _write_body(body, state, plant):  # type: ignore[no-untyped-def]
+    """Write the body into the state vector."""
     state[3], state[4], state[5], state[6], state[7], state[8], state[9], hx, hy, hz = body
     state[10], state[11], state[12] = _product(plant.inertia_inverse, hx, hy, hz)
 
 
 @inlined
-def _rotor_speed(command, i, plant):  # type: ignore[no-untyped-def]
-    """Where the speed of rotor `i` settles (rad/s) under a thrust fraction."""
+def _steady_rotor_speed(command, i, plant):  # type: ignore[no-untyped-def]
+    """Steady-state speed of rotor `i` (rad/s) under a thrust fraction."""
     fraction = min(max(float(command), 0.0), 1.0) * plant.effectiveness[i]
     return np.sqrt(fraction * plant.thrust_max / plant.thrust_coefficient)
 
 
 @inlined
-def _spin(state, commands, plant, e_end):  # type: ignore[no-untyped-def]
-    """Let the rotors turn until e = exp(-t / motor_time_constant) is `e_end`, commands held.
+def _advance_rotors(state, commands, plant, e_end):  # type: ignore[no-untyped-def]
+    """Advance the rotors until e = exp(-t / motor_time_constant) is `e_end`, with the commands held.
 
-    Each rotor's speed is settled + gap e, its thrust proportional to the square. Returns the wrench meanwhile, as
+    The speed of a rotor is settled + gap e; its thrust is proportional to the square. Returns the wrench in between, as
     coefficients of 1, e and e^2.
     """
     constant, linear, square = (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
     for i in range(plant.rotors.shape[0]):
-        settled = _rotor_speed(commands[i], i, plant)
+        settled = _steady_rotor_speed(commands[i], i, plant)
         gap = state[ROTORS + i] - settled
         state[ROTORS + i] = settled + gap * e_end
         c = plant.thrust_coefficient * settled * settled
@@ -188,6 +189,7 @@ def _spin(state, commands, plant, e_end):  # type: ignore[no-untyped-def]
 
 @inlined
 def _wrench(polynomial, e):  # type: ignore[no-untyped-def]
+    """Evaluate the polynomial of `_advance_rotors`: thrust (N) and moment (3, N m)."""
     constant, linear, square = polynomial
     return (
         constant[0] + e * (linear[0] + e * square[0]),
@@ -203,27 +205,27 @@ def advance(state, commands, plant, steps, step):  # type: ignore[no-untyped-def
     decay, e_end = np.exp(-0.5 * step / plant.motor_time_constant), 1.0
     for _ in range(steps):
         e_end *= decay * decay
-    polynomial = _spin(state, commands, plant, e_end)
-    body, e, after = _take(state, plant), 1.0, _wrench(polynomial, 1.0)
+    polynomial = _advance_rotors(state, commands, plant, e_end)
+    body, e, after = _read_body(state, plant), 1.0, _wrench(polynomial, 1.0)
     x, y, z = state[0], state[1], state[2]
     for _ in range(steps):
         before, middle = after, _wrench(polynomial, e * decay)
         e *= decay * decay
         after = _wrench(polynomial, e)
-        body, way = _runge_kutta(body, step, before, middle, after, plant)
-        x, y, z = x + way[0], y + way[1], z + way[2]
+        body, moved = _runge_kutta(body, step, before, middle, after, plant)
+        x, y, z = x + moved[0], y + moved[1], z + moved[2]
     state[0], state[1], state[2] = x, y, z
-    _put(body, state, plant)
+    _write_body(body, state, plant)
 
 
 @compiled
 def _integrate(plant, moments, step, substeps, state, rates, quaternions):  # type: ignore[no-untyped-def]
-    body = _take(state, plant)
+    body = _read_body(state, plant)
     for k in range(moments.shape[0]):
         wrench = (0.0, moments[k, 0], moments[k, 1], moments[k, 2])
         for _ in range(substeps):
-            body, _way = _runge_kutta(body, step, wrench, wrench, wrench, plant)
-        _put(body, state, plant)
+            body, _ = _runge_kutta(body, step, wrench, wrench, wrench, plant)
+        _write_body(body, state, plant)
         quaternions[k + 1] = state[6:10]
         rates[k + 1] = state[10:13]
 
@@ -236,7 +238,7 @@ def integrate_moments(
     substeps: int = 1,
     quaternion0: ArrayLike = (1.0, 0.0, 0.0, 0.0),
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The flown integrator under pure body moments: for comparison with closed forms.
+    """Integrate pure body moments with the integrator of the simulation, for comparison with closed forms.
 
     Parameters
     ----------
@@ -290,34 +292,34 @@ def integrate_moments(
 
 
 def checked_inertia(inertia: ArrayLike) -> NDArray[np.float64]:
-    """The tensor as an array.
+    """Check an inertia tensor and return it as a (3, 3) array, kg m^2.
 
     Raises
     ------
     SitlError
-        When it is not a symmetric, positive definite 3x3 matrix whose principal moments obey the
-        triangle inequality (no body has others).
+        When it is not a symmetric, positive definite 3x3 matrix whose principal moments obey the triangle inequality,
+        as those of every body do.
     """
     J = np.array(inertia, dtype=np.float64)
     if J.shape != (3, 3) or not np.isfinite(J).all() or not np.allclose(J, J.T, rtol=1e-9, atol=0):
         raise SitlError(f"inertia: got {J.tolist()}, expected a symmetric 3x3 tensor, kg m^2")
-    if not is_of_a_body(J):
+    if not is_physical_inertia(J):
         principal = np.linalg.eigvalsh(J)
         raise SitlError(
             f"inertia: principal moments {', '.join(f'{v:.4g}' for v in principal)} kg m^2 are of no real body: "
-            "each must be positive and at most the sum of the other two"
+            "each must be positive and at most the sum of the other two; correct the tensor"
         )
     return J
 
 
-def is_of_a_body(inertia: NDArray[np.float64]) -> bool:
+def is_physical_inertia(inertia: NDArray[np.float64]) -> bool:
     """Whether a symmetric (3, 3) tensor has positive principal moments that obey the triangle inequality."""
     smallest, middle, largest = np.linalg.eigvalsh(inertia)
     return bool(smallest > 0 and largest <= (smallest + middle) * (1 + 1e-9))
 
 
 def hover_state(plant: PlantParameters, altitude: float = 10.0) -> NDArray[np.float64]:
-    """State of a level vehicle at rest in the air, every rotor carrying its equal share of the weight.
+    """State of a level vehicle at rest in the air; each rotor carries an equal share of the weight.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""What the autopilot is told of the vehicle's state: the estimate, with noise, rounded as the wire rounds it.
+"""The state estimate that the autopilot receives: noise, gyro filter, frame mode, and the rounding of MAVLink.
 
-A measurement is an array of nine numbers: quaternion (w, x, y, z) and body rates (rad/s), each a
-single-precision value, then altitude in whole millimetres and climb rate in whole cm/s, just what one
-HIL_STATE_QUATERNION message carries. The in-process loop rounds the same way, so both fly the same bits.
+A measurement is an array of nine numbers: quaternion (w, x, y, z) and body rates (rad/s) in single precision, then
+altitude in whole mm and climb rate in whole cm/s, as in HIL_STATE_QUATERNION. The in-process loop rounds the same way,
+so flights in process and over MAVLink agree in every bit.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import butter
 
-SIZE = 9
-NOISES = 6
+MEASUREMENT_SIZE = 9  # numbers in a measurement
+ESTIMATE_NOISES = 6  # normal numbers for one measurement: 3 angles, 3 rates
 
 
 def low_pass(cutoff_hz: float, Ts: float) -> NDArray[np.float64]:
-    """The gyro's filter, a second-order Butterworth low-pass as flight stacks have it.
+    """The gyro filter: a second-order Butterworth low-pass, as in PX4 and ArduPilot.
 
     Parameters
     ----------
     cutoff_hz : float, Hz
-        0: none.
+        0: no filter.
     Ts : float, s
-        Its period.
+        Sampling period.
 
     Returns
     -------
@@ -38,7 +38,7 @@ def low_pass(cutoff_hz: float, Ts: float) -> NDArray[np.float64]:
     Raises
     ------
     SitlError
-        When the cut-off is at half of the rate or above.
+        When the cutoff is not below half of the sampling rate.
     """
     if not 0 <= cutoff_hz < 0.5 / Ts:
         raise SitlError(
@@ -54,30 +54,30 @@ def low_pass(cutoff_hz: float, Ts: float) -> NDArray[np.float64]:
 def frame_mode(frequency_hz: float, damping: float, gain: float, Ts: float) -> NDArray[np.float64]:
     """A frame that bends between the rotors and the sensors: one mode on roll and one on pitch.
 
-    The bend b obeys b'' + 2 damping w b' + w^2 b = gain a, a the body's angular acceleration; what is measured is the
-    body's angle plus b and its rate plus b': the rigid response times 1 + gain s^2 / (s^2 + 2 damping w s + w^2).
-    Solved exactly with the mean acceleration of a period held over it.
+    The bend b obeys b'' + 2 damping w b' + w^2 b = gain a, where a is the angular acceleration of the body. The sensors
+    measure the angle plus b and the rate plus b': the rigid response times 1 + gain s^2 / (s^2 + 2 damping w s + w^2).
+    Solved exactly, with the mean acceleration of each period held over it.
 
     Parameters
     ----------
     frequency_hz : float, Hz
-        w / (2 pi); below half of the rate.
+        w / (2 pi); below half of the sampling rate.
     damping : float
-        Share of the critical one.
+        Damping ratio.
     gain : float
-        Modal gain over that of the rigid body; 0: a rigid frame.
+        Modal gain relative to the rigid body; 0: a rigid frame.
     Ts : float, s
-        Period of the measurement.
+        Sampling period.
 
     Returns
     -------
     (6,) array
-        A row by row, then B, of (b, b') from one measurement to the next under the acceleration.
+        A (2, 2) row by row, then B (2,), of the state (b, b') from one measurement to the next.
 
     Raises
     ------
     SitlError
-        When the frequency is at half of the rate or above.
+        When the frequency is not below half of the sampling rate.
     """
     if not frequency_hz < 0.5 / Ts:
         raise SitlError(
@@ -85,29 +85,29 @@ def frame_mode(frequency_hz: float, damping: float, gain: float, Ts: float) -> N
         )
     w = 2 * np.pi * frequency_hz
     augmented = np.array([[0.0, 1.0, 0.0], [-(w**2), -2 * damping * w, gain], [0.0, 0.0, 0.0]])
-    moved = expm(augmented * Ts)
-    return np.concatenate([moved[:2, :2].ravel(), moved[:2, 2]]).astype(np.float64)
+    transition = expm(augmented * Ts)
+    return np.concatenate([transition[:2, :2].ravel(), transition[:2, 2]]).astype(np.float64)
 
 
 class Sensors(NamedTuple):
-    """Constants and memory of the measurement; the arrays may be changed between samples.
+    """Constants and state of the sensors; the arrays may be changed between samples.
 
     Attributes
     ----------
     angle_deviation, rate_deviation : float, rad, rad/s
         Standard deviation of the noise.
     gyro : (5,) array
-        From `low_pass`.
+        Coefficients from `low_pass`.
     memory : (2, 3) array
-        Of that filter.
+        State of that filter.
     frame : (7,) array
-        From `frame_mode`, then 1 / Ts; all zeros for a rigid frame.
+        Coefficients from `frame_mode`, then 1 / Ts; all zeros for a rigid frame.
     bend : (2, 3) array
-        Of the frame on roll and pitch: angle (rad), rate (rad/s), and the body's rate (rad/s) at the last measurement.
+        Roll and pitch: bend angle (rad), bend rate (rad/s), and body rate (rad/s) at the last measurement.
     bias : (3,) array, rad/s
         Added to the body rates.
     stuck, failed : (3,) arrays of bool
-        Rates that repeat their last value; rates that are not a number.
+        Axes whose rate repeats its last value; axes whose rate is NaN.
     """
 
     angle_deviation: float
@@ -121,25 +121,26 @@ class Sensors(NamedTuple):
     failed: NDArray[np.bool_]
 
     @staticmethod
-    def sound(
+    def healthy(
         angle_deviation: float, rate_deviation: float, gyro: NDArray[np.float64], frame: NDArray[np.float64]
     ) -> Sensors:
-        """Sensors without a fault."""
-        nothing, never = np.zeros(3), np.zeros(3, np.bool_)
+        """Make sensors without faults."""
+        bias, stuck = np.zeros(3), np.zeros(3, np.bool_)
         memory, bend = np.zeros((2, 3)), np.zeros((2, 3))
-        return Sensors(angle_deviation, rate_deviation, gyro, memory, frame, bend, nothing, never, never.copy())
+        return Sensors(angle_deviation, rate_deviation, gyro, memory, frame, bend, bias, stuck, stuck.copy())
 
     def restart(self, rates: NDArray[np.float64]) -> None:
-        """Forget all that was measured, and every fault; the body turns with `rates` (3,), rad/s."""
+        """Reset the filter, the bend and every fault; the body rotates with `rates` (3,), rad/s."""
         for array in (self.memory, self.bend, self.bias, self.stuck, self.failed):
             array[:] = 0
         self.bend[:, 2] = rates[:2]
 
 
 @inlined
-def measure(state, noise, sensors, seen):  # type: ignore[no-untyped-def]
-    """Fill `seen` (9,), which holds the last measurement, from the true state and six standard normal numbers
-    (angles, then rates).
+def measure(state, noise, sensors, measurement):  # type: ignore[no-untyped-def]
+    """Replace the last `measurement` (9,) by one of the true `state`.
+
+    `noise` (6,) holds standard normal numbers: angles, then rates.
     """
     w, x, y, z = state[6], state[7], state[8], state[9]
     half = 0.5 * sensors.angle_deviation
@@ -153,11 +154,11 @@ def measure(state, noise, sensors, seen):  # type: ignore[no-untyped-def]
             bend[i, 1] = frame[2] * angle + frame[3] * rate + frame[5] * acceleration
             bend[i, 2] = state[10 + i]
         a, b = a + 0.5 * bend[0, 0], b + 0.5 * bend[1, 0]
-    # A small rotation about the body axes, 1 + (a, b, c), noise and bend, then back to length one.
+    # Rotate by the small angles of noise and bend, 1 + (a, b, c), and restore unit length.
     qw, qx = w - x * a - y * b - z * c, x + w * a + y * c - z * b
     qy, qz = y + w * b + z * a - x * c, z + w * c + x * b - y * a
     scale = 1.0 / np.sqrt(qw * qw + qx * qx + qy * qy + qz * qz)
-    seen[0], seen[1], seen[2], seen[3] = (
+    measurement[0], measurement[1], measurement[2], measurement[3] = (
         np.float32(qw * scale),
         np.float32(qx * scale),
         np.float32(qy * scale),
@@ -172,11 +173,11 @@ def measure(state, noise, sensors, seen):  # type: ignore[no-untyped-def]
         memory[0, i] = gyro[1] * rate - gyro[3] * filtered + memory[1, i]
         memory[1, i] = gyro[2] * rate - gyro[4] * filtered
         if sensors.failed[i]:
-            seen[4 + i] = np.nan
+            measurement[4 + i] = np.nan
         elif not sensors.stuck[i]:
-            seen[4 + i] = np.float32(filtered)
-    seen[7] = np.round(-1000.0 * state[2])
-    seen[8] = np.round(-100.0 * state[5])
+            measurement[4 + i] = np.float32(filtered)
+    measurement[7] = np.round(-1000.0 * state[2])
+    measurement[8] = np.round(-100.0 * state[5])
 
 
 @inlined

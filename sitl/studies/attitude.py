@@ -14,7 +14,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.metrics import Performance, performance
 from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet, excitation_flight
 from mimopilot.sitl.flight.simulator import Flight, fly
-from mimopilot.sitl.physics.airframe import Vehicle, load_airframe
+from mimopilot.sitl.physics.airframe import AirframeFile, load_airframe
 from mimopilot.sitl.studies.autotune import autotune
 from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.sitl.studies.optimum import Task, best_gains, flown_effort
@@ -207,7 +207,7 @@ class Run:
 
 
 @cache
-def _bench(airframe: str) -> tuple[Vehicle, Gains, NativeLibrary]:
+def _bench(airframe: str) -> tuple[AirframeFile, Gains, NativeLibrary]:
     vehicle = load_airframe(airframe)
     default = vehicle.default_gains()
     return vehicle, default, load_native(default)

@@ -39,7 +39,7 @@ class Request:
     airframe : str
         Name or path.
     gains : tuple of Path
-        See `sitl.physics.airframe.Vehicle.gain_sets`.
+        See `sitl.physics.airframe.AirframeFile.gain_sets`.
     axis : str
     amplitude_deg, period_s : float
         Of the doublet.

@@ -11,10 +11,10 @@ import time
 from typing import Any
 
 import serial
-from mimopilot.sitl.autopilot.autopilot import MAX_ROTORS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import FORGET_S, SimulatedVehicle
 from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS
+from mimopilot.sitl.physics.rigid_body import MAX_ROTORS
 from pymavlink.dialects.v20 import common as mavlink
 
 STALE_S = 0.5  # speed controllers stop their motors without commands for so long

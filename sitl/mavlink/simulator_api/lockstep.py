@@ -13,7 +13,7 @@ from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState, actuator_controls
 from mimopilot.sitl.mavlink.wire.fast_codec import SPIN_S, STATE, LeanCodec, receive
 from mimopilot.sitl.mavlink.wire.link import COMPONENT, LOOPBACK, SYSTEM
-from mimopilot.sitl.physics.state_estimate import SIZE
+from mimopilot.sitl.physics.state_estimate import MEASUREMENT_SIZE
 from numpy.typing import NDArray
 
 
@@ -54,7 +54,7 @@ def fly(autopilot: Autopilot, scenario: Scenario, port: int) -> NDArray[Any]:
 
 def _exchange(autopilot: Autopilot, plant: socket.socket, record: NDArray[Any]) -> int:
     """Answer frames until the record is full; how many periods were flown. A repeated frame is answered, not flown."""
-    codec, measurement = LeanCodec(SYSTEM, COMPONENT), np.zeros(SIZE)
+    codec, measurement = LeanCodec(SYSTEM, COMPONENT), np.zeros(MEASUREMENT_SIZE)
     count, stamp, answer = 0, -1, b""
     plant.setblocking(False)
     while count < len(record):
@@ -71,7 +71,7 @@ def _exchange(autopilot: Autopilot, plant: socket.socket, record: NDArray[Any]) 
             if state.stamp > stamp:
                 stamp = state.stamp
                 state.measure(measurement)
-                tick(*autopilot.arguments(), measurement, record[count])
+                tick(autopilot.loop, autopilot.hover, autopilot.altitude, measurement, record[count])
                 answer = actuator_controls(codec, stamp, record[count]["commands"], True)
                 count += 1
             plant.sendall(answer)

@@ -17,9 +17,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from mimopilot.sitl.autopilot.autopilot import MAX_ROTORS
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import ARMED, FORGET_S, SimulatedVehicle
 from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, SPIN_S, Message, receive
+from mimopilot.sitl.physics.rigid_body import MAX_ROTORS
 
 FIRST_ANSWER_S = 0.2  # the first frame is repeated at this interval until it is answered
 LOOK_S = 0.2  # between looks at everything but the autopilot

@@ -9,24 +9,24 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from mimopilot.sitl.autopilot.autopilot import MAX_ROTORS
-from mimopilot.sitl.faults.inject_plant import Injection
+from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
+from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.sitl.flight.simulator import Simulator
 from mimopilot.sitl.mavlink.wire.fast_codec import GPS, SENSOR, STATE, LeanCodec
 from mimopilot.sitl.physics.airframe import Airframe
-from mimopilot.sitl.physics.ground_contact import ground_state, touch
+from mimopilot.sitl.physics.ground_contact import apply_ground_contact, ground_state
 from mimopilot.sitl.physics.imu_baro_gps import (
     FIX_3D,
     GPS_EPH,
     GPS_EPV,
     GPS_PERIOD,
     SATELLITES,
-    Instruments,
+    ImuBaroGps,
     centi,
-    place,
+    global_position,
 )
-from mimopilot.sitl.physics.rigid_body import GRAVITY
+from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -36,7 +36,7 @@ INERTIAL, FIELD_AND_AIR = 7 | 56, 448 | 6656  # bits of fields_updated
 FIELD_AND_AIR_PERIOD = 0.02  # s
 FORGET_S = 0.25  # a simulation that is late by more does not race to catch up
 HARD_LANDING = 3.0  # m/s, a fall from half a metre
-TIPPED = math.cos(math.radians(60.0))
+TIPPED = math.cos(MAX_TILT)
 ARMED = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
 
 Tell = Callable[[str], None]
@@ -82,7 +82,7 @@ class SimulatedVehicle:
         # Compile what each period calls now, so that the first frames come in time.
         self.messages()
         self.fly([0.0] * MAX_ROTORS, ARMED)
-        touch(ground_state(self.simulator.plant), self.simulator.plant, Ts)
+        apply_ground_contact(ground_state(self.simulator.plant), self.simulator.plant, Ts)
         self.restart()
 
     def restart(self) -> None:
@@ -91,8 +91,8 @@ class SimulatedVehicle:
         if self.altitude == 0:
             self.simulator.state[:] = ground_state(self.simulator.plant)
             self.simulator.history[:] = 0.0
-        self.instruments = Instruments(self.simulator.state, self.Ts, self.seed)
-        self.injection = Injection(self.faults, self.airframe, self.simulator, self.Ts, self.seed)
+        self.instruments = ImuBaroGps(self.simulator.state, self.Ts, self.seed)
+        self.injection = FaultInjection(self.faults, self.airframe, self.simulator, self.Ts, self.seed)
         self.codec = LeanCodec(1, mavlink.MAV_COMP_ID_USER1)
         self.periods = self.flown = 0
         self.lost = self.odd = False
@@ -118,7 +118,7 @@ class SimulatedVehicle:
 
     def _break(self) -> None:
         """Put the faults of this period into the vehicle and into its link."""
-        for _, runs, delays in self.injection.stretches(self.flown, self.flown + 1):
+        for _, runs, delays in self.injection.segments(self.flown, self.flown + 1):
             self.copies = 1 if runs is None else int(runs[0])
             if delays is not None:
                 self.simulator.delay = int(delays[0])
@@ -137,7 +137,7 @@ class SimulatedVehicle:
                 self._stop_odd(commands)
         simulator = self.simulator
         simulator.advance(commands)
-        speed = touch(simulator.state, simulator.plant, self.Ts)
+        speed = apply_ground_contact(simulator.state, simulator.plant, self.Ts)
         if speed >= 0.0:
             self._judge_landing(speed)
         self.periods += 1
@@ -183,11 +183,11 @@ class SimulatedVehicle:
         if self.periods % self.fix_every == 0:
             fix = self.instruments.fix(state)
             said = (fix.speed, fix.north, fix.east, fix.down, fix.course, FIX_3D, SATELLITES, 0, 0)
-            data += self.codec.pack(GPS, stamp, *fix.place, GPS_EPH, GPS_EPV, *said)
+            data += self.codec.pack(GPS, stamp, *fix.position, GPS_EPH, GPS_EPV, *said)
         if estimate:
-            seen = self.simulator.seen.tolist()
+            seen = self.simulator.measurement.tolist()
             x, y, z, vx, vy = state[:5].tolist()
-            latitude, longitude, _ = place(x, y, z)
+            latitude, longitude, _ = global_position(x, y, z)
             acceleration = (centi(10.0 * a / GRAVITY) for a in readings[12:])
             place_and_speed = (latitude, longitude, int(seen[7]), centi(vx), centi(vy), int(-seen[8]))
             data += self.codec.pack(STATE, stamp, *seen[:7], *place_and_speed, 0, 0, *acceleration)

@@ -30,7 +30,7 @@ class Excitation:
         estimate = vehicle.estimate
         moment = injector.step(
             Conditions(
-                ready=vehicle.armed and not vehicle.lift.landed and not self.situation.row["fault"],
+                ready=vehicle.armed and not vehicle.vertical.landed and not self.situation.row["fault"],
                 mode=NAV_STATES[vehicle.mode],
                 attitude=(estimate.roll, estimate.pitch),
                 sticks=vehicle.sticks.value if vehicle.sticks.fresh(now) else NO_STICKS,

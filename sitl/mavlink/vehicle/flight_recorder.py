@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from mimopilot.sitl.autopilot.autopilot import RECORD
-from mimopilot.sitl.autopilot.flight_modes import Vehicle
+from mimopilot.sitl.autopilot.flight_modes import Commander
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.flight_log import vehicle_log
 from mimopilot.sitl.physics.airframe import Airframe
@@ -75,14 +75,14 @@ class FlightLog:
         self._forget()
         self._gains = gains.copy()
 
-    def row(self, vehicle: Vehicle) -> Any:
+    def row(self, vehicle: Commander) -> Any:
         """The record of the next period, of `sitl.autopilot.autopilot.RECORD`, to be filled."""
         if self._gains is None:
             return self._spare[0]
         place = len(self._landed) % BLOCK
         if place == 0:
             self._blocks.append(np.zeros(BLOCK, RECORD))
-        self._landed.append(vehicle.lift.landed)
+        self._landed.append(vehicle.vertical.landed)
         return self._blocks[-1][place]
 
     @property

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick
-from mimopilot.sitl.autopilot.flight_modes import Severity, Vehicle
+from mimopilot.sitl.autopilot.flight_modes import Commander, Severity
 from mimopilot.sitl.autopilot.vertical import Estimate
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_autopilot import AutopilotFaults
@@ -22,7 +22,7 @@ from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
 from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
 from mimopilot.sitl.mavlink.vehicle.situation import Situation
 from mimopilot.sitl.mavlink.wire.fast_codec import GPS, SENSOR, STATE
-from mimopilot.sitl.physics.state_estimate import SIZE, euler_angles
+from mimopilot.sitl.physics.state_estimate import MEASUREMENT_SIZE, euler_angles
 from mimopilot.tuning.parameters import PARAMETERS
 from numpy.typing import NDArray
 
@@ -52,7 +52,7 @@ class Host:
 
     Attributes
     ----------
-    vehicle : Vehicle
+    vehicle : Commander
     situation : Situation
         What telemetry shows.
     excitation : callable
@@ -68,18 +68,18 @@ class Host:
     def __init__(self, autopilot: Autopilot, plant: PlantLink, log: FlightLog | None = None) -> None:
         self.autopilot, self.plant, self.log = autopilot, plant, log
         autopilot.controls["armed"] = 0
-        self.vehicle = Vehicle(autopilot.hover)
-        self.vehicle.obstacles["plant"] = "no plant is connected"
+        self.vehicle = Commander(autopilot.hover)
+        self.vehicle.arming_blockers["plant"] = "no plant is connected"
         self.situation = Situation(self.vehicle)
         self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
         self.pilot: ScriptedPilot | None = None
         self.faults: AutopilotFaults | None = None
         self.lateness = Lateness()
-        self.measurement = np.zeros(SIZE)
+        self.measurement = np.zeros(MEASUREMENT_SIZE)
         euler_angles(*self.measurement[:4])  # compiled now, not in flight
         self.stamp = self._zero = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
-        self.fixed = autopilot.arguments()[:5]
+        self.fixed = autopilot.loop
         self.heard = self._news = self._turn = 0.0
         self._connected = False
         self._periods = self._examined = self._first = 0
@@ -102,9 +102,9 @@ class Host:
             self._connect(now)
             if self._wait():
                 self._fly()
-            elif self._connected and now > self.heard + SILENT_S and "plant" not in self.vehicle.obstacles:
-                self.vehicle.obstacles["plant"] = f"the plant has been silent for {SILENT_S:g} s"
-                self.vehicle.say(Severity.CRITICAL, self.vehicle.obstacles["plant"])
+            elif self._connected and now > self.heard + SILENT_S and "plant" not in self.vehicle.arming_blockers:
+                self.vehicle.arming_blockers["plant"] = f"the plant has been silent for {SILENT_S:g} s"
+                self.vehicle.say(Severity.CRITICAL, self.vehicle.arming_blockers["plant"])
             if now >= self._turn:
                 self._turn = now + GROUND_S
                 ground.receive(now)
@@ -125,7 +125,7 @@ class Host:
         try:
             self._connected = self.plant.connect(now)
         except SitlError as error:
-            self.vehicle.obstacles["plant"] = str(error)
+            self.vehicle.arming_blockers["plant"] = str(error)
             self.vehicle.say(Severity.CRITICAL, str(error))
         if self._connected:
             self._begin(now)
@@ -174,8 +174,8 @@ class Host:
         if state.stamp < self.stamp - CLOCK_BACK_US:
             self.vehicle.plant_lost("the plant has started anew")
             self._begin(self.heard)
-        elif "plant" in self.vehicle.obstacles:
-            del self.vehicle.obstacles["plant"]
+        elif "plant" in self.vehicle.arming_blockers:
+            del self.vehicle.arming_blockers["plant"]
             self.vehicle.say(Severity.INFO, "the plant is heard again")
         if state.stamp > self.stamp:
             self.stamp = state.stamp
@@ -202,14 +202,14 @@ class Host:
         velocity = (-state.vz / 100, state.vx / 100, state.vy / 100)
         estimate = Estimate(roll, pitch, yaw, (state.p, state.q, state.r), state.alt / 1000, *velocity)
         if self.pilot is not None:
-            self.pilot.steer(self.vehicle)
+            self.pilot.update(self.vehicle)
         demand = self.vehicle.step(now, estimate)
         self._note_arming()
         row = self.rows[0] if self.log is None else self.log.row(self.vehicle)
         row["setpoint"] = demand[:3]
         row["excitation"] = self.excitation(now)
-        autopilot.controls["landed"] = self.vehicle.lift.landed
-        tick(*self.fixed, demand.collective, demand.altitude, m, row)
+        autopilot.controls["landed"] = self.vehicle.vertical.landed
+        tick(self.fixed, demand.collective, demand.altitude, m, row)
         situation = self.situation
         situation.stamp, situation.row, situation.state = self.stamp, row, state
         situation.home = situation.home or (state.lat, state.lon, state.alt)
@@ -253,9 +253,9 @@ class Host:
         if not fault:
             self._first, self._examined = self.stamp, self._periods
         for subject in ("controller", "parameters", "rate"):
-            before = self.vehicle.obstacles.pop(subject, None)
+            before = self.vehicle.arming_blockers.pop(subject, None)
             if subject in found:
-                self.vehicle.obstacles[subject] = found[subject]
+                self.vehicle.arming_blockers[subject] = found[subject]
                 if before is None:
                     self.vehicle.say(Severity.CRITICAL, found[subject])
 

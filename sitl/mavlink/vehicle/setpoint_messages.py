@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from mimopilot.sitl.autopilot.flight_modes import MAX_TILT, Severity, Vehicle
-from mimopilot.sitl.autopilot.setpoints import Attitude, Pose, Sticks
+from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
+from mimopilot.sitl.autopilot.flight_modes import Commander, Severity
+from mimopilot.sitl.autopilot.setpoints import AttitudeSetpoint, Pose, Sticks
 from mimopilot.sitl.physics.state_estimate import euler_angles
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -28,10 +29,10 @@ class Steering:
 
     Parameters
     ----------
-    vehicle : Vehicle
+    vehicle : Commander
     """
 
-    def __init__(self, vehicle: Vehicle) -> None:
+    def __init__(self, vehicle: Commander) -> None:
         self.vehicle = vehicle
         self._channels: list[int] = [0, 0, 0, 0]
         self._seen = -1
@@ -66,7 +67,7 @@ class Steering:
         thrust = None if mask & mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE else message.thrust
         if thrust is not None and not 0 <= thrust <= 1:
             return f"set-point refused: thrust {thrust:g}, expected 0 to 1"
-        self.vehicle.attitude.put(Attitude(*angles, thrust), self.vehicle.now)
+        self.vehicle.attitude.put(AttitudeSetpoint(*angles, thrust), self.vehicle.now)
         return ""
 
     def _manual_control(self, message: Any) -> str:

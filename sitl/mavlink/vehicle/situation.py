@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from mimopilot.sitl.autopilot.autopilot import RECORD
-from mimopilot.sitl.autopilot.flight_modes import Vehicle
-from mimopilot.sitl.autopilot.setpoints import turned
+from mimopilot.sitl.autopilot.flight_modes import Commander
+from mimopilot.sitl.autopilot.setpoints import earth_to_heading
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState
 from mimopilot.sitl.physics.imu_baro_gps import METRES_PER_DEGREE
 
@@ -22,7 +22,7 @@ class Situation:
 
     Attributes
     ----------
-    vehicle : Vehicle
+    vehicle : Commander
     stamp : int, us
         The plant's clock at the last period.
     row : one of `sitl.autopilot.autopilot.RECORD`
@@ -38,7 +38,7 @@ class Situation:
         Axis of the excitation: 0 roll, 1 pitch, 2 between them, -1 none.
     """
 
-    vehicle: Vehicle
+    vehicle: Commander
     stamp: int = -1
     row: Any = field(default_factory=lambda: np.zeros(1, RECORD)[0])
     state: PlantState = NOWHERE
@@ -58,7 +58,7 @@ class Situation:
         estimate, vehicle = self.vehicle.estimate, self.vehicle
         if vehicle.pose.fresh(vehicle.now):
             pose = vehicle.pose.value
-            vx, vy = turned(estimate.north, estimate.east, estimate.yaw - pose.yaw)
+            vx, vy = earth_to_heading(estimate.north, estimate.east, estimate.yaw - pose.yaw)
             return pose.x, pose.y, pose.z, vx, vy, -estimate.climb
         latitude, longitude, altitude = self.home
         metres = 1e-7 * METRES_PER_DEGREE

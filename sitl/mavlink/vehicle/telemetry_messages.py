@@ -48,9 +48,9 @@ def heartbeat(s: Situation) -> Any:
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
     base |= MODE_FLAGS[vehicle.mode] | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0)
     status = mavlink.MAV_STATE_ACTIVE if vehicle.armed else mavlink.MAV_STATE_STANDBY
-    if "plant" in vehicle.obstacles:
+    if "plant" in vehicle.arming_blockers:
         status = mavlink.MAV_STATE_BOOT
-    elif vehicle.armed and vehicle.in_trouble:
+    elif vehicle.armed and vehicle.in_failsafe:
         status = mavlink.MAV_STATE_CRITICAL
     return mavlink.MAVLink_heartbeat_message(
         mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_GENERIC, base, custom_mode(vehicle.mode), status, 3
@@ -62,8 +62,8 @@ def _sys_status(s: Situation) -> Any:
     present = SENSORS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
     if vehicle.pose.fresh(vehicle.now):
         present |= mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION | mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
-    healthy = present if not vehicle.complaints() else present & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
-    if "plant" in vehicle.obstacles:
+    healthy = present if not vehicle.arming_problems() else present & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
+    if "plant" in vehicle.arming_blockers:
         healthy = mavlink.MAV_SYS_STATUS_GEOFENCE  # there is no fence to breach, which is what its absence means
     return mavlink.MAVLink_sys_status_message(
         present, present, healthy, round(1000 * min(s.load, 1)), UNKNOWN_16, -1, -1, 0, 0, 0, 0, 0, 0
@@ -122,7 +122,7 @@ def _vfr_hud(s: Situation) -> Any:
 
 
 def _altitude(s: Situation) -> Any:
-    altitude, ground = s.vehicle.estimate.altitude, s.vehicle.lift.ground
+    altitude, ground = s.vehicle.estimate.altitude, s.vehicle.vertical.ground
     home = s.home[2] / 1000
     return mavlink.MAVLink_altitude_message(
         s.stamp, altitude, altitude, altitude - home, altitude - home, altitude - ground, altitude - ground
@@ -152,7 +152,7 @@ def _actuators(s: Situation) -> Any:
 
 def _extended_state(s: Situation) -> Any:
     vehicle = s.vehicle
-    state = mavlink.MAV_LANDED_STATE_ON_GROUND if vehicle.lift.landed else mavlink.MAV_LANDED_STATE_IN_AIR
+    state = mavlink.MAV_LANDED_STATE_ON_GROUND if vehicle.vertical.landed else mavlink.MAV_LANDED_STATE_IN_AIR
     if vehicle.armed and vehicle.mode is Mode.TAKEOFF:
         state = mavlink.MAV_LANDED_STATE_TAKEOFF
     elif vehicle.armed and vehicle.mode is Mode.LAND:

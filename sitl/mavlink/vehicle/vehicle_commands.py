@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from mimopilot.sitl.autopilot.flight_modes import Denied, Failed, Mode, Refused, Severity, Vehicle
+from mimopilot.sitl.autopilot.flight_modes import Commander, Denied, Failed, Mode, Refused, Severity
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
 from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TOPICS
 from mimopilot.sitl.mavlink.wire.px4_modes import mode_of, mode_of_pair
@@ -83,7 +83,7 @@ class VehicleCommands:
 
     Parameters
     ----------
-    vehicle : Vehicle
+    vehicle : Commander
     telemetry : Telemetry
     reboot : callable
         Puts the vehicle back at its start; may raise `Refused`.
@@ -94,7 +94,7 @@ class VehicleCommands:
         MAV_CMD -> handler; others may add theirs.
     """
 
-    def __init__(self, vehicle: Vehicle, telemetry: Telemetry, reboot: Callable[[], None]) -> None:
+    def __init__(self, vehicle: Commander, telemetry: Telemetry, reboot: Callable[[], None]) -> None:
         self.vehicle, self.telemetry, self.reboot = vehicle, telemetry, reboot
         self.handlers: dict[int, Handler] = {
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
@@ -148,7 +148,7 @@ class VehicleCommands:
     def _take_off(self, command: Command) -> list[Any]:
         height = command.params[6]
         if command.absolute:
-            height -= self.vehicle.lift.ground
+            height -= self.vehicle.vertical.ground
         self.vehicle.take_off(TAKEOFF_HEIGHT if math.isnan(height) else height)
         return []
 

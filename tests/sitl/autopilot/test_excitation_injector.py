@@ -1,10 +1,10 @@
-"""The injector: one run when asked, and an end whenever the flight is not as it should be."""
+"""The excitation injector: one run for each request, which ends when a condition fails."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mimopilot.sitl.autopilot.excitation_injector import NOTHING, Conditions, Injector, Phase
+from mimopilot.sitl.autopilot.excitation_injector import NO_MOMENT, Conditions, ExcitationPhase, Injector
 from mimopilot.tuning.excitation import prbs
 from mimopilot.tuning.parameters import EXCITATION
 
@@ -15,7 +15,7 @@ SHORT = DEFAULTS | {"MIMO_EX_DUR": 0.8, "MIMO_EX_SEED": 5}
 SAMPLES = 200
 
 
-def asked(axis=3, **settings):
+def requested(axis=3, **settings):
     injector = Injector(TS)
     injector.configure(SHORT | settings)
     injector.configure(SHORT | settings | {"MIMO_EX_AX": axis})
@@ -26,8 +26,8 @@ def flown(injector, samples, conditions=HOVER):
     return np.array([injector.step(conditions) for _ in range(samples)])
 
 
-def test_both_axes_get_the_tuners_prbs_one_after_the_other_once():
-    injector = asked()
+def test_both_axes_get_the_prbs_of_the_tuner_one_after_the_other_once():
+    injector = requested()
     moment = flown(injector, 2000)
     pause = round(1 / TS)
     for axis, start, seed in ((0, 0, 10), (1, SAMPLES + pause, 11)):
@@ -35,13 +35,13 @@ def test_both_axes_get_the_tuners_prbs_one_after_the_other_once():
         assert np.array_equal(moment[start : start + SAMPLES, axis], expected)
         moment[start : start + SAMPLES, axis] = 0
     assert not moment.any()
-    assert injector.phase is Phase.OFF
+    assert injector.phase is ExcitationPhase.OFF
     assert injector.said[-1] == "excitation finished"
 
 
 @pytest.mark.parametrize(("axis", "column"), [(1, 0), (2, 1)])
-def test_one_axis_alone(axis, column):
-    moment = flown(asked(axis), 2 * SAMPLES)
+def test_one_axis_can_be_excited_alone(axis, column):
+    moment = flown(requested(axis), 2 * SAMPLES)
     assert np.abs(moment[:SAMPLES, column]).min() > 0
     assert not np.delete(moment, column, axis=1).any()
     assert not moment[SAMPLES:].any()
@@ -57,16 +57,16 @@ def test_one_axis_alone(axis, column):
         (HOVER._replace(sticks=(0.0, 0.0, 0.0, 0.2)), "stick moved"),
     ],
 )
-def test_it_stops_at_once_and_for_good(conditions, words):
-    injector = asked()
+def test_a_failed_condition_ends_the_run_at_once(conditions, words):
+    injector = requested()
     assert flown(injector, 50)[:, 0].all()
-    assert injector.step(conditions) == NOTHING
+    assert injector.step(conditions) == NO_MOMENT
     assert words in injector.said[-1]
     assert not flown(injector, 2000).any()
 
 
-def test_zero_cancels_it_and_allows_another_run():
-    injector = asked()
+def test_zero_cancels_the_run_and_allows_another():
+    injector = requested()
     first = flown(injector, 100)
     injector.configure(SHORT)
     assert injector.said[-1] == "excitation cancelled"
@@ -75,8 +75,8 @@ def test_zero_cancels_it_and_allows_another_run():
     assert np.array_equal(flown(injector, 100), first)
 
 
-def test_another_run_needs_zero_first_and_what_is_set_on_the_way_waits_for_it():
-    injector = asked()
+def test_another_run_needs_zero_first_and_new_settings_wait_for_it():
+    injector = requested()
     flown(injector, 100)
     injector.configure(SHORT | {"MIMO_EX_AX": 3, "MIMO_EX_AMP": 0.4})
     assert np.abs(flown(injector, 10)).max() == pytest.approx(0.1)
@@ -85,21 +85,21 @@ def test_another_run_needs_zero_first_and_what_is_set_on_the_way_waits_for_it():
     assert not flown(injector, 100).any()
 
 
-def test_what_was_left_from_an_earlier_flight_starts_nothing():
+def test_a_request_left_from_an_earlier_flight_starts_no_run():
     injector = Injector(TS)
     injector.configure(SHORT | {"MIMO_EX_AX": 3})
     assert not flown(injector, 1000).any()
 
 
-def test_it_waits_for_its_mode_in_the_air():
-    injector = asked()
+def test_the_run_waits_for_its_mode_in_the_air():
+    injector = requested()
     assert not flown(injector, 500, HOVER._replace(mode=17)).any()
-    assert injector.phase is Phase.WAITING
+    assert injector.phase is ExcitationPhase.WAITING
     assert flown(injector, SAMPLES)[:, 0].all()
 
 
-def test_holds_that_contradict_each_other_are_refused():
-    injector = asked(MIMO_EX_HMIN=50, MIMO_EX_HMAX=20)
+def test_a_minimum_pulse_above_the_maximum_is_refused():
+    injector = requested(MIMO_EX_HMIN=50, MIMO_EX_HMAX=20)
     assert "MIMO_EX_HMIN is above MIMO_EX_HMAX" in injector.said[-1]
     assert not flown(injector, 100).any()
 
@@ -113,7 +113,7 @@ def test_holds_that_contradict_each_other_are_refused():
     ),
     st.lists(st.sampled_from([HOVER, HOVER._replace(ready=False), HOVER._replace(attitude=(2.0, 0.0))]), max_size=60),
 )
-def test_the_moment_is_never_above_its_amplitude_nor_there_without_flight(settings, flight):
+def test_the_torque_never_exceeds_its_amplitude_and_is_zero_outside_of_flight(settings, flight):
     injector = Injector(TS)
     injector.configure(settings | {"MIMO_EX_AX": 0})
     injector.configure(settings)
@@ -121,4 +121,4 @@ def test_the_moment_is_never_above_its_amplitude_nor_there_without_flight(settin
         moment = injector.step(conditions)
         assert max(map(abs, moment)) <= settings["MIMO_EX_AMP"]
         if conditions is not HOVER:
-            assert moment == NOTHING
+            assert moment == NO_MOMENT

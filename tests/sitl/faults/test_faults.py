@@ -1,4 +1,4 @@
-"""Faults: what they are called, and what they do, against what can be worked out by hand."""
+"""Faults: their notation, and their effects against values worked out by hand."""
 
 import json
 from dataclasses import replace
@@ -11,7 +11,7 @@ from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.faults.inject_plant import Injection
+from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.faults.kinds import KINDS, fault_help, parse_fault, parse_faults
 from mimopilot.sitl.flight.flight_log import save_flight
 from mimopilot.sitl.flight.scenario import doublet, excitation_flight, hover, load_scenario, step
@@ -19,10 +19,10 @@ from mimopilot.sitl.flight.simulator import Simulator, fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.tuning.design.cascade import tune
-from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.spec import load_spec
 
+from mimopilot.common.errors import InputFileError
 from tests.conftest import assert_one_clear_line
 
 TS = 0.004
@@ -40,7 +40,7 @@ def library(vehicle):
 
 @pytest.fixture(scope="module")
 def flown(vehicle, library):
-    """Fly a scenario with faults, without noise unless told."""
+    """Fly a scenario with faults, by default without noise."""
 
     def run(scenario, *texts, seed=0, noise=False):
         gains = vehicle.default_gains()
@@ -53,18 +53,19 @@ def flown(vehicle, library):
 
 def injection(vehicle, *texts, seed=0, seconds=None):
     simulator = Simulator(vehicle.airframe, TS, 0, noise=False)
-    return simulator, Injection(tuple(map(parse_fault, texts)), vehicle.airframe, simulator, TS, seed, seconds=seconds)
+    faults = tuple(map(parse_fault, texts))
+    return simulator, FaultInjection(faults, vehicle.airframe, simulator, TS, seed, seconds=seconds)
 
 
 def link(vehicle, text, samples, seed=0):
-    """Runs and ages over a flight of which nothing else changes."""
+    """Runs and command ages of a flight with one fault of the link."""
     _, injected = injection(vehicle, text, seed=seed)
-    pieces = list(injected.stretches(0, samples))
+    pieces = list(injected.segments(0, samples))
     assert len(pieces) == 1
     return pieces[0][1:]
 
 
-# What they are called.
+# Notation.
 
 POSITIVE = st.floats(0, 1e6, allow_nan=False)
 
@@ -98,7 +99,7 @@ def test_a_fault_reads_back_from_its_own_text_as_the_same_fault(text):
 
 
 @given(notations())
-def test_what_is_written_is_what_is_meant(text):
+def test_each_field_is_read_from_its_place(text):
     fault, head = parse_fault(text), text.split("@")[0]
     assert fault.kind == head.split("=")[0].split(":")[0]
     if "=" in head:
@@ -117,11 +118,11 @@ def test_help_names_every_kind_with_the_unit_of_its_size():
 
 WRONG = {
     "motor:5=0.5@1": ("adam0 has motors 1 to 4",),
-    "motor=0.5@1": ("does not say which motor",),
+    "motor=0.5@1": ("needs a motor",),
     "motor:x=0.5@1": ("motor", "integer"),
     "motor:3=1.5@1": ("size: got 1.5", "0 to 1 (share)"),
     "motor:3@1": ("size: got none", "share"),
-    "mass=1@1": ("does not say which position",),
+    "mass=1@1": ("needs a position",),
     "mass:1,2=1@1": ("position",),
     "mass:0,0,0=0@1": ("0.001 to 100 (kg)",),
     "gyro-bias:up=1@1": ("axis", "'roll', 'pitch' or 'yaw'"),
@@ -134,14 +135,14 @@ WRONG = {
     "skip=3@1+1": ("takes no duration",),
     "link@-1": ("at:", "greater than or equal to 0"),
     "link@1+0": ("duration", "greater than 0"),
-    "link@7": ("begins at 7 s, the flight ends at 2.916 s",),
+    "link@7": ("begins at 7 s, but the flight ends at 2.916 s",),
     "rocket@1": ("unknown kind 'rocket'", "motor, battery"),
     "motor:3=0.7": ("expected KIND[:TARGET][=SIZE]@AT[+DURATION]",),
 }
 
 
 @pytest.mark.parametrize("text", WRONG)
-def test_a_wrong_fault_gets_one_message_with_its_text_and_what_was_expected(flown, text):
+def test_a_wrong_fault_is_refused_with_its_text_and_what_was_expected(flown, text):
     with pytest.raises(SitlError) as caught:
         flown(doublet("roll", 0.2, 0.42, TS), text)
     assert caught.value.exit_code == 2
@@ -150,12 +151,12 @@ def test_a_wrong_fault_gets_one_message_with_its_text_and_what_was_expected(flow
         assert word in str(caught.value)
 
 
-def test_a_program_that_holds_only_the_plant_refuses_faults_of_the_autopilot():
+def test_a_plant_process_refuses_faults_of_the_autopilot():
     assert [str(fault) for fault in parse_faults(["motor:1=0.5@2", "loss=0.1@0"], ("plant", "link"), "it")] == [
         "motor:1=0.5@2",
         "loss=0.1@0",
     ]
-    with pytest.raises(SitlError, match="fault 'stale@1': happens in the autopilot, which it does not hold"):
+    with pytest.raises(SitlError, match="fault 'stale@1': acts on the autopilot, which is not part of it"):
         parse_faults(["stale@1"], ("plant", "link"), "it")
 
 
@@ -179,13 +180,13 @@ at = 1
 """
 
 
-def test_a_scenario_file_flies_as_the_same_words_on_the_command_line(mimopilot, tmp_path):
+def test_a_scenario_file_flies_as_the_same_options_on_the_command_line(mimopilot, tmp_path):
     (tmp_path / "a.toml").write_text(FILE)
     given = ("--axis", "pitch", "--amplitude-deg", 15, "--fault", "motor:3=0.7@1.2+0.5", "--fault", "loss=0.2@1")
     from_file = mimopilot("fly", "adam0", "--scenario", "a.toml", "--json")
-    from_words = mimopilot("fly", "adam0", *given, "--json")
+    from_options = mimopilot("fly", "adam0", *given, "--json")
     assert from_file.returncode == 0, from_file.stderr
-    assert from_file.stdout == from_words.stdout
+    assert from_file.stdout == from_options.stdout
     assert json.loads(from_file.stdout)["faults"] == ["motor:3=0.7@1.2+0.5", "loss=0.2@1"]
     refused = mimopilot("fly", "adam0", "--scenario", "a.toml", "--axis", "roll")
     assert_one_clear_line(refused, "--axis", "a.toml")
@@ -203,19 +204,19 @@ def test_a_scenario_file_flies_as_the_same_words_on_the_command_line(mimopilot, 
         (("= 0.42", "= 0.42.1"), ("not a TOML file",)),
     ],
 )
-def test_a_wrong_scenario_file_is_told_by_its_name_and_place(tmp_path, change, words):
+def test_an_error_in_a_scenario_file_is_reported_with_its_name_and_entry(tmp_path, change, words):
     path = tmp_path / "wrong.toml"
     path.write_text(FILE.replace(*change))
-    with pytest.raises((SitlError, TuningError)) as caught:
+    with pytest.raises((SitlError, InputFileError)) as caught:
         load_scenario(path, TS)
     for word in (str(path), *words):
         assert word in str(caught.value)
 
 
-# What they do.
+# Effects.
 
 
-def test_a_flight_that_is_cut_into_stretches_is_the_whole_one_in_every_bit(flown):
+def test_a_flight_cut_into_segments_equals_the_whole_one_in_every_bit(flown):
     scenario = doublet("roll", 0.3, 0.42, TS)
     whole = flown(scenario, noise=True, seed=4)
     # A motor that keeps all of its thrust, a delay that is the vehicle's own, gains times one.
@@ -225,9 +226,9 @@ def test_a_flight_that_is_cut_into_stretches_is_the_whole_one_in_every_bit(flown
 
 
 @pytest.mark.parametrize("share", [0.9, 0.7, 0.0])
-def test_a_weak_motor_makes_the_moment_that_its_lost_thrust_made(vehicle, share):
+def test_a_weak_motor_gives_the_moment_of_its_lost_thrust(vehicle, share):
     simulator, injected = injection(vehicle, f"motor:3={share}@0")
-    next(injected.stretches(0, 1))
+    next(injected.segments(0, 1))
     airframe, plant = vehicle.airframe, simulator.plant
     thrust = airframe.mass * GRAVITY / 4
     simulator.state[13 + 2] *= np.sqrt(share)  # its speed has settled
@@ -236,29 +237,29 @@ def test_a_weak_motor_makes_the_moment_that_its_lost_thrust_made(vehicle, share)
         simulator.advance(commands)
     lost = (1 - share) * thrust
     x, y, _ = airframe.rotors[2].position
-    moment = np.array([lost * y, -lost * x, lost * airframe.motors.torque_ratio])  # motor 3 turns clockwise
-    # In 12 ms nothing but this moment counts; damping takes about 1 %.
+    moment = np.array([lost * y, -lost * x, lost * airframe.motors.torque_ratio])  # motor 3 rotates clockwise
+    # Within 12 ms only this moment matters; damping is about 1 %.
     expected = np.linalg.solve(np.array(airframe.inertia), moment) * 3 * TS
     assert simulator.state[10:13] == pytest.approx(expected, rel=0.02, abs=1e-6)
     assert plant.effectiveness.tolist() == [1.0, 1.0, share, 1.0]
 
 
 def settled_thrust(flight, vehicle, share=1.0):
-    """Thrust (N) of each motor at the end of a quiet flight."""
+    """Thrust (N) of each motor at the end of a hover."""
     return flight.record["commands"][-50:, :4].mean(axis=0) * share * vehicle.airframe.motors.thrust_max
 
 
-def test_in_the_end_the_weak_motor_carries_its_quarter_again(flown, vehicle):
+def test_the_weak_motor_finally_carries_a_quarter_of_the_weight_again(flown, vehicle):
     flight = flown(hover("roll", 40.0, TS), "motor:3=0.7@1")
     thrust = settled_thrust(flight, vehicle, np.array([1, 1, 0.7, 1]))
     assert thrust == pytest.approx(np.full(4, vehicle.airframe.mass * GRAVITY / 4), rel=2e-3)
     assert np.degrees(np.abs(flight.truth["attitude"][-50:, :2]).max()) < 0.05
 
 
-def test_a_sagging_battery_asks_for_more_command_in_a_ramp(flown, vehicle):
+def test_a_sagging_battery_reduces_the_thrust_in_a_ramp(flown, vehicle):
     simulator, injected = injection(vehicle, "battery=0.8@0.4+0.2")
     shares = {}
-    for piece, _, _ in injected.stretches(0, 300):
+    for piece, _, _ in injected.segments(0, 300):
         shares[piece.start] = float(simulator.plant.effectiveness[0])
     assert [shares[k] for k in (0, 100, 125, 150)] == pytest.approx([1.0, 1.0, 0.9, 0.8])
     assert list(shares.values()) == sorted(shares.values(), reverse=True)
@@ -266,7 +267,7 @@ def test_a_sagging_battery_asks_for_more_command_in_a_ramp(flown, vehicle):
     assert thrust.sum() == pytest.approx(vehicle.airframe.mass * GRAVITY, rel=1e-4)
 
 
-def test_a_load_in_flight_is_carried_by_the_motors_that_are_near_it(flown, vehicle):
+def test_a_load_in_flight_is_carried_by_the_motors_near_it(flown, vehicle):
     load, place = 0.16, np.array([0.1, -0.12, 0.05])
     mass = vehicle.airframe.mass + load
     thrust = settled_thrust(flown(hover("roll", 40.0, TS), "mass:0.1,-0.12,0.05=0.16@1"), vehicle)
@@ -278,7 +279,7 @@ def test_a_load_in_flight_is_carried_by_the_motors_that_are_near_it(flown, vehic
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1))
-def test_attaching_a_load_jerks_no_point_of_the_vehicle_and_dropping_it_undoes_it(seed):
+def test_attaching_a_load_keeps_position_and_velocity_and_detaching_restores_the_plant(seed):
     vehicle = load_airframe("adam0")
     generator = np.random.default_rng(seed)
     x, y, z = generator.uniform(-0.3, 0.3, 3)
@@ -290,7 +291,7 @@ def test_attaching_a_load_jerks_no_point_of_the_vehicle_and_dropping_it_undoes_i
 
     def rotor():
         w, a, b, c = state[6:10]
-        turn = np.array(
+        rotation = np.array(
             [
                 [1 - 2 * (b * b + c * c), 2 * (a * b - w * c), 2 * (a * c + w * b)],
                 [2 * (a * b + w * c), 1 - 2 * (a * a + c * c), 2 * (b * c - w * a)],
@@ -298,35 +299,35 @@ def test_attaching_a_load_jerks_no_point_of_the_vehicle_and_dropping_it_undoes_i
             ]
         )
         arm = simulator.plant.rotors[1]
-        return np.concatenate([state[0:3] + turn @ arm, state[3:6] + turn @ np.cross(state[10:13], arm)])
+        return np.concatenate([state[0:3] + rotation @ arm, state[3:6] + rotation @ np.cross(state[10:13], arm)])
 
-    before, sound, found = rotor(), simulator.plant, []
-    for _ in injected.stretches(0, 3):
+    before, healthy, found = rotor(), simulator.plant, []
+    for _ in injected.segments(0, 3):
         found.append((rotor(), simulator.plant.mass))
-    assert [mass > sound.mass for _, mass in found] == [False, True, False]
+    assert [mass > healthy.mass for _, mass in found] == [False, True, False]
     for place, _ in found:
         assert place == pytest.approx(before, abs=1e-12)
     for name in ("mass", "inertia", "rotors", "effectiveness"):
-        assert getattr(simulator.plant, name) == pytest.approx(getattr(sound, name), rel=1e-12, abs=1e-15)
+        assert getattr(simulator.plant, name) == pytest.approx(getattr(healthy, name), rel=1e-12, abs=1e-15)
 
 
 def test_a_biased_gyro_tilts_the_vehicle_by_the_bias_over_the_attitude_gain(flown, vehicle):
-    # The integrator makes the measured rate its set-point, which then equals the bias: -Kp_o phi = bias.
+    # The integrator brings the measured rate to its setpoint, which then equals the bias: -Kp_o phi = bias.
     flight = flown(hover("roll", 30.0, TS), "gyro-bias:roll=0.2@1")
     expected = -0.2 / vehicle.default_gains().Kp_o[0, 0]
     assert flight.truth["attitude"][-1, 0] == pytest.approx(expected, rel=1e-3)
     assert abs(flight.truth["attitude"][-1, 1]) < 1e-3
 
 
-def test_one_sample_that_is_not_a_number_moves_the_vehicle_by_less_than_a_tenth_of_a_degree(flown):
+def test_one_nan_sample_moves_the_vehicle_by_less_than_a_tenth_of_a_degree(flown):
     scenario = doublet("roll", np.radians(15), 0.42, TS)
-    sound, flight = flown(scenario, noise=True), flown(scenario, "gyro-nan@1.1+0.004", noise=True)
+    healthy, flight = flown(scenario, noise=True), flown(scenario, "gyro-nan@1.1+0.004", noise=True)
     assert np.isnan(flight.record["rates"]).any(axis=1).nonzero()[0].tolist() == [275]
     assert np.isfinite(flight.record["moment"]).all()
-    assert 0 < np.degrees(np.abs(flight.truth["attitude"] - sound.truth["attitude"]).max()) < 0.1
+    assert 0 < np.degrees(np.abs(flight.truth["attitude"] - healthy.truth["attitude"]).max()) < 0.1
 
 
-def test_a_stuck_gyro_repeats_itself_on_its_axis_alone_and_then_measures_again(flown):
+def test_a_stuck_gyro_repeats_its_rate_on_one_axis_only_and_then_measures_again(flown):
     rates = flown(doublet("roll", 0.2, 0.42, TS), "gyro-stuck:roll@1.1+0.1", noise=True).record["rates"]
     repeats = np.flatnonzero(rates[1:] == rates[:-1])
     same = (rates[1:] == rates[:-1]).nonzero()
@@ -335,13 +336,13 @@ def test_a_stuck_gyro_repeats_itself_on_its_axis_alone_and_then_measures_again(f
     assert set(same[1].tolist()) == {0}
 
 
-def test_gyro_noise_has_the_size_that_is_asked_for_while_it_lasts(flown):
+def test_gyro_noise_has_its_size_while_the_fault_lasts(flown):
     flight = flown(hover("roll", 12.0, TS), "gyro-noise=0.1@4+4", noise=True)
     error = (flight.record["rates"] - flight.truth["rates"]).reshape(3, 1000, 3).std(axis=1)
     assert error == pytest.approx(np.array([[0.01] * 3, [0.1] * 3, [0.01] * 3]), rel=0.08)
 
 
-def test_a_delay_makes_every_command_so_late_and_none_acts_before_its_time(vehicle):
+def test_a_delay_applies_to_every_command(vehicle):
     runs, ages = link(vehicle, "delay=0.02@0.04+0.04", 40)
     assert runs is None
     # Sample 10 is the first that is 5 periods late: until it arrives the command of sample 9 - 1 acts on, and 9 itself.
@@ -381,7 +382,7 @@ def test_jitter_delivers_the_newest_command_that_has_arrived(vehicle):
         assert np.mean(ages >= d) == pytest.approx(share, abs=0.03)
 
 
-def test_lost_measurements_are_as_many_as_asked_for_and_others_for_another_seed(vehicle):
+def test_measurements_are_lost_with_the_given_probability_and_differ_between_seeds(vehicle):
     runs = [link(vehicle, "loss=0.3@0", 10_000, seed)[0] for seed in (1, 1, 2)]
     assert (runs[0] == runs[1]).all()
     assert (runs[0] != runs[2]).any()
@@ -393,7 +394,7 @@ def test_lost_measurements_are_as_many_as_asked_for_and_others_for_another_seed(
 
 
 @pytest.mark.parametrize(("text", "missing"), [("skip=5@0.4", 5), ("clock=0.1@0.4", 25), ("link@0.4+0.2", 50)])
-def test_an_autopilot_without_ticks_holds_what_it_commanded(flown, text, missing):
+def test_an_autopilot_without_ticks_holds_its_outputs(flown, text, missing):
     flight = flown(hover("roll", 1.0, TS), text, noise=True)
     assert np.flatnonzero(flight.runs == 0).tolist() == list(range(100, 100 + missing))
     for name in ("moment", "commands", "rates"):
@@ -404,7 +405,7 @@ def test_an_autopilot_without_ticks_holds_what_it_commanded(flown, text, missing
 
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 1000), st.lists(st.integers(1, 60), min_size=1, max_size=8))
-def test_one_period_at_a_time_is_the_same_link_as_long_stretches(seed, blocks):
+def test_one_period_at_a_time_gives_the_same_link_as_long_segments(seed, blocks):
     vehicle = load_airframe("adam0")
     texts = ("loss=0.3@0.01+0.5", "duplicate=0.2@0.1", "jitter=0.02@0.05+0.3", "delay=0.03@0.2+0.1", "loss=0.1@0")
 
@@ -412,7 +413,7 @@ def test_one_period_at_a_time_is_the_same_link_as_long_stretches(seed, blocks):
         _, injected = injection(vehicle, *texts, seed=seed)
         start, runs, ages = 0, [], []
         for size in sizes:
-            for _, ran, late in injected.stretches(start, start + size):
+            for _, ran, late in injected.segments(start, start + size):
                 runs, ages = [*runs, *ran], [*ages, *late]
             start += size
         return runs, ages
@@ -420,15 +421,15 @@ def test_one_period_at_a_time_is_the_same_link_as_long_stretches(seed, blocks):
     assert flown_in(blocks) == flown_in([1] * sum(blocks))
 
 
-def test_corrupted_gains_are_written_into_the_running_controller_and_the_old_ones_come_back(vehicle, library):
+def test_corrupted_gains_are_written_into_the_controller_and_then_restored(vehicle, library):
     gains = vehicle.default_gains()
     controller = NativeController(library, gains)
     autopilot = Autopilot(vehicle.airframe, gains, controller)
     before = controller.state["gains"][0].copy()
     simulator = Simulator(vehicle.airframe, TS, 0)
     faults = tuple(map(parse_fault, ("gain:Kp_i=0.5@0.004+0.008", "gain=2@0.008+0.008")))
-    injected = Injection(faults, vehicle.airframe, simulator, TS, 0, autopilot)
-    held = np.array([controller.state["gains"][0].copy() for _ in injected.stretches(0, 5)])
+    injected = FaultInjection(faults, vehicle.airframe, simulator, TS, 0, autopilot=autopilot)
+    held = np.array([controller.state["gains"][0].copy() for _ in injected.segments(0, 5)])
     factors = np.ones((5, len(before)), np.float32)
     Kp_i = slice(4, 8)
     factors[1, Kp_i] = 0.5
@@ -437,7 +438,7 @@ def test_corrupted_gains_are_written_into_the_running_controller_and_the_old_one
     assert (held == factors * before).all()
 
 
-def test_a_stale_set_point_is_flown_for_half_a_second_then_level_with_its_heading(flown):
+def test_a_stale_setpoint_is_flown_for_half_a_second_and_then_level_with_its_heading(flown):
     scenario = hover("roll", 2.0, TS)
     scenario.setpoint[:] = [0.1, -0.05, 0.2]
     scenario.setpoint[60:, 0] = 0.2

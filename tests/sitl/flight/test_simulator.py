@@ -1,13 +1,13 @@
-"""Flights in process: loop, recorder and reader, figures of performance."""
+"""In-process flights: the loop, the log and its reader, performance figures."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mimopilot.codegen.cortex_m4 import load_emulated
-from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.flight.flight_log import quaternions, record_flight, save_flight
+from mimopilot.sitl.flight.flight_log import flight_log_bytes, quaternions, save_flight
 from mimopilot.sitl.flight.metrics import performance
 from mimopilot.sitl.flight.scenario import doublet, excitation_flight, hover, make_scenario, step
 from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, fly
@@ -36,14 +36,13 @@ def short_experiment(vehicle, seed=3, seconds=4.0):
     return fly(vehicle.airframe, fresh(vehicle), scenario, seed)
 
 
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(vehicle):
-    logs = [
-        record_flight(short_experiment(vehicle, seed), vehicle.airframe, vehicle.default_gains()) for seed in (3, 3, 4)
-    ]
+def test_the_same_seed_gives_the_same_log_and_another_does_not(vehicle):
+    gains = vehicle.default_gains()
+    logs = [flight_log_bytes(short_experiment(vehicle, seed), vehicle.airframe, gains) for seed in (3, 3, 4)]
     assert logs[0] == logs[1] != logs[2]
 
 
-def test_the_flown_moments_are_those_of_the_python_reference(vehicle):
+def test_the_torques_in_flight_are_those_of_the_python_reference(vehicle):
     flight = short_experiment(vehicle)
     controller = Controller(vehicle.default_gains())
     saturation = np.zeros(3)
@@ -53,7 +52,7 @@ def test_the_flown_moments_are_those_of_the_python_reference(vehicle):
         saturation = row["unallocated"]
 
 
-def test_a_minute_on_the_emulated_processor_is_the_flight_of_the_native_library_in_every_bit(vehicle):
+def test_a_minute_on_the_emulated_processor_equals_the_flight_of_the_native_library_in_every_bit(vehicle):
     scenario = excitation_flight(30.0, 0.15, 50.0, TS, np.random.default_rng(2))
     gains = vehicle.default_gains()
     native = fly(vehicle.airframe, fresh(vehicle), scenario, 5)
@@ -65,7 +64,7 @@ def test_a_minute_on_the_emulated_processor_is_the_flight_of_the_native_library_
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_processor_that_stops_loses_the_vehicle_and_flies_no_stale_moment(vehicle):
+def test_a_processor_that_stops_gives_no_stale_torque_and_the_vehicle_is_lost(vehicle):
     gains = vehicle.default_gains()
     processor = load_emulated(gains)
     processor.image.functions["step"] = 0x3000_0000  # no memory there
@@ -74,7 +73,7 @@ def test_a_processor_that_stops_loses_the_vehicle_and_flies_no_stale_moment(vehi
     assert flight.crashed_at == 0.0
 
 
-def test_noise_has_the_stated_size_and_no_noise_means_none(vehicle):
+def test_the_noise_has_the_standard_deviation_of_the_airframe_and_can_be_switched_off(vehicle):
     scenario = hover("roll", 8.0, TS)
     noisy = fly(vehicle.airframe, fresh(vehicle), scenario, 1)
     for measured, true, sigma in (("attitude", "attitude", 0.003), ("rates", "rates", 0.01)):
@@ -91,22 +90,22 @@ def test_the_block_size_does_not_change_the_noise(vehicle):
 
 
 def test_a_command_acts_one_period_after_its_measurement(vehicle):
-    # A moment injected at sample k: motors may move in [k+1, k+2), the rate is seen to change at k+2.
+    # A torque injected at sample k: motors may move in [k+1, k+2), the rate is seen to change at k+2.
     scenario = hover("roll", 0.4, TS)
     scenario.excitation[50:, 0] = 0.5
     flight = fly(vehicle.airframe, fresh(vehicle), scenario, noise=False)
-    # The command is single precision, so hovering is not exactly still.
+    # The command is single precision, so hover is not exactly at rest.
     moved = np.flatnonzero(np.abs(flight.truth["rates"][:, 0]) > 1e-3)
     assert flight.record["moment"][50, 0] > 0.4
     assert moved[0] == 52
 
 
-def test_altitude_is_held_through_the_experiment(vehicle):
+def test_the_altitude_is_held_during_the_experiment(vehicle):
     flight = short_experiment(vehicle)
     assert np.abs(flight.truth["position"][:, 2] + 10.0).max() < 0.5
 
 
-def test_a_recorded_flight_reads_back_as_it_was_flown(vehicle, tmp_path):
+def test_the_log_of_a_flight_reads_back_with_the_same_signals(vehicle, tmp_path):
     flight = short_experiment(vehicle)
     save_flight(tmp_path / "a.ulg", flight, vehicle.airframe, vehicle.default_gains())
     read = read_log(tmp_path / "a.ulg")
@@ -122,7 +121,7 @@ def test_a_recorded_flight_reads_back_as_it_was_flown(vehicle, tmp_path):
     assert read.flown.moment_scale == pytest.approx(vehicle.default_gains().moment_scale, rel=1e-6)
 
 
-def test_the_log_is_a_px4_log_to_pyulog(vehicle, tmp_path):
+def test_pyulog_reads_the_log_as_a_px4_log(vehicle, tmp_path):
     flight = short_experiment(vehicle)
     save_flight(tmp_path / "a.ulg", flight, vehicle.airframe, vehicle.default_gains())
     log = ULog(str(tmp_path / "a.ulg"))
@@ -140,7 +139,7 @@ def test_the_log_is_a_px4_log_to_pyulog(vehicle, tmp_path):
 
 @given(st.tuples(st.floats(-3, 3), st.floats(-1.5, 1.5), st.floats(-3, 3)))
 @settings(deadline=None)
-def test_quaternions_and_angles_are_inverse_to_each_other(angles):
+def test_quaternions_and_euler_angles_are_inverse_to_each_other(angles):
     q = quaternions(np.array([angles]))[0].astype(float)
     assert euler_angles(*q) == pytest.approx(angles, abs=2e-6)
 
@@ -152,10 +151,8 @@ def test_an_exact_measurement_is_the_state_in_single_precision(vehicle):
 
 
 def synthetic_flight(response, rate):
-    """A flight whose signals are given: for checking the figures by hand."""
+    """A flight with given signals, to check the figures by hand."""
     scenario = doublet("roll", 0.2, 0.4, TS, tail=0.2)
-    from mimopilot.sitl.autopilot.autopilot import RECORD
-
     record, truth = np.zeros(len(scenario.setpoint), RECORD), np.zeros(len(scenario.setpoint), TRUTH)
     record["setpoint"] = scenario.setpoint
     record["attitude"][:, 0] = response(scenario.setpoint[:, 0])
@@ -166,7 +163,7 @@ def synthetic_flight(response, rate):
     return Flight(scenario, record, truth)
 
 
-def test_the_figures_of_a_perfect_response_are_zero_and_the_others_those_of_their_definitions():
+def test_the_performance_figures_follow_their_definitions():
     inner, outer = second_order(20, 0.4, 0, TS), second_order(10, 0.7, 0, TS)
     flight = synthetic_flight(outer.response, 0.5)
     figures = performance(flight, inner, outer)
@@ -184,7 +181,7 @@ def test_the_figures_of_a_perfect_response_are_zero_and_the_others_those_of_thei
     assert figures.effort_rms == pytest.approx(0.5)
 
 
-def test_a_lost_vehicle_is_reported_when_the_crash_rule_is_met(vehicle):
+def test_a_vehicle_is_lost_after_the_time_beyond_the_largest_tilt(vehicle):
     unstable = vehicle.default_gains().with_elements({"RP_RP": 1.0, "RP_PR": 1.0})
     flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, unstable), hover("roll", 6.0, TS), 1)
     assert flight.crashed_at is not None
@@ -201,7 +198,7 @@ def test_touching_the_ground_is_a_loss(vehicle):
     assert flight.crashed_at == pytest.approx(first * TS)
 
 
-def test_a_steady_flight_is_not_reported_as_lost(vehicle):
+def test_a_steady_flight_is_not_a_loss(vehicle):
     assert fly(vehicle.airframe, fresh(vehicle), hover("roll", 2.0, TS), 1).crashed_at is None
 
 

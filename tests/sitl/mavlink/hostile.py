@@ -15,7 +15,7 @@ from collections import Counter
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.excitation_injector import Injector
-from mimopilot.sitl.autopilot.flight_modes import Mode, Vehicle
+from mimopilot.sitl.autopilot.flight_modes import Commander, Mode
 from mimopilot.sitl.mavlink.vehicle.excitation import Excitation
 from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
@@ -46,7 +46,7 @@ class InTheAir:
         body = load_airframe("adam0")
         gains = body.default_gains()
         self.autopilot = Autopilot(body.airframe, gains, NativeController(load_native(gains), gains))
-        self.vehicle = Vehicle(self.autopilot.hover)
+        self.vehicle = Commander(self.autopilot.hover)
         self.vehicle.armed, self.vehicle.mode, self.vehicle.now = True, Mode.HOLD, 100.0
         situation = Situation(self.vehicle)
         self.injector = Injector(gains.Ts)
@@ -79,7 +79,7 @@ class InTheAir:
         return (
             dict(self.server.values),
             self.autopilot.controller.state.tobytes(),
-            (self.vehicle.armed, self.vehicle.mode, self.vehicle.lift.landed, self.rebooted),
+            (self.vehicle.armed, self.vehicle.mode, self.vehicle.vertical.landed, self.rebooted),
             self.injector.phase,
         )
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
-from mimopilot.sitl.autopilot.setpoints import Attitude
+from mimopilot.sitl.autopilot.setpoints import AttitudeSetpoint
 from mimopilot.sitl.faults.inject_autopilot import AutopilotFaults
 from mimopilot.sitl.faults.kinds import parse_fault
 from mimopilot.sitl.flight.scenario import doublet, hover
@@ -118,7 +118,7 @@ def test_the_host_corrupts_its_gains_and_hears_no_set_points_in_the_time_of_the_
         factor = 0.5 if 50 <= k < 150 else 1.0
         assert (controller.state["gains"][0, Kp_i] == np.float32(factor) * sound[Kp_i]).all(), k
         fresh.append(host.vehicle.attitude.fresh(host.vehicle.now))
-        host.vehicle.attitude.put(Attitude(0.1, 0.0, 0.0, None), host.vehicle.now)  # a ground station steers
+        host.vehicle.attitude.put(AttitudeSetpoint(0.1, 0.0, 0.0, None), host.vehicle.now)  # a ground station steers
     # The one of sample 99 counts for half a second; the first that is heard again comes after sample 300.
     assert np.flatnonzero(~np.array(fresh)).tolist() == [0, *range(225, 301)]
     assert (controller.state["gains"][0] == sound).all()

@@ -2,7 +2,7 @@
 
 import pytest
 from mimopilot.codegen.layout import to_array
-from mimopilot.sitl.autopilot.flight_modes import Vehicle
+from mimopilot.sitl.autopilot.flight_modes import Commander
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
 from mimopilot.sitl.physics.airframe import load_airframe
@@ -18,7 +18,7 @@ def model():
 
 def flies(log, model, seconds):
     """One flight, whose rows say how long they have flown."""
-    vehicle = Vehicle(0.5)
+    vehicle = Commander(0.5)
     log.begin(to_array(model.default_gains()))
     for k in range(round(seconds / TS)):
         log.row(vehicle)["rates"] = k * TS

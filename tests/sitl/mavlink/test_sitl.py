@@ -57,7 +57,7 @@ def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logg
         assert pilot.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 3) == TEMPORARILY_REJECTED
         pilot.hears("no take-off: not armed")
         assert pilot.command(SET_MODE, 1, 6) == TEMPORARILY_REJECTED
-        pilot.hears("no set-points arrive")
+        pilot.hears("no setpoints arrive")
         assert pilot.command(ARM, 1) == ACCEPTED
         assert pilot.command(TAKEOFF, 0, 0, 0, 0, 0, 0, 3) == ACCEPTED
         pilot.flies(Mode.TAKEOFF)
@@ -72,8 +72,8 @@ def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logg
             pilot.wait(lambda roll=roll: steered(pilot) and abs(pilot.asks("ATTITUDE").roll - roll) < 0.05)
         sender.stop()
         # Nobody steers any more: level, then down.
-        pilot.hears("no set-points for 0.5 s: level")
-        pilot.hears("no set-points for 2.5 s: landing")
+        pilot.hears("no setpoints for 0.5 s: level")
+        pilot.hears("no setpoints for 2.5 s: landing")
         pilot.hears("disarmed: landed")
         pilot.wait(lambda: not pilot.armed())
         pilot.hears("logged: flight.ulg")

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mimopilot.sitl.autopilot.autopilot import RECORD
-from mimopilot.sitl.autopilot.flight_modes import Mode, Refused, Severity, Vehicle
+from mimopilot.sitl.autopilot.flight_modes import Commander, Mode, Refused, Severity
 from mimopilot.sitl.autopilot.setpoints import Pose
 from mimopilot.sitl.autopilot.vertical import Estimate
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState
@@ -34,7 +34,7 @@ class Bench:
     """A standing vehicle with everything around it but sockets."""
 
     def __init__(self):
-        self.vehicle = Vehicle(0.5)
+        self.vehicle = Commander(0.5)
         self.situation = Situation(self.vehicle)
         self.telemetry = Telemetry(self.situation)
         self.rebooted = False
@@ -100,7 +100,7 @@ def test_arming_and_disarming_are_commands(bench):
 
 
 def test_a_refusal_is_temporary_and_says_its_reason(bench):
-    bench.vehicle.obstacles["plant"] = "no plant is connected"
+    bench.vehicle.arming_blockers["plant"] = "no plant is connected"
     bench.vehicle.said.clear()
     assert bench.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1) == TEMPORARILY_REJECTED
     assert bench.vehicle.said == [(Severity.WARNING, "not armed: no plant is connected")]
@@ -108,7 +108,7 @@ def test_a_refusal_is_temporary_and_says_its_reason(bench):
 
 def test_disarming_in_the_air_needs_the_number_that_forces_it(bench):
     bench.vehicle.arm()
-    bench.vehicle.lift.landed = False
+    bench.vehicle.vertical.landed = False
     assert bench.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1) == TEMPORARILY_REJECTED
     assert bench.vehicle.armed
     assert bench.result(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 0, 21196) == ACCEPTED
@@ -129,7 +129,7 @@ def test_take_off_climbs_to_the_height_above_the_ground(bench, message, height):
     (ack,) = bench.commands.answer(received(message))
     assert ack.result == ACCEPTED
     assert bench.vehicle.mode is Mode.TAKEOFF
-    assert bench.vehicle._height == pytest.approx(100 + height)
+    assert bench.vehicle._takeoff_altitude == pytest.approx(100 + height)
 
 
 def test_a_take_off_that_is_too_high_is_denied_and_one_unarmed_only_now(bench):
@@ -305,7 +305,7 @@ def test_telemetry_tells_the_truth(bench):
 def test_no_fence_is_ever_breached(bench):
     """MAVProxy says "fence breach" when the bit goes from the healthy."""
     for obstacles in ({}, {"plant": "no plant is connected"}, {"rate": "the plant's period is wrong"}):
-        bench.vehicle.obstacles = obstacles
+        bench.vehicle.arming_blockers = obstacles
         status = bench.telemetry.build(mavlink.MAVLINK_MSG_ID_SYS_STATUS)
         for field in ("present", "enabled", "health"):
             assert getattr(status, f"onboard_control_sensors_{field}") & mavlink.MAV_SYS_STATUS_GEOFENCE
@@ -317,11 +317,11 @@ def test_readiness_to_arm_is_shown(bench):
         return message.onboard_control_sensors_health & mavlink.MAV_SYS_STATUS_PREARM_CHECK
 
     assert status()
-    bench.vehicle.obstacles["plant"] = "no plant is connected"
+    bench.vehicle.arming_blockers["plant"] = "no plant is connected"
     assert not status()
     beat = bench.telemetry.build(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
     assert beat.system_status == mavlink.MAV_STATE_BOOT
-    del bench.vehicle.obstacles["plant"]
+    del bench.vehicle.arming_blockers["plant"]
     assert bench.telemetry.build(0).system_status == mavlink.MAV_STATE_STANDBY
     bench.vehicle.arm()
     assert bench.telemetry.build(0).system_status == mavlink.MAV_STATE_ACTIVE

@@ -1,3 +1,5 @@
+"""Airframe files, the unit of the torque, and the gyro filter."""
+
 import dataclasses
 
 import numpy as np
@@ -12,13 +14,15 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.provenance import Provenance
 
+from mimopilot.common.errors import InputFileError
 from tests.conftest import assert_one_clear_line
 
 TS = 0.004
 
 KNOWN = ["adam0", "adam0_boom", "adam0_flexible", "adam0_nominal", "adam0_perturbed", "antr", "px4_sih"]
 
-def test_the_airframes_come_with_their_gains():
+
+def test_each_airframe_has_default_gains_in_its_unit_of_torque():
     assert known_airframes() == KNOWN
     for name in known_airframes():
         vehicle = load_airframe(name)
@@ -27,9 +31,7 @@ def test_the_airframes_come_with_their_gains():
 
 
 def test_an_unknown_airframe_lists_the_known_ones():
-    with pytest.raises(
-        SitlError, match=f"unknown airframe 'adam1'.*{', '.join(KNOWN)}"
-    ):
+    with pytest.raises(SitlError, match=f"unknown airframe 'adam1'.*{', '.join(KNOWN)}"):
         load_airframe("adam1")
 
 
@@ -50,13 +52,11 @@ def test_a_wrong_entry_of_an_airframe_file_is_named(tmp_path, old, new, message)
     text = (FOLDER / "adam0.toml").read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises((SitlError, TuningError), match=rf"mine.toml: .*{message}"):
+    with pytest.raises((SitlError, InputFileError), match=rf"mine.toml: .*{message}"):
         load_airframe(str(path))
 
 
-def test_gains_for_another_unit_of_moment_are_refused(gains):
-    import dataclasses
-
+def test_gains_for_another_unit_of_torque_are_refused(gains):
     airframe = load_airframe("adam0").airframe
     with pytest.raises(SitlError, match=r"3\.6, 3\.6, 0\.2736 N m per unit, adam0 has 2\.546"):
         other = dataclasses.replace(gains, moment_scale=(3.6, 3.6, 0.2736))
@@ -71,8 +71,9 @@ def test_the_gyro_filter_is_a_butterworth_low_pass_on_the_measured_rates():
     vehicle = load_airframe("px4_sih")
     plain = vehicle.airframe.model_copy(update={"gyro_cutoff_hz": 0.0})
     gains = vehicle.default_gains()
-    task = doublet("roll", 0.2, 0.8, TS)
-    flights = {body.gyro_cutoff_hz: fly(body, Autopilot(body, gains), task, 3) for body in (vehicle.airframe, plain)}
+    scenario = doublet("roll", 0.2, 0.8, TS)
+    bodies = (vehicle.airframe, plain)
+    flights = {body.gyro_cutoff_hz: fly(body, Autopilot(body, gains), scenario, 3) for body in bodies}
     filtered, raw = flights[40.0], flights[0.0]
     b, a = butter(2, 40.0, fs=250)
     assert raw.record["rates"] == pytest.approx(raw.truth["rates"], abs=0.1)
@@ -82,14 +83,14 @@ def test_the_gyro_filter_is_a_butterworth_low_pass_on_the_measured_rates():
     assert filtered.record["rates"] == pytest.approx(expected, abs=2e-6)
 
 
-def test_a_gyro_filter_beyond_half_of_the_rate_is_refused():
+def test_a_gyro_cutoff_at_half_of_the_sampling_rate_is_refused():
     vehicle = load_airframe("adam0")
     body = vehicle.airframe.model_copy(update={"gyro_cutoff_hz": 125.0})
     with pytest.raises(SitlError, match=r"gyro_cutoff_hz: got 125 Hz, expected 0 .* below 125 Hz"):
         fly(body, Autopilot(body, vehicle.default_gains()), doublet("roll", 0.2, 0.8, TS))
 
 
-def test_converted_gains_make_the_same_moment_in_newton_metres_and_keep_their_certificate():
+def test_converted_gains_give_the_same_torque_in_newton_metres_and_keep_their_certificate():
     scale = load_airframe("px4_sih").airframe.moment_scale()
     assert scale == pytest.approx((2.88, 2.88, 0.2))
     original = load_airframe("adam0").default_gains()
@@ -105,7 +106,7 @@ def test_converted_gains_make_the_same_moment_in_newton_metres_and_keep_their_ce
     assert converted.verdict() == ("certified", "")
     edited = dataclasses.replace(certified, Kp_o=1.1 * certified.Kp_o)
     assert edited.with_moment_scale(scale).verdict()[0] == "void"
-    assert certified.with_moment_scale((2.08, 2.5, 0.4)).verdict()[0] == "none"  # its figures would be others
+    assert certified.with_moment_scale((2.08, 2.5, 0.4)).verdict()[0] == "none"  # its figures would differ
     known = dataclasses.replace(original, provenance=Provenance(standard_deviation={"Kp_i": [[1.0, 2.0], [3.0, 4.0]]}))
     deviation = known.with_moment_scale(scale).provenance.standard_deviation["Kp_i"]
     assert deviation == pytest.approx(np.array([[1.0, 2.0], [3.0, 4.0]]) * original.moment_scale[0] / scale[0])
@@ -115,7 +116,7 @@ def test_converted_gains_make_the_same_moment_in_newton_metres_and_keep_their_ce
         dataclasses.replace(original, moment_scale=None).with_moment_scale(scale)
 
 
-def test_convert_writes_gains_that_the_airframe_takes(mimopilot, tmp_path):
+def test_convert_writes_gains_that_the_airframe_accepts(mimopilot, tmp_path):
     mine = tmp_path / "mine.gains.toml"
     load_airframe("adam0").default_gains().save(mine)
     assert_one_clear_line(mimopilot("fly", "px4_sih", "--gains", mine), "mimopilot convert", "moment_scale")

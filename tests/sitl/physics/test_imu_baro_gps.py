@@ -1,8 +1,7 @@
-"""The instruments show what the body does, with the noise of real ones, the same for the same seed."""
+"""The raw sensors: true motion, noise densities, and the same readings for the same seed."""
 
 import numpy as np
 import pytest
-from mimopilot.sitl.autopilot.autopilot import MAX_ROTORS
 from mimopilot.sitl.flight.simulator import Simulator
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.ground_contact import ground_state
@@ -13,9 +12,9 @@ from mimopilot.sitl.physics.imu_baro_gps import (
     GYRO_DENSITY,
     MAGNETOMETER_NOISE,
     METRES_PER_DEGREE,
-    Instruments,
+    ImuBaroGps,
 )
-from mimopilot.sitl.physics.rigid_body import GRAVITY, hover_state
+from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS, hover_state
 
 TS = 0.004
 AIRFRAME = load_airframe("adam0").airframe
@@ -23,18 +22,18 @@ PLANT = AIRFRAME.plant()
 
 
 def exact(state):
-    """Instruments without noise and bias."""
-    instruments = Instruments(state, TS, 0)
-    instruments.biases[:], instruments.deviations[:] = 0.0, 0.0
-    return instruments
+    """Sensors without noise and bias."""
+    sensors = ImuBaroGps(state, TS, 0)
+    sensors.biases[:], sensors.deviations[:] = 0.0, 0.0
+    return sensors
 
 
-def turned(state, yaw):
+def with_yaw(state, yaw):
     state[6:10] = np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)
     return state
 
 
-def test_on_the_ground_the_accelerometer_shows_the_ground_pushing_up():
+def test_on_the_ground_the_accelerometer_measures_minus_gravity():
     state = ground_state(PLANT)
     readings = exact(state).read(state)
     assert readings[:6] == [0, 0, -GRAVITY, 0, 0, 0]
@@ -42,8 +41,8 @@ def test_on_the_ground_the_accelerometer_shows_the_ground_pushing_up():
 
 
 @pytest.mark.parametrize("yaw_deg", [0, 90, -135])
-def test_the_magnetometer_shows_declination_and_inclination(yaw_deg):
-    state = turned(ground_state(PLANT), np.radians(yaw_deg))
+def test_the_magnetometer_measures_declination_and_inclination(yaw_deg):
+    state = with_yaw(ground_state(PLANT), np.radians(yaw_deg))
     x, y, z = exact(state).read(state)[6:9]
     heading = np.degrees(-np.arctan2(y, x)) + 3.4
     assert (heading - yaw_deg + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-9)
@@ -61,9 +60,9 @@ def test_the_barometer_follows_the_standard_atmosphere():
     assert readings[0][2] - readings[1][2] == pytest.approx(0.65)
 
 
-def test_dead_reckoning_from_gyro_and_accelerometer_follows_a_violent_flight():
+def test_integrated_accelerations_give_the_velocity_of_an_aggressive_flight():
     simulator = Simulator(AIRFRAME, TS, 0)
-    instruments = exact(simulator.state)
+    sensors = exact(simulator.state)
     velocity, previous = simulator.state[3:6].copy(), simulator.state.copy()
     random = np.random.default_rng(1)
     for k in range(500):
@@ -71,7 +70,7 @@ def test_dead_reckoning_from_gyro_and_accelerometer_follows_a_violent_flight():
             commands = np.zeros(MAX_ROTORS, np.float32)
             commands[:4] = random.uniform(0.3, 0.7, 4)
         simulator.advance(commands)
-        readings = instruments.read(simulator.state)
+        readings = sensors.read(simulator.state)
         q = simulator.state[6:10] + previous[6:10]
         w, x, y, z = q / np.linalg.norm(q)
         R = np.array(
@@ -88,7 +87,7 @@ def test_dead_reckoning_from_gyro_and_accelerometer_follows_a_violent_flight():
     assert np.abs(velocity - simulator.state[3:6]).max() < 1e-9
 
 
-def test_the_noise_has_the_densities_of_the_parts():
+def test_the_noise_has_the_stated_densities():
     state, samples = ground_state(PLANT), 20_000
     readings = np.array([r for r in readings_of(state, 3, samples)])
     root = np.sqrt(0.5 / TS)
@@ -96,11 +95,11 @@ def test_the_noise_has_the_densities_of_the_parts():
     # Five standard deviations of an estimated deviation.
     assert readings[:, :9].std(axis=0) == pytest.approx(expected, rel=5 / np.sqrt(2 * samples))
     assert np.abs(np.corrcoef(readings[:, :10].T) - np.eye(10)).max() < 5 / np.sqrt(samples)
-    # A receiver's noise comes on top of a place a metre to the north, at 2 m/s to the east.
+    # GPS noise around a position a metre to the north, at 2 m/s to the east.
     state[0], state[4] = 1.0, 2.0
-    instruments = Instruments(state, TS, 3)
-    fixes = [instruments.fix(state) for _ in range(2000)]
-    north = (np.array([f.place.latitude for f in fixes]) - 473977420) * 1e-7 * METRES_PER_DEGREE
+    sensors = ImuBaroGps(state, TS, 3)
+    fixes = [sensors.fix(state) for _ in range(2000)]
+    north = (np.array([f.position.latitude for f in fixes]) - 473977420) * 1e-7 * METRES_PER_DEGREE
     assert north.mean() == pytest.approx(1.0, abs=5 * GPS_HORIZONTAL / np.sqrt(2000))
     assert north.std() == pytest.approx(GPS_HORIZONTAL, rel=0.08)
     assert np.mean([f.east for f in fixes]) == pytest.approx(200, abs=500 * GPS_SPEED / np.sqrt(2000))
@@ -108,19 +107,19 @@ def test_the_noise_has_the_densities_of_the_parts():
 
 
 def readings_of(state, seed, samples):
-    instruments = Instruments(state, TS, seed)
-    return [instruments.read(state) for _ in range(samples)]
+    sensors = ImuBaroGps(state, TS, seed)
+    return [sensors.read(state) for _ in range(samples)]
 
 
-def test_equal_seeds_read_the_same_and_others_do_not():
+def test_equal_seeds_give_equal_readings_and_others_do_not():
     state = hover_state(PLANT)
     assert readings_of(state, 5, 50) == readings_of(state, 5, 50)
     assert readings_of(state, 5, 2) != readings_of(state, 6, 2)
-    assert Instruments(state, TS, 5).fix(state) == Instruments(state, TS, 5).fix(state)
+    assert ImuBaroGps(state, TS, 5).fix(state) == ImuBaroGps(state, TS, 5).fix(state)
 
 
 def test_an_impact_saturates_the_accelerometer():
     state = hover_state(PLANT)
-    instruments = exact(state)
+    sensors = exact(state)
     state[5] = -5.0  # m/s within one sample
-    assert instruments.read(state)[2] == pytest.approx(-15.9 * GRAVITY)
+    assert sensors.read(state)[2] == pytest.approx(-15.9 * GRAVITY)

@@ -1,3 +1,5 @@
+"""Control allocation within and at the limits of the motors."""
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -34,7 +36,7 @@ def vehicles():
     ]
 
 
-def test_one_unit_of_moment_is_2_b_t_max():
+def test_one_unit_of_torque_is_2_b_t_max():
     airframe = load_airframe("adam0").airframe
     roll, pitch, yaw = airframe.moment_scale()
     assert roll == pitch == pytest.approx(2 * 0.1768 * 7.2)
@@ -45,7 +47,7 @@ def test_one_unit_of_moment_is_2_b_t_max():
 
 @given(roll=UNIT, pitch=UNIT, yaw=UNIT, collective=st.floats(0, 1), vehicle=st.integers(0, 3))
 @settings(max_examples=300, deadline=None)
-def test_commands_stay_in_range_and_what_fits_is_given_exactly(roll, pitch, yaw, collective, vehicle):
+def test_commands_stay_in_range_and_feasible_torques_are_given_exactly(roll, pitch, yaw, collective, vehicle):
     allocation = vehicles()[vehicle]
     moments = np.array([roll, pitch, yaw])
     commands, unallocated = run(allocation, moments, collective)
@@ -60,10 +62,10 @@ def test_commands_stay_in_range_and_what_fits_is_given_exactly(roll, pitch, yaw,
             assert got[axis] == pytest.approx(moments[axis], abs=1e-8)
         else:
             assert unallocated[axis] == np.sign(moments[axis])
-            # Less of it, never the other way round.
+            # Reduced, never reversed.
             low, high = sorted((0.0, moments[axis]))
             assert low - 1e-8 <= got[axis] <= high + 1e-8
-    # Yaw gives way before roll and pitch, which are scaled together.
+    # Yaw is reduced before roll and pitch, which are scaled together.
     if unallocated[:2].any():
         assert abs(got[2]) < 1e-7
         if min(abs(roll), abs(pitch)) > 1e-6:
@@ -78,14 +80,14 @@ def test_at_the_upper_limit_the_collective_is_lowered():
     assert (unallocated == 0).all()
 
 
-def test_airmode_raises_the_collective_and_without_it_the_moment_is_cut():
+def test_airmode_raises_the_collective_and_without_it_the_torque_is_reduced():
     airframe = load_airframe("antr").airframe
     hover = 0.745 * 9.80665 / 4 / 13
     with_airmode = airframe.allocation()
     without = airframe.model_copy(update={"airmode": False}).allocation()
     assert given_moments(with_airmode, run(with_airmode, [0.8, 0, 0], hover)[0])[0] == pytest.approx(0.8)
     commands, unallocated = run(without, [0.8, 0, 0], hover)
-    # Half of the collective on each side: hovering at 14 % of the thrust leaves 28 % of the moment.
+    # Half of the collective on each side: hovering at 14 % of the thrust leaves 28 % of the torque.
     assert given_moments(without, commands)[0] == pytest.approx(2 * hover, rel=1e-6)
     assert unallocated[0] == 1
 

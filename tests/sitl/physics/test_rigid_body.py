@@ -42,7 +42,7 @@ def test_a_torque_free_asymmetric_top_follows_the_elliptic_functions():
             np.sqrt((M2 - E2 * J[0]) / (J[2] * (J[2] - J[0]))) * dn,
         ]
     )
-    # The sense of the rotation about axis 2 is that of Euler's equations.
+    # The sign of the rotation about axis 2 is that of Euler's equations.
     assert rates == pytest.approx(exact, abs=1e-9)
 
 
@@ -128,7 +128,7 @@ def test_160_g_at_motor_3_moves_the_centre_and_adds_to_three_entries_of_the_tens
     assert (total - inertia)[2, 2] == pytest.approx(2 * reduced * 0.1414**2, rel=1e-12)
 
 
-def test_an_added_mass_is_the_same_body_seen_from_its_new_centre():
+def test_added_masses_combine_linearly_and_in_any_order():
     rng = np.random.default_rng(4)
     parts = [
         PointMass(mass=float(m), position=tuple(map(float, r)))
@@ -151,7 +151,7 @@ def fly_open_loop(plant: PlantParameters, commands, seconds, step=1e-3):
     return state
 
 
-def test_hover_commands_hold_the_vehicle_still():
+def test_hover_commands_keep_the_vehicle_at_rest():
     plant = load_airframe("adam0").airframe.plant()
     share = plant.mass * GRAVITY / 4 / plant.thrust_max
     state = fly_open_loop(plant, [share] * 4, 2.0)
@@ -160,7 +160,7 @@ def test_hover_commands_hold_the_vehicle_still():
     assert state[10:13] == pytest.approx(0, abs=1e-9)
 
 
-def test_without_thrust_the_vehicle_falls_against_its_drag():
+def test_without_thrust_the_vehicle_falls_to_its_terminal_velocity():
     plant = load_airframe("adam0").airframe.plant()._replace(motor_time_constant=1e-2)
     state = fly_open_loop(plant, [0] * 4, 3.0)
     tau = plant.mass / plant.drag
@@ -181,7 +181,7 @@ def test_the_motors_lag_is_first_order_in_rotor_speed():
     ("motors", "axis", "sign"),
     [((1, 2), 0, 1), ((0, 3), 0, -1), ((0, 2), 1, 1), ((1, 3), 1, -1), ((0, 1), 2, 1), ((2, 3), 2, -1)],
 )
-def test_each_pair_of_motors_turns_the_vehicle_the_right_way(motors, axis, sign):
+def test_each_pair_of_motors_gives_a_torque_of_the_right_sign(motors, axis, sign):
     # 1 front right, 2 rear left, 3 front left, 4 rear right; x forward, y right, z down.
     plant = load_airframe("adam0_nominal").airframe.plant()
     share = plant.mass * GRAVITY / 4 / plant.thrust_max
