@@ -29,6 +29,7 @@ from mimopilot.tuning.parameters import (
     rows,
 )
 from mimopilot.tuning.provenance import Provenance
+from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
 from numpy.typing import NDArray
 
 from mimopilot.common.files import sha256
@@ -36,6 +37,9 @@ from mimopilot.common.files import sha256
 Matrix = NDArray[np.float64]
 Triple = tuple[float, float, float]
 
+#: Reference models of the thesis' flights (chapter 6): rate loop, attitude loop.
+THESIS_INNER = (SecondOrder(20.0, 0.4),) * 2
+THESIS_OUTER = (SecondOrder(10.0, 0.7),) * 2
 #: Seal of a certificate that was read from a gains file of schema 1.
 SCHEMA_1 = "schema 1"
 
@@ -200,6 +204,12 @@ class Gains:
             limits=Limits(**parts[Shape.AXES]),
             **{name: np.reshape(matrix, (2, 2)) for name, matrix in parts[Shape.MATRIX].items()},  # type: ignore[arg-type]
         )
+
+    def reference_models(self, axis: int) -> tuple[ReferenceModel, ReferenceModel]:
+        """Reference models of the rate and the attitude loop on an axis; the thesis' own when none are known."""
+        inner = (self.provenance.inner_model or THESIS_INNER)[axis]
+        outer = (self.provenance.outer_model or THESIS_OUTER)[axis]
+        return inner.discretise(self.Ts), outer.discretise(self.Ts)
 
     def identity(self) -> dict[str, float]:
         """Name -> value of `tuning.parameters.IDENTITY`; empty when the set does not say its unit of torque."""

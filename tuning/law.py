@@ -352,7 +352,7 @@ def response(gains: Any, omega: Signal) -> Response:
     """
 
     def whole(name: str) -> Signal:
-        return block_diag(getattr(gains, name), getattr(gains.yaw, name))
+        return np.asarray(block_diag(getattr(gains, name), getattr(gains.yaw, name)), dtype=np.float64)
 
     attitude, eye, none = whole("Kp_o"), np.eye(3), np.zeros((3, 3))
     matrices = {letter: whole(term.matrix) for letter, term in TERMS.items()}

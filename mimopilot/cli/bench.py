@@ -256,7 +256,6 @@ def fly(
     from mimopilot.sitl.flight.fault_recovery import recovery
     from mimopilot.sitl.flight.flight_log import save_flight
     from mimopilot.sitl.flight.metrics import performance
-    from mimopilot.sitl.flight.models import reference_models
     from mimopilot.sitl.flight.scenario import AXES
     from mimopilot.sitl.flight.simulator import fly as fly_scenario
 
@@ -266,7 +265,7 @@ def fly(
         raise SitlError(f"--on: got {on!r}, expected native or cortex-m4")
     processor = load_emulated(controller) if on == "cortex-m4" else None
     flight = fly_scenario(body, Autopilot(body, controller, processor), task, seed)
-    inner, outer = reference_models(controller, task.axis)
+    inner, outer = controller.reference_models(task.axis)
     figures: dict[str, Any] = {**asdict(performance(flight, inner, outer)), "crashed_at_s": flight.crashed_at}
     if task.faults:
         sound = fly_scenario(body, Autopilot(body, controller), replace(task, faults=()), seed)

@@ -19,7 +19,6 @@ from mimopilot.sitl.campaign.plan import Plan, plan_from_files
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.flight.metrics import Performance, performance
-from mimopilot.sitl.flight.models import reference_models
 from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, first_loss
 
 from mimopilot.common.files import seal
@@ -43,7 +42,7 @@ class Stand:
         first = next(iter(plan.gains.values()))
         self.autopilots = {name: Autopilot(plan.airframe, gains) for name, gains in plan.gains.items()}
         self.models = {
-            (name, scenario.axis): reference_models(gains, scenario.axis)
+            (name, scenario.axis): gains.reference_models(scenario.axis)
             for name, gains in plan.gains.items()
             for scenario in plan.scenarios
         }

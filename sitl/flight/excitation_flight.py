@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.flight_log import save_flight
 from mimopilot.sitl.flight.scenario import excitation_flight
 from mimopilot.sitl.flight.simulator import Flight, fly
@@ -70,6 +71,18 @@ def default_amplitude(airframe: Airframe) -> float:
     hover = plant.mass * GRAVITY / (len(plant.rotors) * plant.thrust_max)
     margin = min(hover, 1 - hover) / float(np.abs(allocation.mixer[:, :2]).max())
     return min(AMPLITUDE, float(f"{TORQUE_SHARE * margin:.2g}"))
+
+
+def check_survived(flight: Flight) -> None:
+    """Refuse a flight whose vehicle was lost.
+
+    Raises
+    ------
+    SitlError
+        With the time, and what to change.
+    """
+    if flight.crashed_at is not None:
+        raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s; lower --amplitude", exit_code=1)
 
 
 def repeat_experiment(

@@ -17,6 +17,7 @@ A scenario file names a manoeuvre and its faults:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -24,7 +25,7 @@ from typing import Literal
 import numpy as np
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.faults.kinds import Fault, make_fault
+from mimopilot.sitl.faults.kinds import Fault, make_fault, parse_fault
 from mimopilot.tuning.excitation import hold_from_bandwidth, prbs
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
@@ -232,3 +233,43 @@ def excitation_flight(
         samples_of_axis = slice(axis * samples, (axis + 1) * samples)
         excitation[samples_of_axis, axis] = prbs(samples, amplitude, hold_min, hold_max, generator)
     return Scenario("experiment", Ts, np.zeros_like(excitation), excitation, 0, (0, len(excitation)))
+
+
+def scenario_of(
+    name: str,
+    axis: str | None,
+    amplitude_deg: float | None,
+    period_s: float | None,
+    tail_s: float | None,
+    faults: Sequence[str],
+    Ts: float,
+) -> Scenario:
+    """A manoeuvre by its name, or a scenario file, with faults added.
+
+    Parameters
+    ----------
+    name : str
+        ``doublet``, ``step``, ``hover``, or a file whose name ends in ``.toml``.
+    axis, amplitude_deg, period_s, tail_s
+        Of a manoeuvre; None: the usual one. A file has its own.
+    faults : sequence of str
+        Further faults, see `sitl.faults.kinds.parse_fault`.
+    Ts : float, s
+        Control period.
+
+    Raises
+    ------
+    SitlError
+        When something of a file is given here, too, or a value is out of its range.
+    """
+    given = {"axis": axis, "amplitude-deg": amplitude_deg, "period-s": period_s, "tail-s": tail_s}
+    if name.endswith(".toml"):
+        doubled = [f"--{option}" for option, value in given.items() if value is not None]
+        if doubled:
+            raise SitlError(f"{', '.join(doubled)}: defined in {name}; change it there")
+        task = load_scenario(Path(name), Ts)
+    else:
+        amplitude = AMPLITUDE_DEG if amplitude_deg is None else amplitude_deg
+        period, tail = PERIOD_S if period_s is None else period_s, TAIL_S if tail_s is None else tail_s
+        task = make_scenario(name, axis or "roll", amplitude, period, Ts, tail)
+    return replace(task, faults=(*task.faults, *map(parse_fault, faults)))

@@ -18,7 +18,6 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
 from mimopilot.sitl.flight.flight_log import save_flight
 from mimopilot.sitl.flight.metrics import Performance, performance
-from mimopilot.sitl.flight.models import reference_models
 from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet, excitation_flight
 from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.mavlink.simulator_api import lockstep
@@ -131,7 +130,7 @@ def run_demo(out: Path, seed: int) -> Summary:
 
     figures = {
         axis: {
-            method: performance(flight, *reference_models(gains["mimo"], AXES.index(axis)))
+            method: performance(flight, *gains["mimo"].reference_models(AXES.index(axis)))
             for method, flight in methods.items()
         }
         for axis, methods in flights.items()
@@ -239,7 +238,7 @@ def _write_report(
     flights: dict[str, dict[str, Flight]],
     experiment: Flight,
 ) -> None:
-    inner, outer = reference_models(gains["mimo"], 0)
+    inner, outer = gains["mimo"].reference_models(0)
     labels = {"default": "default", "siso": "SISO", "mimo": "MIMO"}
     doublets = [
         svg(manoeuvre_figure({labels[m]: f for m, f in methods.items()}, inner, outer), axis)
