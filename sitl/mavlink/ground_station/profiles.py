@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import single
+from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.gains import AXES, AXIS_LETTERS, MATRICES, PARAMETER_PREFIX, Gains
 from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Parameter, check_ranges
 from mimopilot.tuning.parameters import Setting as VehicleSetting

@@ -22,8 +22,8 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     Steps,
     Turn,
     Value,
-    shortest,
 )
+from mimopilot.sitl.mavlink.wire.float32 import shortest
 
 #: One try, s; how many. At 30 % loss each way 24 tries lose 1 exchange in 10^7.
 TRY_S, TRIES = 0.5, 24

@@ -11,8 +11,9 @@ from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState, actuator_controls
-from mimopilot.sitl.mavlink.wire.fast_codec import SPIN_S, STATE, LeanCodec, receive
-from mimopilot.sitl.mavlink.wire.link import COMPONENT, LOOPBACK, SYSTEM
+from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
+from mimopilot.sitl.mavlink.wire.fast_codec import SPIN_S, STATE, FastCodec, receive
+from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK
 from mimopilot.sitl.physics.state_estimate import SIZE
 from numpy.typing import NDArray
 
@@ -54,7 +55,7 @@ def fly(autopilot: Autopilot, scenario: Scenario, port: int) -> NDArray[Any]:
 
 def _exchange(autopilot: Autopilot, plant: socket.socket, record: NDArray[Any]) -> int:
     """Answer frames until the record is full; how many periods were flown. A repeated frame is answered, not flown."""
-    codec, measurement = LeanCodec(SYSTEM, COMPONENT), np.zeros(SIZE)
+    codec, measurement = FastCodec(SYSTEM, COMPONENT), np.zeros(SIZE)
     count, stamp, answer = 0, -1, b""
     plant.setblocking(False)
     while count < len(record):

@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
-from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, LeanCodec, Message
-from mimopilot.sitl.mavlink.wire.link import COMPONENT, LOOPBACK, SYSTEM
+from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, FastCodec, Message
+from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK
 from numpy.typing import NDArray
 
 RETRY_S = 0.2  # between tries to connect
@@ -49,7 +50,7 @@ class PlantState(NamedTuple):
         out[7], out[8] = self.alt, -self.vz
 
 
-def actuator_controls(codec: LeanCodec, stamp: int, commands: NDArray[np.float32], armed: bool) -> bytes:
+def actuator_controls(codec: FastCodec, stamp: int, commands: NDArray[np.float32], armed: bool) -> bytes:
     """HIL_ACTUATOR_CONTROLS: motor commands, (16,) thrust fractions, for the frame of a time (us)."""
     return codec.pack(ACTUATORS, stamp, LOCKSTEP, *commands.tolist(), ARMED if armed else 0)
 
@@ -72,7 +73,7 @@ class PlantLink:
         self.child = plant if isinstance(plant, PlantProcess) else None
         self.address = None if isinstance(plant, PlantProcess) else plant
         self.socket: socket.socket | None = None
-        self.codec = LeanCodec(SYSTEM, COMPONENT)
+        self.codec = FastCodec(SYSTEM, COMPONENT)
         self._connecting: socket.socket | None = None
         self._next = 0.0
 
@@ -139,7 +140,7 @@ class PlantLink:
             if self.child is not None and not self.child.alive:
                 self.child.end()  # so that it is started again
             return False
-        self.codec = LeanCodec(SYSTEM, COMPONENT)
+        self.codec = FastCodec(SYSTEM, COMPONENT)
         self.socket = link
         return True
 

@@ -82,7 +82,7 @@ class PlantServer:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         try:
             with connection:
-                Lockstep(self, connection).fly()
+                LockstepSession(self, connection).fly()
         except OSError:
             flown = vehicle.seconds
             vehicle.restart()
@@ -111,7 +111,7 @@ class PlantServer:
             self.vehicle.tell("a second autopilot was turned away: this vehicle has one already")
 
 
-class Lockstep:
+class LockstepSession:
     """One autopilot's flight."""
 
     def __init__(self, server: PlantServer, connection: socket.socket) -> None:

@@ -13,7 +13,7 @@ from mimopilot.sitl.autopilot.autopilot import MAX_ROTORS
 from mimopilot.sitl.faults.inject_plant import Injection
 from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.sitl.flight.simulator import Simulator
-from mimopilot.sitl.mavlink.wire.fast_codec import GPS, SENSOR, STATE, LeanCodec
+from mimopilot.sitl.mavlink.wire.fast_codec import GPS, SENSOR, STATE, FastCodec
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.sitl.physics.ground_contact import ground_state, touch
 from mimopilot.sitl.physics.imu_baro_gps import (
@@ -66,7 +66,7 @@ class SimulatedVehicle:
         How often the messages of now reach the autopilot: 0 when they are lost, 2 when they are duplicated.
     periods : int
         What the simulated clock has counted.
-    codec : LeanCodec
+    codec : FastCodec
         Of the plant's end of the link.
     """
 
@@ -93,7 +93,7 @@ class SimulatedVehicle:
             self.simulator.history[:] = 0.0
         self.instruments = Instruments(self.simulator.state, self.Ts, self.seed)
         self.injection = Injection(self.faults, self.airframe, self.simulator, self.Ts, self.seed)
-        self.codec = LeanCodec(1, mavlink.MAV_COMP_ID_USER1)
+        self.codec = FastCodec(1, mavlink.MAV_COMP_ID_USER1)
         self.periods = self.flown = 0
         self.lost = self.odd = False
         self.copies, self.gyro = 1, [0.0, 0.0, 0.0]

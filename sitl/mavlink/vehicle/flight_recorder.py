@@ -30,7 +30,7 @@ class _Flight:
     gains: NDArray[np.float32]
 
 
-class FlightLog:
+class FlightRecorder:
     """Writes FILE.ulg for the first flight, FILE-2.ulg for the second, and so on.
 
     A flight that cannot be written (a full disk) keeps its number and is kept until it can.

@@ -16,11 +16,11 @@ from mimopilot.sitl.autopilot.vertical import Estimate
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_autopilot import AutopilotFaults
 from mimopilot.sitl.flight.scripted_pilot import ScriptedPilot
-from mimopilot.sitl.mavlink.simulator_api.lateness import Lateness
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantLink, PlantState
-from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
-from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
-from mimopilot.sitl.mavlink.vehicle.situation import Situation
+from mimopilot.sitl.mavlink.simulator_api.response_times import ResponseTimes
+from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightRecorder
+from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.fast_codec import GPS, SENSOR, STATE
 from mimopilot.sitl.physics.state_estimate import SIZE, euler_angles
 from mimopilot.tuning.parameters import PARAMETERS
@@ -35,7 +35,7 @@ EXAMINED = 250  # periods between examinations of what forbids arming
 REPEATED_S = 1.0  # the same text is told no more often
 
 #: Moment to inject in a period, (3,); called with the vehicle's clock, s.
-Excitation = Callable[[float], Sequence[float]]
+TorqueSource = Callable[[float], Sequence[float]]
 
 
 class Host:
@@ -47,13 +47,13 @@ class Host:
         The controller and what surrounds it.
     plant : PlantLink
         Where the body is.
-    log : FlightLog or None
+    log : FlightRecorder or None
         Where flights are recorded.
 
     Attributes
     ----------
     vehicle : Vehicle
-    situation : Situation
+    situation : VehicleState
         What telemetry shows.
     excitation : callable
         May be replaced.
@@ -61,20 +61,20 @@ class Host:
         Flies in place of a ground station.
     faults : AutopilotFaults or None
         Of this autopilot, in seconds from the first frame of a plant.
-    lateness : Lateness
+    response_times : ResponseTimes
         How long frames of the plant wait.
     """
 
-    def __init__(self, autopilot: Autopilot, plant: PlantLink, log: FlightLog | None = None) -> None:
+    def __init__(self, autopilot: Autopilot, plant: PlantLink, log: FlightRecorder | None = None) -> None:
         self.autopilot, self.plant, self.log = autopilot, plant, log
         autopilot.controls["armed"] = 0
         self.vehicle = Vehicle(autopilot.hover)
         self.vehicle.obstacles["plant"] = "no plant is connected"
-        self.situation = Situation(self.vehicle)
-        self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
+        self.situation = VehicleState(self.vehicle)
+        self.excitation: TorqueSource = lambda now: (0.0, 0.0, 0.0)
         self.pilot: ScriptedPilot | None = None
         self.faults: AutopilotFaults | None = None
-        self.lateness = Lateness()
+        self.response_times = ResponseTimes()
         self.measurement = np.zeros(SIZE)
         euler_angles(*self.measurement[:4])  # compiled now, not in flight
         self.stamp = self._zero = -1
@@ -90,7 +90,7 @@ class Host:
         self.plant.drop()
         self._lose("the vehicle starts again")
 
-    def run(self, ground: Ground) -> None:
+    def run(self, ground: GroundStationLink) -> None:
         """Fly and serve ground stations, for ever or until `pilot` is done.
 
         The plant comes first, and is found again when it goes away.
@@ -152,7 +152,7 @@ class Host:
         begin = time.monotonic()
         ready = select.select(plants, [], [], TURN_S)[0]
         end = time.monotonic()
-        self.lateness.nothing_waits(end - begin, end)
+        self.response_times.nothing_waits(end - begin, end)
         return bool(ready)
 
     def _fly(self) -> None:
@@ -181,8 +181,8 @@ class Host:
             self.stamp = state.stamp
             self._compute(state)
         self.plant.answer(self.stamp, self.situation.row["commands"], self.vehicle.armed)
-        self.lateness.answered()
-        self.situation.load = self.lateness.load
+        self.response_times.answered()
+        self.situation.load = self.response_times.load
 
     def _break(self) -> None:
         """Put the faults of now into the controller, and stop what steers."""
@@ -235,7 +235,7 @@ class Host:
             kept = ", ".join(path.name for path in self.log.unsaved)
             text = f"not logged: {error.filename}: {error.strerror}; kept for the next disarming: {kept}"
             self.vehicle.say(Severity.CRITICAL, text)
-        self.lateness.nothing_waits(0.0, time.monotonic())  # writing is not counted: nothing flies
+        self.response_times.nothing_waits(0.0, time.monotonic())  # writing is not counted: nothing flies
 
     def _examine(self, fault: int) -> None:
         """What forbids arming and only we know."""
@@ -259,7 +259,7 @@ class Host:
                 if before is None:
                     self.vehicle.say(Severity.CRITICAL, found[subject])
 
-    def _tell(self, ground: Ground, now: float) -> None:
+    def _tell(self, ground: GroundStationLink, now: float) -> None:
         """What the vehicle has said, to the ground stations and the console."""
         for severity, text in self.vehicle.said:
             if now - self._told.get(text, -REPEATED_S) >= REPEATED_S:

@@ -12,8 +12,8 @@ from mimopilot.codegen.cortex_m4 import EmulatedController
 from mimopilot.codegen.native import NativeController
 from mimopilot.sitl.autopilot.excitation_injector import AXIS, Injector
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import REAL32, shortest, single
 from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
+from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest, single
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS, identity_parameters, to_array
 from pymavlink.dialects.v20 import common as mavlink
@@ -25,7 +25,7 @@ TOLD = 5
 
 
 @dataclass(frozen=True)
-class Entry:
+class ServedParameter:
     """One line of the vehicle's list; integers are published as floats, which every ground station understands."""
 
     name: str
@@ -73,10 +73,10 @@ class ParameterServer:
     ) -> None:
         self.controller, self.injector, self.store = controller, injector, store
         identity = identity_parameters(gains)
-        self.table: tuple[Entry, ...] = (
-            *(Entry(p.name, p.minimum, p.maximum, p.writable) for p in PARAMETERS),
-            *(Entry(p.name, p.minimum, p.maximum, False) for p in IDENTITY if p.name in identity),
-            *(Entry(s.name, s.minimum, s.maximum, True, s.integer) for s in EXCITATION),
+        self.table: tuple[ServedParameter, ...] = (
+            *(ServedParameter(p.name, p.minimum, p.maximum, p.writable) for p in PARAMETERS),
+            *(ServedParameter(p.name, p.minimum, p.maximum, False) for p in IDENTITY if p.name in identity),
+            *(ServedParameter(s.name, s.minimum, s.maximum, True, s.integer) for s in EXCITATION),
         )
         self.index = {entry.name: i for i, entry in enumerate(self.table)}
         settings = {setting.name: single(setting.default) for setting in EXCITATION}
@@ -146,7 +146,7 @@ class ParameterServer:
         held = self.message(index)
         return [held] if refusal is None else [_error(name, index, refusal), held]
 
-    def _refusal(self, entry: Entry, value: float, kind: int) -> int | None:
+    def _refusal(self, entry: ServedParameter, value: float, kind: int) -> int | None:
         """Why a value is not taken; None: it was."""
         if not entry.writable:
             return READ_ONLY

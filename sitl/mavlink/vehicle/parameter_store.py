@@ -63,7 +63,7 @@ class ParameterStore:
             if wanted is None:
                 return True
             try:
-                write_atomically(self.path, parameter_text("qgc", wanted, seal=False))
+                write_atomically(self.path, parameter_text("qgc", wanted, checksum=False))
             except OSError as error:
                 with self._taking:
                     self._wanted = self._wanted or wanted

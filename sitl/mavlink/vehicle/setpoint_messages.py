@@ -23,7 +23,7 @@ PULSE_MIN, PULSE_MAX = 800, 2200  # us, of a credible RC channel
 FARTHEST = 1e5  # m
 
 
-class Steering:
+class SetpointReceiver:
     """Feeds a vehicle from messages.
 
     Parameters

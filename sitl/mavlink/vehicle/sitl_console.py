@@ -18,14 +18,14 @@ from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.flight.scripted_pilot import ScriptedPilot
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantLink
 from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
-from mimopilot.sitl.mavlink.vehicle.excitation import Excitation
-from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
-from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
+from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightRecorder
+from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
 from mimopilot.sitl.mavlink.vehicle.host import Host
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
 from mimopilot.sitl.mavlink.vehicle.stations import Stations
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
+from mimopilot.sitl.mavlink.vehicle.torque_injection import TorqueInjection
 from mimopilot.sitl.mavlink.vehicle.vehicle_commands import VehicleCommands
 from mimopilot.sitl.mavlink.wire.signing import Signer, read_key
 from mimopilot.sitl.physics.airframe import Airframe
@@ -33,7 +33,7 @@ from mimopilot.tuning.gains import Gains
 
 
 @dataclass(frozen=True)
-class Options:
+class SitlOptions:
     """What the command line says.
 
     Attributes
@@ -81,7 +81,7 @@ class Options:
     faults: tuple[Fault, ...]
 
 
-def run(options: Options) -> None:
+def run(options: SitlOptions) -> None:
     """Run the vehicle until Ctrl-C, or until its scenario is flown.
 
     Raises
@@ -95,14 +95,14 @@ def run(options: Options) -> None:
         begin = time.monotonic()
         try:
             host.run(ground)
-            pace = host.lateness.periods * options.gains.Ts / (time.monotonic() - begin)
+            pace = host.response_times.periods * options.gains.Ts / (time.monotonic() - begin)
             print(f"flown at {pace:.3g} times real time")
         except KeyboardInterrupt:
             written = host.leave()
-            print(f"ended: {host.lateness}{'; logged: ' if written else ''}{', '.join(map(str, written))}")
+            print(f"ended: {host.response_times}{'; logged: ' if written else ''}{', '.join(map(str, written))}")
 
 
-def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
+def _assemble(options: SitlOptions, leaving: ExitStack) -> tuple[Host, GroundStationLink]:
     gains, key = options.gains, options.signing_key
     outside = _faults_of_the_plant(options)
     signer = Signer(read_key(key)) if key else None
@@ -118,7 +118,7 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
         link.child.start()  # it comes up while we compile
     autopilot = Autopilot(options.airframe, gains)
     autopilot.warm_up()
-    log = FlightLog(options.log, options.airframe, gains.Ts) if options.log else None
+    log = FlightRecorder(options.log, options.airframe, gains.Ts) if options.log else None
     host = Host(autopilot, link, log)
     leaving.callback(host.leave)
     if len(options.faults) > len(outside):
@@ -126,7 +126,7 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
     telemetry = Telemetry(host.situation)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
     injector = Injector(gains.Ts)
-    host.excitation = Excitation(injector, host.situation)
+    host.excitation = TorqueInjection(injector, host.situation)
     if options.scenario is not None:
         host.pilot = pilot = ScriptedPilot(options.scenario)
         host.excitation = lambda now: pilot.moment
@@ -137,10 +137,10 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
         print(server.summary)
     if link.child is not None:
         link.child.wait()
-    return host, Ground(server, commands, telemetry, stations)
+    return host, GroundStationLink(server, commands, telemetry, stations)
 
 
-def _faults_of_the_plant(options: Options) -> list[Fault]:
+def _faults_of_the_plant(options: SitlOptions) -> list[Fault]:
     """What happens in the plant and in its link, for a plant of ours."""
     for fault in options.faults:
         check_fault(fault, options.airframe, options.gains.Ts, None)

@@ -13,8 +13,9 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
-from mimopilot.sitl.mavlink.wire.link import COMPONENT, KINDS, LOOPBACK, SYSTEM, Codec, listen, udp_socket
+from mimopilot.sitl.mavlink.wire.codec import COMPONENT, KINDS, SYSTEM, Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
+from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, listen, udp_socket
 
 #: Time that one call of `Stations.receive` may take, and one of `Stations.deliver`, s: an eighth of a control period.
 BUDGET_S = 0.0005

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from typing import Any
 
 from mimopilot.sitl.autopilot.flight_modes import Severity
-from mimopilot.sitl.mavlink.vehicle.situation import Situation
-from mimopilot.sitl.mavlink.vehicle.telemetry_messages import OF_NO_STREAM, TOPICS
+from mimopilot.sitl.mavlink.vehicle.telemetry_messages import NO_STREAM, TELEMETRY_MESSAGES
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from pymavlink.dialects.v20 import common as mavlink
 
 MAX_RATE = 250.0  # Hz, of one message
@@ -20,13 +20,13 @@ class Telemetry:
 
     Parameters
     ----------
-    situation : Situation
+    situation : VehicleState
         What they are made from.
     """
 
-    def __init__(self, situation: Situation) -> None:
+    def __init__(self, situation: VehicleState) -> None:
         self.situation = situation
-        self.rates = {number: topic.rate for number, topic in TOPICS.items()}
+        self.rates = {number: topic.rate for number, topic in TELEMETRY_MESSAGES.items()}
         self.due = {number: 0.0 for number, rate in self.rates.items() if rate > 0}
         self.next = 0.0
 
@@ -44,13 +44,13 @@ class Telemetry:
 
     def set_stream(self, stream: int, rate: float) -> None:
         """The same for all messages of a data stream; stream 0 is all of them."""
-        for number, topic in TOPICS.items():
-            if topic.stream != OF_NO_STREAM and stream in (mavlink.MAV_DATA_STREAM_ALL, topic.stream):
-                self.set_rate(number, rate if TOPICS[number].rate > 0 else 0.0)
+        for number, topic in TELEMETRY_MESSAGES.items():
+            if topic.stream != NO_STREAM and stream in (mavlink.MAV_DATA_STREAM_ALL, topic.stream):
+                self.set_rate(number, rate if TELEMETRY_MESSAGES[number].rate > 0 else 0.0)
 
     def build(self, number: int) -> Any:
         """One message now; None when what it tells is not known."""
-        topic = TOPICS[number]
+        topic = TELEMETRY_MESSAGES[number]
         if topic.needs and not getattr(self.situation, topic.needs):
             return None
         return topic.build(self.situation)

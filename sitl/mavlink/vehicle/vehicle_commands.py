@@ -9,7 +9,7 @@ from typing import Any
 
 from mimopilot.sitl.autopilot.flight_modes import Denied, Failed, Mode, Refused, Severity, Vehicle
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
-from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TOPICS
+from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TELEMETRY_MESSAGES
 from mimopilot.sitl.mavlink.wire.px4_modes import mode_of, mode_of_pair
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -166,14 +166,14 @@ class VehicleCommands:
 
     def _topic(self, command: Command) -> int:
         number = command.whole(1)
-        if number not in TOPICS:
+        if number not in TELEMETRY_MESSAGES:
             raise Unsupported(f"there is no message {number} here")
         return number
 
     def _set_interval(self, command: Command) -> list[Any]:
         number, interval = self._topic(command), command.params[1]
         if interval == 0:
-            self.telemetry.set_rate(number, TOPICS[number].rate)
+            self.telemetry.set_rate(number, TELEMETRY_MESSAGES[number].rate)
         elif interval == -1:
             self.telemetry.set_rate(number, 0.0)
         elif 0 < interval <= MAX_INTERVAL_US:

@@ -10,7 +10,7 @@ import socket
 import time
 from typing import NamedTuple
 
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.common.console import print_table

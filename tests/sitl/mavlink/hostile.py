@@ -16,13 +16,13 @@ from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.excitation_injector import Injector
 from mimopilot.sitl.autopilot.flight_modes import Mode, Vehicle
-from mimopilot.sitl.mavlink.vehicle.excitation import Excitation
-from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
+from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.stations import Stations
-from mimopilot.sitl.mavlink.vehicle.telemetry import Situation, Telemetry
+from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry, VehicleState
+from mimopilot.sitl.mavlink.vehicle.torque_injection import TorqueInjection
 from mimopilot.sitl.mavlink.vehicle.vehicle_commands import VehicleCommands
-from mimopilot.sitl.mavlink.wire.link import KINDS, Codec
+from mimopilot.sitl.mavlink.wire.codec import KINDS, Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.state_estimate import euler_angles
@@ -48,9 +48,9 @@ class InTheAir:
         self.autopilot = Autopilot(body.airframe, gains, NativeController(load_native(gains), gains))
         self.vehicle = Vehicle(self.autopilot.hover)
         self.vehicle.armed, self.vehicle.mode, self.vehicle.now = True, Mode.HOLD, 100.0
-        situation = Situation(self.vehicle)
+        situation = VehicleState(self.vehicle)
         self.injector = Injector(gains.Ts)
-        self.excitation = Excitation(self.injector, situation)
+        self.excitation = TorqueInjection(self.injector, situation)
         self.server = ParameterServer(self.autopilot.controller, gains, self.injector)
         telemetry = Telemetry(situation)
         self.commands = VehicleCommands(self.vehicle, telemetry, self.reboot)
@@ -58,7 +58,7 @@ class InTheAir:
         self.attacker = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.attacker.bind(("127.0.0.1", 0))
         self.stations = Stations(self.attacker.getsockname()[1], 0, 0, signer=self.signer)
-        self.ground = Ground(self.server, self.commands, telemetry, self.stations)
+        self.ground = GroundStationLink(self.server, self.commands, telemetry, self.stations)
         self.udp, self.tcp_address = self.stations.udp.getsockname(), self.stations.tcp.getsockname()
         self.tcp = socket.create_connection(self.tcp_address)
         self.friend = Codec(255, 190, Signer(key) if key else None)

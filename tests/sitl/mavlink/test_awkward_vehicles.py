@@ -12,10 +12,10 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     Value,
     Write,
     drive,
-    single,
 )
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Conversation
 from mimopilot.sitl.mavlink.ground_station.upload import apply, read
+from mimopilot.sitl.mavlink.wire.float32 import single
 
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, SimulatedLink
 

@@ -13,7 +13,7 @@ from mimopilot.sitl.mavlink.ground_station.events import Value, Write, drive
 from mimopilot.sitl.mavlink.ground_station.experiment import INTEGERS, excite, observe
 from mimopilot.sitl.mavlink.ground_station.experiment_console import Choice, settings
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Conversation
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.tuning.logs.reader import read_log
 from pymavlink.dialects.v20 import common as mavlink
 

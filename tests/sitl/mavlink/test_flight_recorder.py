@@ -3,7 +3,7 @@
 import pytest
 from mimopilot.sitl.autopilot.flight_modes import Vehicle
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
+from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightRecorder
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.parameters import to_array
 from pyulog import ULog
@@ -30,7 +30,7 @@ def seconds(path):
 
 def test_a_flight_that_cannot_be_written_keeps_its_number_and_is_written_later(model, tmp_path):
     folder = tmp_path / "logs"
-    log = FlightLog(folder / "f.ulg", model.airframe, TS)
+    log = FlightRecorder(folder / "f.ulg", model.airframe, TS)
     flies(log, model, 1.0)
     assert log.save() == [folder / "f.ulg"]
     folder.rename(tmp_path / "away")
@@ -50,5 +50,5 @@ def test_a_flight_that_cannot_be_written_keeps_its_number_and_is_written_later(m
 
 def test_a_folder_is_no_log(model, tmp_path):
     with pytest.raises(SitlError, match="cannot be written there"):
-        FlightLog(tmp_path, model.airframe, TS)
+        FlightRecorder(tmp_path, model.airframe, TS)
     assert list(tmp_path.iterdir()) == []

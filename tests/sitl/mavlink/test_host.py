@@ -7,7 +7,7 @@ import time
 from contextlib import suppress
 
 import pytest
-from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, STATE, LeanCodec
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, STATE, FastCodec
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.sitl.mavlink.running import Pilot, running_sitl
@@ -29,7 +29,7 @@ class FakePlant:
 
     def _run(self):
         link, _ = self.server.accept()
-        codec = LeanCodec(1, 1)
+        codec = FastCodec(1, 1)
         with link, suppress(OSError):
             while not self.over:
                 time.sleep(0.004)

@@ -2,7 +2,7 @@
 
 import pytest
 from mimopilot.sitl.mavlink.vehicle import stations
-from mimopilot.sitl.mavlink.wire import link
+from mimopilot.sitl.mavlink.wire import codec
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.sitl.mavlink.hostile import KEY, InTheAir, attack, drain
@@ -64,9 +64,9 @@ def test_one_turn_reads_no_more_than_its_time_allows(target, monkeypatch):
 
 @pytest.mark.parametrize("piece", [b"\xfe", b"\xfe\xfe\0\0\0\x6e", b"\xfd\xff\0\0\0\0\0\x6e\0\0"])
 def test_a_stream_of_false_starts_takes_no_more_time_than_is_allowed(target, monkeypatch, piece):
-    clock, looked_at, is_sound = iter(range(10**9)), [], link._is_sound
+    clock, looked_at, is_intact = iter(range(10**9)), [], codec._is_intact
     monkeypatch.setattr(stations.time, "perf_counter", lambda: next(clock) * stations.BUDGET_S / 10)
-    monkeypatch.setattr(link, "_is_sound", lambda frame: looked_at.append(len(frame)) or is_sound(frame))
+    monkeypatch.setattr(codec, "_is_intact", lambda frame: looked_at.append(len(frame)) or is_intact(frame))
     target.tcp.sendall((piece * 2000)[:2000])
     deepest = turns = 0
     while sum(looked_at) < 20_000:

@@ -11,7 +11,8 @@ from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.mavlink.simulator_api import lockstep
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
-from mimopilot.sitl.mavlink.wire.link import Codec, listen
+from mimopilot.sitl.mavlink.wire.codec import Codec
+from mimopilot.sitl.mavlink.wire.sockets import listen
 from mimopilot.sitl.physics.airframe import load_airframe
 from pymavlink.dialects.v20 import common as mavlink
 

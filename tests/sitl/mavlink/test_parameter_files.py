@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import single
+from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, NAME, parameter_text, read_parameters
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.parameters import PARAMETERS
@@ -64,14 +64,14 @@ def test_every_name_of_our_table_fits_a_file():
     [
         ("", "holds no parameters"),
         ("# only a comment\n", "holds no parameters"),
-        ("MIMO_RP_RR", r"line 1: got 'MIMO_RP_RR', expected a parameter's name"),
+        ("MIMO_RP_RR", r"line 1: got 'MIMO_RP_RR', expected a parameter name"),
         ("MIMO_RP_RR,0,12", r"line 1: got 'MIMO_RP_RR,0,12'"),
         ("MIMO_RP_RR,abc", r"line 1: MIMO_RP_RR: got 'abc', expected a finite number"),
         ("\nMIMO_RP_RR nan", r"line 2: MIMO_RP_RR: got 'nan'"),
         ("MIMO_RP_RR inf", "got 'inf'"),
         ("MIMO_RP_RR 1e39", "got '1e39'"),
-        ("MIMO_RP_RR 1\nMIMO_RP_RR 2", "line 2: MIMO_RP_RR stands in the file twice"),
-        ("MIMO_RP_RR_TOO_LONG 1", "16 capitals at most"),
+        ("MIMO_RP_RR 1\nMIMO_RP_RR 2", "line 2: MIMO_RP_RR is in the file twice"),
+        ("MIMO_RP_RR_TOO_LONG 1", "at most 16 capitals"),
         ("mimo 1", "got 'mimo 1'"),
         ("1\t1\tSYS_AUTOSTART\t4001\t6", "SYS_AUTOSTART: param_type 6, expected 9"),
         ("1\t1\tMIMO_RP_RR\t0.12", "got '1"),
@@ -91,11 +91,11 @@ def test_a_file_of_ours_that_was_cut_or_changed_is_refused_at_every_byte(tmp_pat
     text = parameter_text(form, values)
     for size in range(len(text) - 1):  # without its last line end it is whole
         path.write_text(text[:size])
-        with pytest.raises(SitlError, match=r"holds no parameters|not whole|cut short"):
+        with pytest.raises(SitlError, match=r"holds no parameters|incomplete|cut short"):
             read_parameters(path)
     lines = text.splitlines(keepends=True)
     path.write_text("".join(lines[:-10]))
-    with pytest.raises(SitlError, match=r"x\.params: holds 26 parameters, but its first line says 36: it is not whole"):
+    with pytest.raises(SitlError, match=r"x\.params: incomplete: holds 26 parameters, but its first line says 36"):
         read_parameters(path)
     path.write_text(text.replace("0.105", "0.106"))
     with pytest.raises(SitlError, match=r"damaged or edited.*delete the first line"):

@@ -17,11 +17,11 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     Value,
     Write,
     drive,
-    single,
 )
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, Conversation
 from mimopilot.sitl.mavlink.ground_station.upload import apply, read
 from mimopilot.sitl.mavlink.ground_station.vehicle_contact import LISTEN_S
+from mimopilot.sitl.mavlink.wire.float32 import single
 
 from tests.sitl.mavlink.scripted_vehicle import FAILING, ScriptedVehicle, SimulatedLink
 

@@ -18,8 +18,8 @@ from mimopilot.sitl.faults.kinds import parse_fault
 from mimopilot.sitl.mavlink.simulator_api.hitl import SerialPlant
 from mimopilot.sitl.mavlink.simulator_api.plant_server import PlantServer
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import ARMED, SimulatedVehicle
-from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, GPS, SENSOR, STATE, LeanCodec
-from mimopilot.sitl.mavlink.wire.link import LOOPBACK, listen
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, GPS, SENSOR, STATE, FastCodec
+from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, listen
 from mimopilot.sitl.physics.airframe import load_airframe
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -71,7 +71,7 @@ class Pilot:
     """A raw autopilot: answers frames one by one."""
 
     def __init__(self, port):
-        self.codec, self.waiting = LeanCodec(1, 1), []
+        self.codec, self.waiting = FastCodec(1, 1), []
         self.link = socket.create_connection((LOOPBACK, port), timeout=PATIENCE_S)
         self.frames = []
 
@@ -352,7 +352,7 @@ class Board:
         self.fd, self.slave = pty.openpty()
         tty.setraw(self.slave)
         self.device = os.ttyname(self.slave)
-        self.codec = LeanCodec(1, 1)
+        self.codec = FastCodec(1, 1)
         self.sensors, self.kinds, self.command, self.running = [], set(), None, True
         self.thread = threading.Thread(target=self._run)
         self.thread.start()

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import single
 from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, off_diagonals, restoration
+from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.gains import MATRICES, Limits
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.parameters import PARAMETERS, to_array

@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.signing import EPOCH_S, UNITS_PER_S, Signer
 from pymavlink.dialects.v20 import common as mavlink
 

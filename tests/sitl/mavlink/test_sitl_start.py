@@ -4,7 +4,7 @@ import socket
 
 import numpy as np
 import pytest
-from mimopilot.sitl.mavlink.wire.link import listen
+from mimopilot.sitl.mavlink.wire.sockets import listen
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from pymavlink.dialects.v20 import common as mavlink
 

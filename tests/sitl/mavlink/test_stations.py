@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.vehicle import stations as module
 from mimopilot.sitl.mavlink.vehicle.stations import MAX_STATIONS, Stations
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.sitl.mavlink.running import PATIENCE_S, wait_for

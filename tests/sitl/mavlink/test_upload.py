@@ -14,7 +14,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.connection import Connection, express, understand
 from mimopilot.sitl.mavlink.ground_station.events import Beat, Heartbeat, Read, Refusal, Store, Value, Write
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.mavlink.wire.signing import Signer, read_key
 from mimopilot.sitl.physics.airframe import load_airframe

@@ -11,13 +11,13 @@ from mimopilot.sitl.autopilot.flight_modes import Mode, Refused, Severity, Vehic
 from mimopilot.sitl.autopilot.setpoints import Pose
 from mimopilot.sitl.autopilot.vertical import Estimate
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState
-from mimopilot.sitl.mavlink.vehicle.setpoint_messages import Steering
-from mimopilot.sitl.mavlink.vehicle.situation import Situation
+from mimopilot.sitl.mavlink.vehicle.setpoint_messages import SetpointReceiver
 from mimopilot.sitl.mavlink.vehicle.small_protocols import PROTOCOLS
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry, texts
-from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TOPICS
+from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TELEMETRY_MESSAGES
 from mimopilot.sitl.mavlink.vehicle.vehicle_commands import VehicleCommands
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -35,11 +35,11 @@ class Bench:
 
     def __init__(self):
         self.vehicle = Vehicle(0.5)
-        self.situation = Situation(self.vehicle)
+        self.situation = VehicleState(self.vehicle)
         self.telemetry = Telemetry(self.situation)
         self.rebooted = False
         self.commands = VehicleCommands(self.vehicle, self.telemetry, self.reboot)
-        self.steering = Steering(self.vehicle)
+        self.steering = SetpointReceiver(self.vehicle)
         self.stand(1.0)
 
     def reboot(self):
@@ -234,7 +234,7 @@ def test_every_message_can_be_sent_of_a_vehicle_of_which_nothing_is_a_number(ben
     for name in ("attitude", "quaternion", "rates", "collective", "commands", "moment"):
         situation.row[name] = value
     situation.vehicle.estimate = Estimate(value, value, value, (value,) * 3, 10.0, 0.0, 0.0, 0.0)
-    for number in TOPICS:
+    for number in TELEMETRY_MESSAGES:
         assert received(bench.telemetry.build(number)).get_msgId() == number
 
 
@@ -263,7 +263,7 @@ def test_before_a_plant_is_heard_only_the_vehicle_itself_is_shown(bench):
 
 def test_every_message_can_be_requested_and_packed(bench):
     bench.show()
-    for number in TOPICS:
+    for number in TELEMETRY_MESSAGES:
         ack, message = bench.long(mavlink.MAV_CMD_REQUEST_MESSAGE, number)
         assert ack.result == ACCEPTED
         assert received(message).get_msgId() == number

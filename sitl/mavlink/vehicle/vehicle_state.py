@@ -17,7 +17,7 @@ NOWHERE = PlantState(*[0] * 19)
 
 
 @dataclass
-class Situation:
+class VehicleState:
     """All that telemetry is made from.
 
     Attributes

@@ -7,7 +7,7 @@ import time
 LATE_S = 1e-3
 
 
-class Lateness:
+class ResponseTimes:
     """Times of one loop that waits for a plant and for others.
 
     Attributes

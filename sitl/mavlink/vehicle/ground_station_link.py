@@ -8,7 +8,7 @@ from typing import Any
 
 from mimopilot.sitl.autopilot.flight_modes import Denied, Failed, Refused, Severity
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
-from mimopilot.sitl.mavlink.vehicle.setpoint_messages import Steering
+from mimopilot.sitl.mavlink.vehicle.setpoint_messages import SetpointReceiver
 from mimopilot.sitl.mavlink.vehicle.small_protocols import PROTOCOLS
 from mimopilot.sitl.mavlink.vehicle.stations import BUDGET_S, Stations
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry, texts
@@ -20,7 +20,7 @@ GROUND_LOST_S = 5.0
 Answers = Callable[[Any], list[Any]]
 
 
-class Ground:
+class GroundStationLink:
     """The vehicle as ground stations see it.
 
     Parameters
@@ -42,7 +42,7 @@ class Ground:
         self.now = 0.0
         self.heard: float | None = None
         self._texts = 0
-        steering = Steering(self.vehicle)
+        steering = SetpointReceiver(self.vehicle)
         self.answers: dict[str, Answers] = {
             **PROTOCOLS,
             **dict.fromkeys(steering.takers, steering.take),

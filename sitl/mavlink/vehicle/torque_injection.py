@@ -5,23 +5,23 @@ from __future__ import annotations
 from mimopilot.sitl.autopilot.excitation_injector import Conditions, Injector, Moment
 from mimopilot.sitl.autopilot.flight_modes import Severity
 from mimopilot.sitl.autopilot.setpoints import Sticks
-from mimopilot.sitl.mavlink.vehicle.situation import Situation
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.px4_modes import NAV_STATES
 
 NO_STICKS = Sticks(0.0, 0.0, 0.0, 0.0)
 
 
-class Excitation:
+class TorqueInjection:
     """Drives an injector once a period.
 
     Parameters
     ----------
     injector : Injector
-    situation : Situation
+    situation : VehicleState
         The vehicle, with what the autopilot saw last.
     """
 
-    def __init__(self, injector: Injector, situation: Situation) -> None:
+    def __init__(self, injector: Injector, situation: VehicleState) -> None:
         self.injector, self.situation = injector, situation
 
     def __call__(self, now: float) -> Moment:
