@@ -1,4 +1,4 @@
-"""The messages that show a vehicle to ground stations, each made from its situation."""
+"""The telemetry messages, each built from the vehicle's state."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from pymavlink.dialects.v20 import common as mavlink
 
-UNKNOWN_16 = 65535
+UNKNOWN_16 = 65535  # "unknown" in a uint16 field, MAVLink common.xml
 CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     | mavlink.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
@@ -64,26 +64,26 @@ def _sys_status(s: VehicleState) -> Any:
         present |= mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION | mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
     healthy = present if not vehicle.complaints() else present & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
     if "plant" in vehicle.obstacles:
-        healthy = mavlink.MAV_SYS_STATUS_GEOFENCE  # there is no fence to breach, which is what its absence means
+        healthy = mavlink.MAV_SYS_STATUS_GEOFENCE  # without this bit ground stations report a fence breach
     return mavlink.MAVLink_sys_status_message(
         present, present, healthy, round(1000 * min(s.load, 1)), UNKNOWN_16, -1, -1, 0, 0, 0, 0, 0, 0
     )
 
 
 def _attitude(s: VehicleState) -> Any:
-    return mavlink.MAVLink_attitude_message(s.milliseconds, *_floats(s.row["attitude"]), *_floats(s.row["rates"]))
+    return mavlink.MAVLink_attitude_message(s.milliseconds, *_floats(s.record["attitude"]), *_floats(s.record["rates"]))
 
 
 def _attitude_quaternion(s: VehicleState) -> Any:
     return mavlink.MAVLink_attitude_quaternion_message(
-        s.milliseconds, *_floats(s.row["quaternion"]), *_floats(s.row["rates"])
+        s.milliseconds, *_floats(s.record["quaternion"]), *_floats(s.record["rates"])
     )
 
 
 def _attitude_target(s: VehicleState) -> Any:
-    wanted = _floats(quaternions(s.row["setpoint"][None])[0])
+    wanted = _floats(quaternions(s.record["setpoint"][None])[0])
     return mavlink.MAVLink_attitude_target_message(
-        s.milliseconds, 0, wanted, *_floats(s.row["rates_setpoint"]), float(s.row["collective"])
+        s.milliseconds, 0, wanted, *_floats(s.record["rates_setpoint"]), float(s.record["collective"])
     )
 
 
@@ -92,17 +92,10 @@ def _local_position(s: VehicleState) -> Any:
 
 
 def _global_position(s: VehicleState) -> Any:
-    above = s.state.alt - s.home[2]
+    plant = s.plant
+    place = (plant.lat, plant.lon, plant.alt, plant.alt - s.home[2])
     return mavlink.MAVLink_global_position_int_message(
-        s.milliseconds,
-        s.state.lat,
-        s.state.lon,
-        s.state.alt,
-        above,
-        s.state.vx,
-        s.state.vy,
-        s.state.vz,
-        _heading(s, UNKNOWN_16),
+        s.milliseconds, *place, plant.vx, plant.vy, plant.vz, _heading(s, UNKNOWN_16)
     )
 
 
@@ -117,7 +110,7 @@ def _vfr_hud(s: VehicleState) -> Any:
     e = s.vehicle.estimate
     speed = math.hypot(e.north, e.east)
     return mavlink.MAVLink_vfr_hud_message(
-        speed, speed, _heading(s, 0) // 100, _int16(100 * float(s.row["collective"])), e.altitude, e.climb
+        speed, speed, _heading(s, 0) // 100, _int16(100 * float(s.record["collective"])), e.altitude, e.climb
     )
 
 
@@ -141,12 +134,12 @@ def _scaled_imu(s: VehicleState) -> Any:
 
 
 def _servo_output(s: VehicleState) -> Any:
-    pulses = [_int16(1000 + 1000 * value) for value in _floats(s.row["commands"])]
+    pulses = [_int16(1000 + 1000 * value) for value in _floats(s.record["commands"])]
     return mavlink.MAVLink_servo_output_raw_message(max(s.stamp, 0) % 2**32, 0, *pulses[:8])
 
 
 def _actuators(s: VehicleState) -> Any:
-    commands = _floats(s.row["commands"])
+    commands = _floats(s.record["commands"])
     return mavlink.MAVLink_actuator_output_status_message(max(s.stamp, 0), len(commands), commands + [0.0] * 16)
 
 
@@ -161,7 +154,7 @@ def _extended_state(s: VehicleState) -> Any:
 
 
 def _battery(s: VehicleState) -> Any:
-    """Nothing is known of it: the simulator's link carries no battery."""
+    """All fields unknown: the simulator API carries no battery state."""
     return mavlink.MAVLink_battery_status_message(0, 0, 0, 32767, [UNKNOWN_16] * 10, -1, -1, -1, -1)
 
 
@@ -170,9 +163,9 @@ def _home_position(s: VehicleState) -> Any:
 
 
 def _excitation(s: VehicleState) -> Any:
-    """What is injected, as the firmware's module publishes it."""
-    roll, pitch, _ = _floats(s.row["excitation"])
-    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, max(s.stamp, 0), roll, pitch, float(s.excited))
+    """Injected torque, as the firmware's module publishes it."""
+    roll, pitch, _ = _floats(s.record["excitation"])
+    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, max(s.stamp, 0), roll, pitch, float(s.excitation_phase))
 
 
 def _autopilot_version(s: VehicleState) -> Any:
@@ -181,7 +174,19 @@ def _autopilot_version(s: VehicleState) -> Any:
 
 @dataclass(frozen=True)
 class TelemetryMessage:
-    """A message: how it is made, how often by default (Hz), its data stream, and what must be known for it."""
+    """One telemetry message.
+
+    Attributes
+    ----------
+    build : callable
+        Builds it.
+    rate : float, Hz
+        Default rate; 0: only on request.
+    stream : int
+        Its MAV_DATA_STREAM, or `NO_STREAM`.
+    needs : str
+        The `VehicleState` attribute that must be known; empty: none.
+    """
 
     build: Callable[[VehicleState], Any]
     rate: float
@@ -194,7 +199,7 @@ _RAW, _CONTROLLER = mavlink.MAV_DATA_STREAM_RAW_SENSORS, mavlink.MAV_DATA_STREAM
 _ATTITUDE, _HUD = mavlink.MAV_DATA_STREAM_EXTRA1, mavlink.MAV_DATA_STREAM_EXTRA2
 NO_STREAM = -1
 
-#: Message number -> topic.
+#: Message number -> how it is sent.
 TELEMETRY_MESSAGES = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: TelemetryMessage(heartbeat, 1.0, NO_STREAM, ""),
     mavlink.MAVLINK_MSG_ID_SYS_STATUS: TelemetryMessage(_sys_status, 1.0, _STATUS, ""),
@@ -223,7 +228,7 @@ def _floats(values: Any) -> list[float]:
 
 
 def _heading(s: VehicleState, unknown: int) -> int:
-    """0.01 deg; a plant may tell an attitude that is none."""
+    """Heading, 0.01 deg; `unknown` when the plant's attitude is not finite."""
     yaw = s.vehicle.estimate.yaw
     return round(math.degrees(yaw) * 100) % 36000 if math.isfinite(yaw) else unknown
 

@@ -1,4 +1,4 @@
-"""The injector on the vehicle: what it sees of the flight, and what ground stations see of it."""
+"""Excitation on the vehicle: steps the injector with the flight conditions, and publishes its phase and texts."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ NO_STICKS = Sticks(0.0, 0.0, 0.0, 0.0)
 
 
 class TorqueInjection:
-    """Drives an injector once a period.
+    """Steps an injector once a period.
 
     Parameters
     ----------
     injector : Injector
-    situation : VehicleState
-        The vehicle, with what the autopilot saw last.
+    state : VehicleState
+        The vehicle, with the autopilot's last record.
     """
 
-    def __init__(self, injector: Injector, situation: VehicleState) -> None:
-        self.injector, self.situation = injector, situation
+    def __init__(self, injector: Injector, state: VehicleState) -> None:
+        self.injector, self.state = injector, state
 
     def __call__(self, now: float) -> Moment:
-        """Moment to inject now; `now` is the vehicle's clock, s."""
-        vehicle, injector = self.situation.vehicle, self.injector
+        """Step the injector: torque (normalised) to inject now; `now` is the vehicle's clock, s."""
+        vehicle, injector = self.state.vehicle, self.injector
         estimate = vehicle.estimate
         moment = injector.step(
             Conditions(
-                ready=vehicle.armed and not vehicle.lift.landed and not self.situation.row["fault"],
+                ready=vehicle.armed and not vehicle.lift.landed and not self.state.record["fault"],
                 mode=NAV_STATES[vehicle.mode],
                 attitude=(estimate.roll, estimate.pitch),
                 sticks=vehicle.sticks.value if vehicle.sticks.fresh(now) else NO_STICKS,
@@ -39,5 +39,5 @@ class TorqueInjection:
         for text in injector.said:
             vehicle.say(Severity.INFO, text)
         injector.said.clear()
-        self.situation.excited = injector.phase.published
+        self.state.excitation_phase = injector.phase.published
         return moment

@@ -65,7 +65,7 @@ def read_parameters(path: Path) -> dict[str, float]:
 
     Raises
     ------
-    TuningError
+    InputFileError
         When the file cannot be read.
     SitlError
         With the line, when the format is unknown, a name is invalid or repeated, or a value is not a finite float.

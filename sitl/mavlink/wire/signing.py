@@ -30,7 +30,7 @@ def read_key(path: Path) -> bytes:
 
     Raises
     ------
-    TuningError
+    InputFileError
         When the file cannot be read.
     SitlError
         When it holds no key.

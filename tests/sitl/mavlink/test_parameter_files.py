@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, NAME, parameter_text, read_parameters
-from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.parameters import PARAMETERS
 from pymavlink.mavparm import MAVParmDict
+
+from mimopilot.common.errors import InputFileError
 
 names = st.from_regex(NAME, fullmatch=True)
 #: -0.0 comes back as 0.0 by intention: zero has no sign here.
@@ -105,10 +106,10 @@ def test_a_file_of_ours_that_was_cut_or_changed_is_refused_at_every_byte(tmp_pat
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    with pytest.raises(TuningError, match=r"none\.params: cannot read"):
+    with pytest.raises(InputFileError, match=r"none\.params: cannot read"):
         read_parameters(tmp_path / "none.params")
     (tmp_path / "binary.params").write_bytes(bytes(range(128, 256)))
-    with pytest.raises(TuningError, match=r"binary\.params: cannot read"):
+    with pytest.raises(InputFileError, match=r"binary\.params: cannot read"):
         read_parameters(tmp_path / "binary.params")
 
 
