@@ -23,9 +23,9 @@ from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S,
 from mimopilot.sitl.mavlink.ground_station.upload import apply, read
 from mimopilot.sitl.mavlink.simulator_api import lockstep
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
-from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import ARMED, SimulatedVehicle
+from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import SimulatedVehicle
 from mimopilot.sitl.mavlink.wire.codec import Codec
-from mimopilot.sitl.mavlink.wire.fast_codec import SENSOR, FastCodec
+from mimopilot.sitl.mavlink.wire.fast_codec import ARMED, SENSOR, FastCodec
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY

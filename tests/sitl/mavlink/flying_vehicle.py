@@ -1,4 +1,4 @@
-"""A vehicle in the air that is not ours: it has an injector, tells of its flight, and something happens to it."""
+"""A scripted vehicle in the air, with an excitation injector, telemetry, and scheduled events."""
 
 from mimopilot.sitl.autopilot.excitation_injector import AXIS, Conditions, Injector
 from mimopilot.sitl.mavlink.ground_station.events import Attitude, Excited, Heartbeat, Landed, Request, Text, Value
@@ -11,8 +11,8 @@ TS = 0.02
 
 
 class FlyingVehicle(ScriptedVehicle):
-    """Hovers. `integers`: its whole numbers are INT32, as on a PX4; `then`: time (s) -> what happens then; `careless`:
-    its own injector stops for nothing."""
+    """Hovers. `integers`: its integer parameters are INT32, as on a PX4; `then`: time (s) -> event; `careless`: its
+    injector never aborts."""
 
     def __init__(self, integers=False, then=None, careless=False, **values):
         names = {setting.name: setting.default for setting in EXCITATION}
@@ -44,7 +44,7 @@ class FlyingVehicle(ScriptedVehicle):
         return super().answer(order)
 
     def tell(self, now):
-        """What it tells ten times a second."""
+        """Its telemetry, ten times a second."""
         for at in [at for at in self.then if at <= now]:
             self.then.pop(at)(self)
         while self.stepped < now:
@@ -68,5 +68,5 @@ class FlyingVehicle(ScriptedVehicle):
 
     @property
     def settings(self):
-        """Its parameters, but for the one that starts."""
+        """Its parameters, except the one that starts the excitation."""
         return {name: value for name, value in self.values.items() if name != AXIS}

@@ -1,4 +1,4 @@
-"""Parameter files: the same bits back, for us and for MAVProxy."""
+"""Parameter files: values read back bit for bit, by us and by MAVProxy."""
 
 import math
 import struct
@@ -15,7 +15,7 @@ from pymavlink.mavparm import MAVParmDict
 from mimopilot.common.errors import InputFileError
 
 names = st.from_regex(NAME, fullmatch=True)
-#: -0.0 comes back as 0.0 by intention: zero has no sign here.
+#: -0.0 is read back as 0.0 on purpose: zero has no sign here.
 floats32 = st.floats(width=32, allow_nan=False, allow_infinity=False).map(lambda v: v + 0.0)
 
 
@@ -26,7 +26,7 @@ def bits(value):
 @pytest.mark.parametrize("form", FORMATS)
 @given(values=st.dictionaries(names, floats32, min_size=1, max_size=30))
 @settings(deadline=None)
-def test_every_float_comes_back_with_the_same_bits(form, values, tmp_path_factory):
+def test_every_float_is_read_back_bit_for_bit(form, values, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / f"round.{form}"
     path.write_text(parameter_text(form, values))
     back = read_parameters(path)
@@ -44,7 +44,7 @@ def test_mavproxy_reads_the_same_bits(form, values, tmp_path_factory):
     assert {name: bits(value) for name, value in loaded.items()} == {name: bits(v) for name, v in values.items()}
 
 
-def test_a_value_that_six_digits_would_lose_is_kept(tmp_path):
+def test_a_value_that_needs_more_than_six_digits_is_kept(tmp_path):
     path = tmp_path / "small.parm"
     path.write_text(parameter_text("mavproxy", {"MIMO_RD_RP": 1.2345678e-8}))
     assert read_parameters(path) == {"MIMO_RD_RP": single(1.2345678e-8)}
@@ -56,7 +56,7 @@ def test_qgroundcontrols_five_columns_hold_the_vehicle_and_the_type():
     assert text.startswith("# ")
 
 
-def test_every_name_of_our_table_fits_a_file():
+def test_every_parameter_name_is_valid_in_a_file():
     assert all(NAME.fullmatch(p.name) for p in PARAMETERS)
 
 
@@ -78,7 +78,7 @@ def test_every_name_of_our_table_fits_a_file():
         ("1\t1\tMIMO_RP_RR\t0.12", "got '1"),
     ],
 )
-def test_a_file_that_is_none_is_refused_with_its_line(tmp_path, text, message):
+def test_an_invalid_file_is_refused_with_its_line(tmp_path, text, message):
     path = tmp_path / "x.params"
     path.write_text(text)
     with pytest.raises(SitlError, match=message):
@@ -86,11 +86,11 @@ def test_a_file_that_is_none_is_refused_with_its_line(tmp_path, text, message):
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_a_file_of_ours_that_was_cut_or_changed_is_refused_at_every_byte(tmp_path, form):
+def test_a_file_that_was_truncated_or_edited_is_refused(tmp_path, form):
     values = {p.name: single(0.001 * i + 0.1) for i, p in enumerate(PARAMETERS)}
     path = tmp_path / "x.params"
     text = parameter_text(form, values)
-    for size in range(len(text) - 1):  # without its last line end it is whole
+    for size in range(len(text) - 1):  # without its last newline it is still complete
         path.write_text(text[:size])
         with pytest.raises(SitlError, match=r"holds no parameters|incomplete|cut short"):
             read_parameters(path)
