@@ -118,9 +118,7 @@ def _parse_line(content: str, where: str) -> tuple[str, float]:
     else:
         fields = content.split(",") if "," in content else content.split()
     if len(fields) != 2 or not NAME.fullmatch(fields[0].strip()):
-        raise SitlError(
-            f"{where}: got {shown(content)}, expected a parameter name (at most 16 capitals) and its value"
-        )
+        raise SitlError(f"{where}: got {shown(content)}, expected a parameter name (at most 16 capitals) and its value")
     try:
         value = float(fields[1])
     except ValueError:
