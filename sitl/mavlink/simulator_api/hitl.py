@@ -14,14 +14,14 @@ import serial
 from mimopilot.sitl.autopilot.autopilot import MAX_ROTORS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import MAX_CATCH_UP_S, SimulatedVehicle
-from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS
+from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, READ_BYTES
 from pymavlink.dialects.v20 import common as mavlink
 
 STALE_S = 0.5  # s without commands after which the motors stop, as speed controllers do; chosen
 REOPEN_S = 0.5  # s between attempts to reopen a disconnected port; chosen
 HEARTBEAT_S = 1.0  # s, MAVLink's heartbeat interval
 WRITE_S = 1.0  # s, write timeout; chosen
-READ_BYTES = 65536
 
 
 class SerialPlant:
@@ -113,7 +113,7 @@ class SerialPlant:
         data = self.vehicle.pack_messages(estimate=False)
         if count % round(HEARTBEAT_S / self.vehicle.Ts) == 0:
             state = mavlink.MAV_STATE_ACTIVE
-            beat = (0, mavlink.MAV_TYPE_GENERIC, mavlink.MAV_AUTOPILOT_INVALID, 0, state, 3)
+            beat = (0, mavlink.MAV_TYPE_GENERIC, mavlink.MAV_AUTOPILOT_INVALID, 0, state, MAVLINK_VERSION)
             data = self.vehicle.codec.pack(mavlink.MAVLink_heartbeat_message, *beat) + data
         if select.select([], [self.port], [], 0)[1]:
             self.port.write(data * self.vehicle.copies)

@@ -11,7 +11,7 @@ import numpy as np
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
 from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
-from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, ARMED, LOCKSTEP, FastCodec, Message
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, ARMED, LOCKSTEP, READ_BYTES, FastCodec, Message
 from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK
 from numpy.typing import NDArray
 
@@ -154,7 +154,7 @@ class PlantLink:
         """
         assert self.socket is not None
         try:
-            data = self.socket.recv(65536)
+            data = self.socket.recv(READ_BYTES)
         except BlockingIOError:
             return []
         except OSError as error:

@@ -13,6 +13,7 @@ from mimopilot.sitl.autopilot.autopilot import MAX_ROTORS
 from mimopilot.sitl.faults.inject_plant import Injection
 from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.sitl.flight.simulator import Simulator
+from mimopilot.sitl.mavlink.wire.codec import SYSTEM
 from mimopilot.sitl.mavlink.wire.fast_codec import ARMED, GPS, SENSOR, STATE, FastCodec
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.sitl.physics.ground_contact import ground_state, touch
@@ -97,7 +98,7 @@ class SimulatedVehicle:
             self.simulator.history[:] = 0.0
         self.instruments = Instruments(self.simulator.state, self.Ts, self.seed)
         self.injection = Injection(self.faults, self.airframe, self.simulator, self.Ts, self.seed)
-        self.codec = FastCodec(1, mavlink.MAV_COMP_ID_USER1)
+        self.codec = FastCodec(SYSTEM, mavlink.MAV_COMP_ID_USER1)
         self.periods = self.flown = 0
         self.crashed = self.nonfinite_reported = False
         self.copies, self.gyro = 1, [0.0, 0.0, 0.0]

@@ -10,6 +10,7 @@ from typing import Any
 from mimopilot.sitl.autopilot.flight_modes import Mode
 from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, quaternions
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
+from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from pymavlink.dialects.v20 import common as mavlink
@@ -52,9 +53,8 @@ def heartbeat(s: VehicleState) -> Any:
         status = mavlink.MAV_STATE_BOOT
     elif vehicle.armed and vehicle.in_trouble:
         status = mavlink.MAV_STATE_CRITICAL
-    return mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_GENERIC, base, custom_mode(vehicle.mode), status, 3
-    )
+    kind, mode = (mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_GENERIC), custom_mode(vehicle.mode)
+    return mavlink.MAVLink_heartbeat_message(*kind, base, mode, status, MAVLINK_VERSION)
 
 
 def _sys_status(s: VehicleState) -> Any:

@@ -15,6 +15,7 @@ V1, V2 = mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2
 HEADER_BYTES: dict[int, int] = {V1: mavlink.HEADER_LEN_V1, V2: mavlink.HEADER_LEN_V2}
 SIGNED = mavlink.MAVLINK_IFLAG_SIGNED
 CRC_BYTES = 2  # CRC-16/MCRF4XX
+MAVLINK_VERSION = 3  # HEARTBEAT.mavlink_version of MAVLink 2
 MARKER = re.compile(b"[\xfd\xfe]")
 KINDS: dict[int, Any] = mavlink.mavlink_map
 EVERY = frozenset(KINDS)

@@ -30,6 +30,7 @@ MARK = bytes((mavlink.PROTOCOL_MARKER_V2,))
 HEADER = struct.Struct("<BBBBBBHB")  # length, 2 x flags, sequence, system, component, 3 bytes of message id
 HEADER_BYTES = len(MARK) + HEADER.size
 OVERHEAD = HEADER_BYTES + CRC_BYTES
+READ_BYTES = 65536  # read from a link at once; chosen
 SPIN_S = 200e-6  # s; chosen longer than a peer at full speed takes to answer
 
 Message = tuple[Any, tuple[Any, ...]]
@@ -122,7 +123,7 @@ def receive(connection: socket.socket, spin: float = 0.0) -> bytes | None:
     until = time.monotonic() + spin
     while True:
         try:
-            return connection.recv(65536)
+            return connection.recv(READ_BYTES)
         except BlockingIOError:
             if time.monotonic() >= until:
                 return None
