@@ -18,14 +18,15 @@ from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import doublet, excitation_flight
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.mavlink.ground_station.connection import Connection
-from mimopilot.sitl.mavlink.ground_station.events import run_exchange, single
+from mimopilot.sitl.mavlink.ground_station.events import run_exchange
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
 from mimopilot.sitl.mavlink.simulator_api import lockstep
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
-from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import ARMED, SimulatedVehicle
-from mimopilot.sitl.mavlink.wire.fast_codec import SENSOR, LeanCodec
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import SimulatedVehicle
+from mimopilot.sitl.mavlink.wire.codec import Codec
+from mimopilot.sitl.mavlink.wire.fast_codec import ARMED, SENSOR, FastCodec
+from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.sitl.studies.faults import standard_faults
@@ -76,7 +77,7 @@ def plant_rows(airframe: Airframe) -> list[list[str]]:
     """What one period costs the plant process, its body and its messages apart, and what lean messages save."""
     vehicle = SimulatedVehicle(airframe, TS, 0, 10.0, print)
     hover = [vehicle.simulator.plant.mass * GRAVITY / (4 * airframe.motors.thrust_max)] * 16
-    lean, generic, periods = LeanCodec(1, 1), Codec(), 2000
+    lean, generic, periods = FastCodec(1, 1), Codec(), 2000
 
     def repeat(work: Callable[[], object]) -> Callable[[], object]:
         return lambda: [work() for _ in range(periods)]

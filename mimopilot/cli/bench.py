@@ -351,7 +351,7 @@ def sitl(
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.faults.kinds import parse_fault
-    from mimopilot.sitl.mavlink.vehicle.sitl_console import Options, run
+    from mimopilot.sitl.mavlink.vehicle.sitl_console import SitlOptions, run
 
     body, controller = _load(airframe, gains)
     task, faults = None, tuple(map(parse_fault, fault or ()))
@@ -364,7 +364,8 @@ def sitl(
         raise SitlError("--port, --speed and --seed belong to the plant: with --plant, say them where it was started")
     address = _address(plant) if plant else None
     links = (ground_port, vehicle_port, tcp_port, bind, signing_key)
-    run(Options(airframe, body, controller, address, port, *links, parameters, _times(speed), seed, log, task, faults))
+    times = _times(speed)
+    run(SitlOptions(airframe, body, controller, address, port, *links, parameters, times, seed, log, task, faults))
 
 
 def plant(
@@ -388,7 +389,7 @@ def plant(
     from mimopilot.sitl.mavlink.simulator_api.hitl import SerialPlant
     from mimopilot.sitl.mavlink.simulator_api.plant_server import PlantServer
     from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import SimulatedVehicle
-    from mimopilot.sitl.mavlink.wire.link import LOOPBACK, listen
+    from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, listen
     from mimopilot.sitl.physics.airframe import load_airframe
 
     times = _times(speed)

@@ -1,1 +1,1 @@
-"""MAVLink: the wire, the simulated vehicle, the ground station, PX4's simulator API."""
+"""MAVLink: wire format, PX4's simulator API, the simulated vehicle, the ground station."""

@@ -31,8 +31,9 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     SetParameter,
     StatusText,
 )
-from mimopilot.sitl.mavlink.wire.link import Codec, udp_socket
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
+from mimopilot.sitl.mavlink.wire.sockets import udp_socket
 from pymavlink.dialects.v20 import common as mavlink
 
 #: System and component number that ground stations use.

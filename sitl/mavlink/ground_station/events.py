@@ -7,15 +7,13 @@ loses, duplicates and reorders messages.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Generator, Sequence
 from typing import NamedTuple, Protocol, TypeVar
 
-import numpy as np
-from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.mavlink.wire.float32 import REAL32
 
 #: MAV_PARAM_TYPE.
-INT32, REAL32 = 6, 9
+INT32 = 6
 #: MAV_COMP_ID_AUTOPILOT1.
 AUTOPILOT = 1
 #: MAV_CMD_PREFLIGHT_STORAGE.
@@ -221,31 +219,3 @@ def run_exchange(exchange: Exchange[T], link: Link) -> T:
     except StopIteration as end:
         result: T = end.value
         return result
-
-
-def single(value: float) -> float:
-    """`value` rounded to single precision, as a vehicle stores it; zero has no sign.
-
-    Raises
-    ------
-    SitlError
-        When it is not finite in single precision.
-    """
-    try:
-        rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
-    except OverflowError:
-        rounded = float("inf")
-    if not abs(rounded) < float("inf"):
-        raise SitlError(f"got {value}, expected a number that is finite in single precision")
-    return rounded + 0.0
-
-
-def shortest(value: float) -> str:
-    """Shortest decimal that reads back to float32(value).
-
-    Examples
-    --------
-    >>> shortest(0.1), shortest(-5.0), shortest(1e-7)
-    ('0.1', '-5.0', '1e-07')
-    """
-    return str(np.float32(value))

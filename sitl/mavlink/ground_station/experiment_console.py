@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 import typer
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import shortest, single
 from mimopilot.sitl.mavlink.ground_station.experiment import (
     INTEGERS,
     NAMES,
@@ -20,6 +19,7 @@ from mimopilot.sitl.mavlink.ground_station.experiment import (
     start_monitor,
 )
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
+from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES
 from mimopilot.tuning.excitation import hold_from_bandwidth
 from mimopilot.tuning.parameters import EXCITATION

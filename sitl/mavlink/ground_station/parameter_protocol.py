@@ -16,7 +16,6 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     FAILED,
     IN_PROGRESS,
     INT32,
-    REAL32,
     REASONS,
     STORAGE_COMMAND,
     CommandAck,
@@ -27,9 +26,9 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     ReadParameter,
     SetParameter,
     StoreParameters,
-    shortest,
 )
 from mimopilot.sitl.mavlink.ground_station.vehicle_contact import FRESH_S, TRIES, TRY_S, VehicleContact
+from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest
 
 #: Largest number of pending requests; chosen.
 WINDOW = 10

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import single
+from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import (

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Literal, Protocol
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import Heartbeat, shortest
+from mimopilot.sitl.mavlink.ground_station.events import Heartbeat
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S
 from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, violated_range
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
 from mimopilot.sitl.mavlink.ground_station.upload import UploadOutcome, write_and_verify
+from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.gains import Gains, Triple

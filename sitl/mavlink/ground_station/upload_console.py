@@ -9,11 +9,12 @@ from typing import Literal
 
 import typer
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import Heartbeat, shortest
+from mimopilot.sitl.mavlink.ground_station.events import Heartbeat
 from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
 from mimopilot.sitl.mavlink.ground_station.transaction import STORAGE, Upload, upload_and_verify
 from mimopilot.sitl.mavlink.ground_station.upload import SMALLEST_CHANGE
+from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.tuning.gains import Gains, Triple
 
 from mimopilot.common.console import print_json, print_table

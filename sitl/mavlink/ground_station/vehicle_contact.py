@@ -22,8 +22,8 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     ParameterValue,
     RequestMessage,
     SendAndWait,
-    shortest,
 )
+from mimopilot.sitl.mavlink.wire.float32 import shortest
 
 #: Wait for an answer to one try (s), number of tries. At 30 % loss each way 24 tries lose 1 exchange in 10^7.
 TRY_S, TRIES = 0.5, 24

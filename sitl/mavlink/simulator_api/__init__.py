@@ -1,1 +1,1 @@
-"""PX4's simulator API: the plant as a process of its own, and the autopilot's end of it."""
+"""PX4's simulator API: the plant as a separate process, and the autopilot's end of the link."""

@@ -1,7 +1,7 @@
-"""Hardware in the loop: the same vehicle for a real board on a serial port, in real time.
+"""Hardware in the loop: the simulated vehicle for a real board on a serial port, in real time.
 
-A board does not answer frame by frame: the plant steps by the wall clock, under the latest motor commands.
-HIL_STATE_QUATERNION is left out, because PX4 on a board takes it for its own estimate.
+A board does not answer frame by frame, so the plant steps by the wall clock, under the latest motor commands.
+HIL_STATE_QUATERNION is not sent, because PX4 on a board would use it as its own estimate.
 """
 
 from __future__ import annotations
@@ -12,24 +12,25 @@ from typing import Any
 
 import serial
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import FORGET_S, SimulatedVehicle
-from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS
+from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import MAX_CATCH_UP_S, SimulatedVehicle
+from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, READ_BYTES
 from mimopilot.sitl.physics.rigid_body import MAX_ROTORS
 from pymavlink.dialects.v20 import common as mavlink
 
-STALE_S = 0.5  # speed controllers stop their motors without commands for so long
-RETRY_S = 0.5  # between tries to open a port that went away
-HEARTBEAT_S = 1.0
-WRITE_S = 1.0
+STALE_S = 0.5  # s without commands after which the motors stop, as speed controllers do; chosen
+REOPEN_S = 0.5  # s between attempts to reopen a disconnected port; chosen
+HEARTBEAT_S = 1.0  # s, MAVLink's heartbeat interval
+WRITE_S = 1.0  # s, write timeout; chosen
 
 
 class SerialPlant:
-    """Serves a vehicle to a board.
+    """Serves a simulated vehicle to a board.
 
     Parameters
     ----------
     vehicle : SimulatedVehicle
-        Put back at its start whenever the board goes away.
+        Reset to its start whenever the board disconnects.
     url : str
         ``DEVICE,BAUD``.
 
@@ -48,20 +49,22 @@ class SerialPlant:
         try:
             self.port = self._open()
         except (OSError, ValueError) as error:
-            raise SitlError(f"--serial {url}: cannot be opened: {error}", exit_code=1) from error
+            raise SitlError(
+                f"--serial {url}: cannot be opened: {error}; is the board connected?", exit_code=1
+            ) from error
 
     def _open(self) -> Any:
         return serial.Serial(self.device, self.baud, timeout=0, write_timeout=WRITE_S, exclusive=True)
 
     def serve(self) -> None:
-        """Fly for ever; a board that goes away (they do when they reboot) may come back."""
+        """Serve for ever; a board that disconnects (they do when they reboot) may reconnect."""
         while True:
             try:
                 self._fly()
             except OSError:
                 self.port.close()
                 self.vehicle.restart()
-                self.vehicle.tell(f"{self.device} went away; the vehicle is back at its start until it returns")
+                self.vehicle.report(f"{self.device} disconnected; the vehicle is reset to its start")
             self._reopen()
 
     def _reopen(self) -> None:
@@ -70,7 +73,7 @@ class SerialPlant:
                 self.port = self._open()
                 return
             except OSError:
-                time.sleep(RETRY_S)
+                time.sleep(REOPEN_S)
 
     def _fly(self) -> None:
         vehicle = self.vehicle
@@ -80,37 +83,37 @@ class SerialPlant:
         while True:
             self._write(count)
             now = time.monotonic()
-            for kind, fields in vehicle.codec.parse(self.port.read(65536)):
+            for kind, fields in vehicle.codec.parse(self.port.read(READ_BYTES)):
                 if kind is ACTUATORS:
                     controls, mode, heard = fields[2:18], fields[18], now
             if heard < 0:
-                vehicle.stand()
+                vehicle.hold()
             else:
                 if stale != (now - heard > STALE_S):
                     stale = not stale
-                    self._tell_stale(stale)
+                    self._report_stale(stale)
                 vehicle.fly(controls, 0 if stale else mode)
             count += 1
             ahead = begin + count * vehicle.Ts - time.monotonic()
             if ahead > 0:
                 time.sleep(ahead)
-            elif ahead < -FORGET_S:
-                vehicle.tell(f"late by {-ahead:.2f} s, which is left out: this machine is too busy for real time")
+            elif ahead < -MAX_CATCH_UP_S:
+                vehicle.report(f"late by {-ahead:.2f} s, not caught up: this machine is too busy for real time")
                 begin, count = time.monotonic(), 0
 
-    def _tell_stale(self, stale: bool) -> None:
+    def _report_stale(self, stale: bool) -> None:
         when = f"at {self.vehicle.seconds:.2f} s of flight"
         if stale:
-            self.vehicle.tell(f"no motor commands from the board for {STALE_S:g} s, {when}: the motors stop")
+            self.vehicle.report(f"no motor commands from the board for {STALE_S:g} s, {when}: the motors stop")
         else:
-            self.vehicle.tell(f"motor commands come again, {when}")
+            self.vehicle.report(f"motor commands resumed, {when}")
 
     def _write(self, count: int) -> None:
-        """Send what is due; a board that does not read misses it."""
-        data = self.vehicle.messages(estimate=False)
+        """Send the messages of this period; a board that does not read misses them."""
+        data = self.vehicle.pack_messages(estimate=False)
         if count % round(HEARTBEAT_S / self.vehicle.Ts) == 0:
             state = mavlink.MAV_STATE_ACTIVE
-            beat = (0, mavlink.MAV_TYPE_GENERIC, mavlink.MAV_AUTOPILOT_INVALID, 0, state, 3)
+            beat = (0, mavlink.MAV_TYPE_GENERIC, mavlink.MAV_AUTOPILOT_INVALID, 0, state, MAVLINK_VERSION)
             data = self.vehicle.codec.pack(mavlink.MAVLink_heartbeat_message, *beat) + data
         if select.select([], [self.port], [], 0)[1]:
             self.port.write(data * self.vehicle.copies)

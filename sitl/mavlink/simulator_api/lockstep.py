@@ -1,4 +1,4 @@
-"""A scenario flown over MAVLink: the plant is another process, the flight the in-process one bit for bit."""
+"""A scenario flown over MAVLink in lockstep with a plant process, bit for bit as in one process."""
 
 from __future__ import annotations
 
@@ -11,21 +11,24 @@ from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState, actuator_controls
-from mimopilot.sitl.mavlink.wire.fast_codec import SPIN_S, STATE, LeanCodec, receive
-from mimopilot.sitl.mavlink.wire.link import COMPONENT, LOOPBACK, SYSTEM
+from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
+from mimopilot.sitl.mavlink.wire.fast_codec import SPIN_S, STATE, FastCodec, receive
+from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK
 from mimopilot.sitl.physics.state_estimate import MEASUREMENT_SIZE
 from numpy.typing import NDArray
 
+CONNECT_S = 10.0  # s, timeout of the connection; chosen
+
 
 def fly(autopilot: Autopilot, scenario: Scenario, port: int) -> NDArray[Any]:
-    """Fly a scenario on a plant of this machine, from its first frame on.
+    """Fly a scenario with a plant process on this machine, from its first frame.
 
     Parameters
     ----------
     autopilot : Autopilot
-        A fresh one.
+        A newly made one.
     scenario : Scenario
-        Set-points and excitation.
+        Setpoints and excitation.
     port : int
         TCP port of the plant.
 
@@ -36,25 +39,30 @@ def fly(autopilot: Autopilot, scenario: Scenario, port: int) -> NDArray[Any]:
     Raises
     ------
     SitlError
-        When there is no plant, or it goes away before the end.
+        When there is no plant, or it disconnects before the end.
     """
     try:
-        plant = socket.create_connection((LOOPBACK, port), timeout=10.0)
+        plant = socket.create_connection((LOOPBACK, port), timeout=CONNECT_S)
     except OSError as error:
-        raise SitlError(f"no plant on TCP port {port}: {error}", exit_code=1) from error
+        raise SitlError(
+            f"no plant on TCP port {port}: {error}; start one: mimopilot plant --port {port}", exit_code=1
+        ) from error
     with plant:
         plant.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         record = np.zeros(len(scenario.setpoint), RECORD)
         record["setpoint"], record["excitation"] = scenario.setpoint, scenario.excitation
         count = _exchange(autopilot, plant, record)
     if count < len(record):
-        raise SitlError(f"the plant went away after {count} of {len(record)} periods", exit_code=1)
+        raise SitlError(f"the plant disconnected after {count} of {len(record)} periods", exit_code=1)
     return record
 
 
 def _exchange(autopilot: Autopilot, plant: socket.socket, record: NDArray[Any]) -> int:
-    """Answer frames until the record is full; how many periods were flown. A repeated frame is answered, not flown."""
-    codec, measurement = LeanCodec(SYSTEM, COMPONENT), np.zeros(MEASUREMENT_SIZE)
+    """Answer frames until the record is full; return the number of periods flown.
+
+    A repeated frame is answered, but not flown.
+    """
+    codec, measurement = FastCodec(SYSTEM, COMPONENT), np.zeros(MEASUREMENT_SIZE)
     count, stamp, answer = 0, -1, b""
     plant.setblocking(False)
     while count < len(record):

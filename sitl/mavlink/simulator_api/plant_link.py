@@ -1,4 +1,4 @@
-"""The connection to a plant: made, lost, and made again, without ever waiting for it."""
+"""The autopilot's TCP link to a plant: connects, and reconnects when the plant is lost, without blocking."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
-from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, LeanCodec, Message
-from mimopilot.sitl.mavlink.wire.link import COMPONENT, LOOPBACK, SYSTEM
+from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, ARMED, LOCKSTEP, READ_BYTES, FastCodec, Message
+from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK
 from numpy.typing import NDArray
 
-RETRY_S = 0.2  # between tries to connect
-RESTART_S = 1.0  # between tries to start a child
-ARMED = 128
-LOCKSTEP = 1
+RETRY_S = 0.2  # s between attempts to connect; chosen
+RESTART_S = 1.0  # s between attempts to start the plant process; chosen
 
 
 class PlantState(NamedTuple):
-    """HIL_STATE_QUATERNION: us, rad/s, 1e-7 deg, mm, cm/s, cm/s, mG."""
+    """HIL_STATE_QUATERNION: time us, rates rad/s, position 1e-7 deg and mm, velocity cm/s, acceleration mG."""
 
     stamp: int
     qw: float
@@ -44,13 +43,13 @@ class PlantState(NamedTuple):
     az: int
 
     def measure(self, out: NDArray[np.float64]) -> None:
-        """Fill a measurement as `sitl.physics.state_estimate` has it, (9,)."""
+        """Fill a measurement, (9,), laid out as in `sitl.physics.state_estimate`."""
         out[:7] = self[1:8]
         out[7], out[8] = self.alt, -self.vz
 
 
-def actuator_controls(codec: LeanCodec, stamp: int, commands: NDArray[np.float32], armed: bool) -> bytes:
-    """HIL_ACTUATOR_CONTROLS: motor commands, (16,) thrust fractions, for the frame of a time (us)."""
+def actuator_controls(codec: FastCodec, stamp: int, commands: NDArray[np.float32], armed: bool) -> bytes:
+    """HIL_ACTUATOR_CONTROLS in answer to the frame of time `stamp`, us: motor commands, (16,) thrust fractions."""
     return codec.pack(ACTUATORS, stamp, LOCKSTEP, *commands.tolist(), ARMED if armed else 0)
 
 
@@ -60,7 +59,7 @@ class PlantLink:
     Parameters
     ----------
     plant : PlantProcess or (host, port)
-        A child of ours, started when it does not run; or somebody else's plant.
+        Our own process, started when it does not run; or the address of a plant started elsewhere.
 
     Attributes
     ----------
@@ -72,23 +71,23 @@ class PlantLink:
         self.child = plant if isinstance(plant, PlantProcess) else None
         self.address = None if isinstance(plant, PlantProcess) else plant
         self.socket: socket.socket | None = None
-        self.codec = LeanCodec(SYSTEM, COMPONENT)
+        self.codec = FastCodec(SYSTEM, COMPONENT)
         self._connecting: socket.socket | None = None
         self._next = 0.0
 
     @property
     def place(self) -> str:
-        """Where the plant is."""
-        host, port = self.address or (LOOPBACK, self.child.port() if self.child else None)
+        """Address of the plant, for messages."""
+        host, port = self.address or (LOOPBACK, self.child.poll_port() if self.child else None)
         return f"TCP {host}:{port}"
 
     def connect(self, now: float) -> bool:
-        """Go on connecting; True once there is a connection. `now` is a monotonic time in s.
+        """Continue connecting; True once connected. `now` is a monotonic time in s.
 
         Raises
         ------
         SitlError
-            When the child ended instead of listening; calling again starts it anew.
+            When our plant process ended instead of listening; the next call restarts it.
         """
         if self.socket is not None:
             return True
@@ -109,7 +108,7 @@ class PlantLink:
         if self.child.child is None:
             self.child.start()
         try:
-            return self.child.port()
+            return self.child.poll_port()
         except SitlError:
             self.child.end()
             self._next = now + RESTART_S
@@ -125,7 +124,9 @@ class PlantLink:
                 return
             link.close()
         except OSError as error:
-            raise SitlError(f"no plant at {address[0]}:{address[1]}: {error.strerror or error}") from error
+            raise SitlError(
+                f"no plant at {address[0]}:{address[1]}: {error.strerror or error}; correct --plant"
+            ) from error
         self._next = now + RETRY_S
 
     def _finish(self, now: float) -> bool:
@@ -137,23 +138,23 @@ class PlantLink:
             link.close()
             self._next = now + RETRY_S
             if self.child is not None and not self.child.alive:
-                self.child.end()  # so that it is started again
+                self.child.end()  # so that the next call restarts it
             return False
-        self.codec = LeanCodec(SYSTEM, COMPONENT)
+        self.codec = FastCodec(SYSTEM, COMPONENT)
         self.socket = link
         return True
 
     def receive(self) -> list[Message]:
-        """Messages that have arrived.
+        """Read the messages that have arrived.
 
         Raises
         ------
         ConnectionError
-            When the plant is gone; `connect` then finds it again.
+            When the plant disconnected; `connect` then reconnects.
         """
         assert self.socket is not None
         try:
-            data = self.socket.recv(65536)
+            data = self.socket.recv(READ_BYTES)
         except BlockingIOError:
             return []
         except OSError as error:
@@ -165,7 +166,7 @@ class PlantLink:
         return self.codec.parse(data)
 
     def answer(self, stamp: int, commands: NDArray[np.float32], armed: bool) -> None:
-        """Motor commands for the frame of a time; a plant that is gone is noticed when its next frame is awaited."""
+        """Send motor commands for the frame of time `stamp`, us; `receive` notices a plant that disconnected."""
         if self.socket is None:
             return
         try:
@@ -180,7 +181,7 @@ class PlantLink:
             self.socket = None
 
     def close(self) -> None:
-        """Leave the plant, and end our child."""
+        """Disconnect, and end our plant process."""
         self.drop()
         if self._connecting is not None:
             self._connecting.close()

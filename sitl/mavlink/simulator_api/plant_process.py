@@ -1,4 +1,4 @@
-"""The plant as a child of the autopilot host: started, watched, started again, and never left behind."""
+"""The plant as a child process of the autopilot host: start, monitor, end."""
 
 from __future__ import annotations
 
@@ -12,11 +12,15 @@ from contextlib import contextmanager
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import Fault
 
-START_SECONDS = 120.0  # the first time everything is compiled
+START_S = 120.0  # s; chosen: the first start compiles everything
+END_S = 2.0  # s from terminating the process to killing it; chosen
+POLL_S = 0.02  # s between looks for its port while it starts; chosen
 
 
 class PlantProcess:
-    """`mimopilot plant` as a child; it ends when its standard input closes, so also when this process is killed.
+    """`mimopilot plant` as a child process.
+
+    It ends when its standard input closes, so also when this process is killed.
 
     Parameters
     ----------
@@ -27,11 +31,11 @@ class PlantProcess:
     Ts : float, s
         Period of its frames.
     seed : int
-        Of its noise.
+        Seed of its noise.
     speed : float or None
         Times real time; None: as fast as it is answered.
     altitude : float, m
-        Where it starts, hovering; 0: on the ground, rotors standing.
+        Initial hover altitude; 0: on the ground, rotors stopped.
     faults : sequence of Fault
         Of the plant and of its link, see `sitl.mavlink.simulator_api.simulated_vehicle.SimulatedVehicle`.
     """
@@ -55,11 +59,11 @@ class PlantProcess:
 
     def _forget(self) -> None:
         self._rest = b""
-        self._said: list[str] = []
+        self._messages: list[str] = []
         self._port: int | None = None
 
     def start(self) -> None:
-        """Start it; whatever ran before is ended."""
+        """Start the process; a running one is ended first."""
         self.end()
         self._forget()
         self.child = subprocess.Popen(
@@ -70,11 +74,11 @@ class PlantProcess:
 
     @property
     def alive(self) -> bool:
-        """Whether it runs."""
+        """Whether the process runs."""
         return self.child is not None and self.child.poll() is None
 
-    def _listen(self) -> None:
-        """Take what it has said since."""
+    def _read_output(self) -> None:
+        """Read the new lines of its output: its port, or messages for the user."""
         assert self.child is not None and self.child.stdout is not None
         *lines, self._rest = (self._rest + (self.child.stdout.read() or b"")).split(b"\n")
         for line in lines:
@@ -82,47 +86,50 @@ class PlantProcess:
             if "listens on" in text:
                 self._port = int(text.rsplit(":", 1)[1])
             else:
-                self._said.append(text)
+                self._messages.append(text)
 
-    def port(self) -> int | None:
-        """The TCP port on which it listens; None while it starts.
+    def poll_port(self) -> int | None:
+        """Read its output, and return the TCP port on which it listens; None while it starts.
 
         Raises
         ------
         SitlError
-            When it has ended without listening, with its own last words.
+            When it ended without listening, with its last message.
         """
         assert self.child is not None
         alive = self.alive
-        self._listen()
+        self._read_output()
         if self._port is None and not alive:
-            words = self._said[-1] if self._said else "the plant process ended without a word"
-            raise SitlError(words, self.child.returncode or 1)
+            last = "the plant process ended without a message; run `mimopilot plant` by itself to see why"
+            raise SitlError(self._messages[-1] if self._messages else last, self.child.returncode or 1)
         return self._port
 
-    def news(self) -> list[str]:
-        """What it has said since the last call, line by line."""
+    def take_messages(self) -> list[str]:
+        """Read its output, and return the messages since the last call, line by line."""
         if self.child is not None:
-            self._listen()
-        said, self._said = self._said, []
-        return said
+            self._read_output()
+        taken, self._messages = self._messages, []
+        return taken
 
     def wait(self) -> int:
-        """The port, as soon as it listens; raises as `port`."""
-        deadline = time.monotonic() + START_SECONDS
-        while (listening := self.port()) is None:
+        """Wait until it listens, and return the port; raises as `poll_port`."""
+        deadline = time.monotonic() + START_S
+        while (listening := self.poll_port()) is None:
             if time.monotonic() > deadline:
-                raise SitlError(f"the plant process did not start within {START_SECONDS:g} s", exit_code=1)
-            time.sleep(0.02)
+                raise SitlError(
+                    f"the plant process did not start within {START_S:g} s; run `mimopilot plant` by itself to see why",
+                    exit_code=1,
+                )
+            time.sleep(POLL_S)
         return listening
 
     def end(self) -> None:
-        """End it."""
+        """End the process."""
         if self.child is None:
             return
         self.child.terminate()
         try:
-            self.child.wait(timeout=2)
+            self.child.wait(timeout=END_S)
         except subprocess.TimeoutExpired:
             self.child.kill()
             self.child.wait()
@@ -142,12 +149,12 @@ def plant_process(
     altitude: float = 10.0,
     faults: Sequence[Fault] = (),
 ) -> Iterator[int]:
-    """Run a plant for as long as a block lasts; yields the port that it listens on. Arguments as `PlantProcess`.
+    """Run a plant for the duration of a block; yields its port. Parameters as `PlantProcess`.
 
     Raises
     ------
     SitlError
-        When it does not come up, with its own message.
+        When it does not start, with its own message.
     """
     process = PlantProcess(airframe, port, Ts, seed, speed, altitude, faults)
     process.start()

@@ -1,1 +1,1 @@
-"""The simulated vehicle as ground stations see it."""
+"""The vehicle's MAVLink side: autopilot host, commands, parameters, setpoints, telemetry, ground stations."""

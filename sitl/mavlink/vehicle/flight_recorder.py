@@ -1,4 +1,4 @@
-"""The log of a vehicle that is flown by others: each flight, from arming to disarming, at full rate."""
+"""Flight recorder of the SITL vehicle: one log a flight, from arming to disarming, at the control rate."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from mimopilot.common.files import write_atomically
 
-BLOCK = 15_000  # rows, a minute
+BLOCK = 15_000  # rows allocated at once: one minute at 250 Hz
 
 
 @dataclass(frozen=True)
-class _Flight:
-    """A flight that has ended: its file, its records, (N,), whether it stood on the ground, and its gains, (36,)."""
+class _RecordedFlight:
+    """A flight that has ended: its file, its records, (N,), whether it was landed, (N,), and its gains, (36,)."""
 
     path: Path
     record: NDArray[Any]
@@ -30,15 +30,15 @@ class _Flight:
     gains: NDArray[np.float32]
 
 
-class FlightLog:
+class FlightRecorder:
     """Writes FILE.ulg for the first flight, FILE-2.ulg for the second, and so on.
 
-    A flight that cannot be written (a full disk) keeps its number and is kept until it can.
+    A flight that cannot be written, as on a full disk, keeps its number and is written later.
 
     Parameters
     ----------
     path : Path
-        Of the first.
+        File of the first flight.
     airframe : Airframe
         The vehicle.
     Ts : float, s
@@ -47,21 +47,21 @@ class FlightLog:
     Attributes
     ----------
     flights : int
-        How many have ended.
+        Number of flights that have ended.
 
     Raises
     ------
     SitlError
-        When nothing can be written there.
+        When no file can be written there.
     """
 
     def __init__(self, path: Path, airframe: Airframe, Ts: float) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir() or not os.access(path.parent, os.W_OK):
-            raise SitlError(f"--log {path}: a file cannot be written there")
+            raise SitlError(f"--log {path}: a file cannot be written there; name a file in a folder of yours")
         self.path, self.airframe, self.Ts = path, airframe, Ts
         self.flights = 0
-        self._waiting: list[_Flight] = []
+        self._unsaved: list[_RecordedFlight] = []
         self._spare: NDArray[Any] = np.zeros(1, RECORD)
         self._forget()
 
@@ -71,12 +71,12 @@ class FlightLog:
         self._gains: NDArray[np.float32] | None = None
 
     def begin(self, gains: NDArray[np.float32]) -> None:
-        """A flight begins, under these gains, (36,)."""
+        """Begin a flight, with these gains, (36,)."""
         self._forget()
         self._gains = gains.copy()
 
-    def row(self, vehicle: Commander) -> Any:
-        """The record of the next period, of `sitl.autopilot.autopilot.RECORD`, to be filled."""
+    def next_row(self, vehicle: Commander) -> Any:
+        """Append a record, of `sitl.autopilot.autopilot.RECORD`, for the next period; the caller fills it."""
         if self._gains is None:
             return self._spare[0]
         place = len(self._landed) % BLOCK
@@ -88,31 +88,31 @@ class FlightLog:
     @property
     def unsaved(self) -> list[Path]:
         """Files of the flights that could not be written yet."""
-        return [flight.path for flight in self._waiting]
+        return [flight.path for flight in self._unsaved]
 
     def save(self) -> list[Path]:
-        """The flight ends: write it, and those that could not be written before.
+        """End the flight; write it and those that could not be written before.
 
         Returns
         -------
         list of Path
-            What was written.
+            Files written.
 
         Raises
         ------
         OSError
-            When a file cannot be written; its flight and the later ones are kept for the next time.
+            When a file cannot be written; its flight and the later ones are kept for the next call.
         """
         if self._gains is not None and self._landed:
             self.flights += 1
             name = self.path if self.flights == 1 else self.path.with_stem(f"{self.path.stem}-{self.flights}")
             record = np.concatenate(self._blocks)[: len(self._landed)]
-            self._waiting.append(_Flight(name, record, np.array(self._landed), self._gains))
+            self._unsaved.append(_RecordedFlight(name, record, np.array(self._landed), self._gains))
         self._forget()
         written = []
-        while self._waiting:
-            flight = self._waiting[0]
+        while self._unsaved:
+            flight = self._unsaved[0]
             content = vehicle_log(flight.record, flight.landed, self.Ts, self.airframe, flight.gains)
             write_atomically(flight.path, content)
-            written.append(self._waiting.pop(0).path)
+            written.append(self._unsaved.pop(0).path)
         return written

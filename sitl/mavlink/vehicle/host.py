@@ -1,4 +1,4 @@
-"""The autopilot host: runs the compiled controller against a plant, and is a vehicle for ground stations."""
+"""The autopilot host: runs the compiled controller against a plant, and serves ground stations as a vehicle."""
 
 from __future__ import annotations
 
@@ -16,26 +16,29 @@ from mimopilot.sitl.autopilot.vertical import Estimate
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_autopilot import AutopilotFaults
 from mimopilot.sitl.flight.scripted_pilot import ScriptedPilot
-from mimopilot.sitl.mavlink.simulator_api.lateness import Lateness
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantLink, PlantState
-from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
-from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
-from mimopilot.sitl.mavlink.vehicle.situation import Situation
+from mimopilot.sitl.mavlink.simulator_api.response_times import ResponseTimes
+from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightRecorder
+from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.fast_codec import GPS, SENSOR, STATE
 from mimopilot.sitl.physics.state_estimate import MEASUREMENT_SIZE, euler_angles
 from mimopilot.tuning.parameters import PARAMETERS
 from numpy.typing import NDArray
 
-SILENT_S = 0.9  # a plant that says nothing for so long is said to be silent
-GROUND_S = 0.002  # between looks at what ground stations say; they wake nobody
-NEWS_S = 0.2  # between looks at what our own plant tells
-TURN_S = 0.01  # longest wait for anything
-CLOCK_BACK_US = 1_000_000  # a plant whose time goes back by more has started anew
-EXAMINED = 250  # periods between examinations of what forbids arming
-REPEATED_S = 1.0  # the same text is told no more often
+# All chosen:
+PLANT_TIMEOUT_S = 0.9  # s without a frame before it is reported: within one second
+GROUND_PERIOD_S = 0.002  # s between reads of the ground stations' links, which are polled, not waited for
+CHILD_PERIOD_S = 0.2  # s between reads of our own plant process's messages
+MAX_SLEEP_S = 0.01  # s, longest wait for a frame
+CLOCK_BACK_US = 1_000_000  # us; a plant whose clock goes back by more has restarted
+CHECK_PERIODS = 250  # control periods between pre-arm checks of the controller: one second at 250 Hz
+PERIOD_TOLERANCE = 0.02  # relative deviation of the plant's period from the gains' that forbids arming
+REPEAT_S = 1.0  # s, least interval between two equal texts
+MAX_TEXTS = 100  # texts remembered for it
 
-#: Moment to inject in a period, (3,); called with the vehicle's clock, s.
-Excitation = Callable[[float], Sequence[float]]
+#: Torque (normalised) to inject in a period, (3,); called with the vehicle's clock, s.
+TorqueSource = Callable[[float], Sequence[float]]
 
 
 class Host:
@@ -44,79 +47,79 @@ class Host:
     Parameters
     ----------
     autopilot : Autopilot
-        The controller and what surrounds it.
+        The controller with estimator and mixer.
     plant : PlantLink
-        Where the body is.
-    log : FlightLog or None
-        Where flights are recorded.
+        Link to the plant.
+    log : FlightRecorder or None
+        Recorder of the flights.
 
     Attributes
     ----------
     vehicle : Commander
-    situation : Situation
-        What telemetry shows.
+    state : VehicleState
+        What telemetry is made from.
     excitation : callable
-        May be replaced.
+        Torque source; may be replaced.
     pilot : ScriptedPilot or None
         Flies in place of a ground station.
     faults : AutopilotFaults or None
-        Of this autopilot, in seconds from the first frame of a plant.
-    lateness : Lateness
-        How long frames of the plant wait.
+        Faults of this autopilot, in seconds from the first frame of a plant.
+    response_times : ResponseTimes
+        Response times to frames of the plant.
     """
 
-    def __init__(self, autopilot: Autopilot, plant: PlantLink, log: FlightLog | None = None) -> None:
+    def __init__(self, autopilot: Autopilot, plant: PlantLink, log: FlightRecorder | None = None) -> None:
         self.autopilot, self.plant, self.log = autopilot, plant, log
         autopilot.controls["armed"] = 0
         self.vehicle = Commander(autopilot.hover)
         self.vehicle.arming_blockers["plant"] = "no plant is connected"
-        self.situation = Situation(self.vehicle)
-        self.excitation: Excitation = lambda now: (0.0, 0.0, 0.0)
+        self.state = VehicleState(self.vehicle)
+        self.excitation: TorqueSource = lambda now: (0.0, 0.0, 0.0)
         self.pilot: ScriptedPilot | None = None
         self.faults: AutopilotFaults | None = None
-        self.lateness = Lateness()
+        self.response_times = ResponseTimes()
         self.measurement = np.zeros(MEASUREMENT_SIZE)
-        euler_angles(*self.measurement[:4])  # compiled now, not in flight
+        euler_angles(*self.measurement[:4])  # compile now, not in flight
         self.stamp = self._zero = -1
         self.rows: NDArray[Any] = np.zeros(1, RECORD)
         self.fixed = autopilot.loop
-        self.heard = self._news = self._turn = 0.0
+        self.heard = self._next_child_read = self._next_ground_read = 0.0
         self._connected = False
-        self._periods = self._examined = self._first = 0
-        self._told: dict[str, float] = {}
+        self._periods = self._checked = self._first = 0
+        self._sent_texts: dict[str, float] = {}
 
     def reboot(self) -> None:
-        """Leave the plant and come back as another autopilot: it is put back at its start."""
+        """Reconnect to the plant as a new autopilot: the plant resets the vehicle to its start."""
         self.plant.drop()
-        self._lose("the vehicle starts again")
+        self._plant_lost("the vehicle reboots")
 
-    def run(self, ground: Ground) -> None:
+    def run(self, ground: GroundStationLink) -> None:
         """Fly and serve ground stations, for ever or until `pilot` is done.
 
-        The plant comes first, and is found again when it goes away.
+        The plant is served first. If it disconnects, the host reconnects.
         """
         gc.collect()
-        gc.freeze()  # or looking through all that was imported would take 70 ms of a flight, now and then
+        gc.freeze()  # otherwise a collection over all imported modules takes 70 ms of a flight, measured
         while self.pilot is None or not self.pilot.done:
             now = time.monotonic()
             self._connect(now)
             if self._wait():
                 self._fly()
-            elif self._connected and now > self.heard + SILENT_S and "plant" not in self.vehicle.arming_blockers:
-                self.vehicle.arming_blockers["plant"] = f"the plant has been silent for {SILENT_S:g} s"
+            elif self._connected and now > self.heard + PLANT_TIMEOUT_S and "plant" not in self.vehicle.arming_blockers:
+                self.vehicle.arming_blockers["plant"] = f"no frame from the plant for {PLANT_TIMEOUT_S:g} s"
                 self.vehicle.say(Severity.CRITICAL, self.vehicle.arming_blockers["plant"])
-            if now >= self._turn:
-                self._turn = now + GROUND_S
+            if now >= self._next_ground_read:
+                self._next_ground_read = now + GROUND_PERIOD_S
                 ground.receive(now)
-            self._pass_on(now)
-            self._tell(ground, now)
+            self._forward_child_messages(now)
+            self._send_texts(ground, now)
             ground.send(now)
 
-    def _pass_on(self, now: float) -> None:
-        """What our own plant tells, such as a crash."""
-        if self.plant.child is not None and now >= self._news:
-            self._news = now + NEWS_S
-            for text in self.plant.child.news():
+    def _forward_child_messages(self, now: float) -> None:
+        """Forward the messages of our own plant process, such as a crash."""
+        if self.plant.child is not None and now >= self._next_child_read:
+            self._next_child_read = now + CHILD_PERIOD_S
+            for text in self.plant.child.take_messages():
                 self.vehicle.say(Severity.WARNING, text)
 
     def _connect(self, now: float) -> None:
@@ -131,61 +134,61 @@ class Host:
             self._begin(now)
 
     def _begin(self, now: float) -> None:
-        """A plant that may know nothing of what was before."""
+        """Start with a newly connected plant, which may be another one."""
         self.heard = now
         self.stamp = self._zero = -1
-        self._periods = self._examined = 0
-        self.situation.home = self.situation.imu = self.situation.fix = ()
+        self._periods = self._checked = 0
+        self.state.home = self.state.imu = self.state.fix = ()
         self.vehicle.plant_back()
 
-    def _lose(self, why: str) -> None:
+    def _plant_lost(self, why: str) -> None:
         self._connected = False
-        self.situation.home = ()  # what was known of it holds no more
+        self.state.home = ()  # the next plant may start elsewhere
         self.vehicle.plant_lost(why)
-        self._note_arming()
+        self._follow_arming()
 
     def _wait(self) -> bool:
-        """Wait for the plant; True when it has something to say. Ground stations wake nobody: they have their turn."""
+        """Wait for the plant; True when it has sent something. Ground stations do not end the wait."""
         plants = [self.plant.socket] if self.plant.socket is not None else []
         if plants and select.select(plants, [], [], 0)[0]:
             return True
         begin = time.monotonic()
-        ready = select.select(plants, [], [], TURN_S)[0]
+        ready = select.select(plants, [], [], MAX_SLEEP_S)[0]
         end = time.monotonic()
-        self.lateness.nothing_waits(end - begin, end)
+        self.response_times.note_idle(end - begin, end)
         return bool(ready)
 
     def _fly(self) -> None:
-        """Answer what the plant says."""
+        """Read and answer the frames of the plant."""
         try:
             for kind, fields in self.plant.receive():
                 if kind is STATE:
                     self._period(PlantState(*fields))
                 elif kind is SENSOR:
-                    self.situation.imu = fields
+                    self.state.imu = fields
                 elif kind is GPS:
-                    self.situation.fix = fields
+                    self.state.fix = fields
         except ConnectionError as error:
-            self._lose(f"the plant is gone: {error}")
+            self._plant_lost(f"the plant disconnected: {error}")
 
     def _period(self, state: PlantState) -> None:
-        """One control period; a repeated time is answered, not flown."""
+        """Run one control period; a frame whose time repeats is answered, not flown."""
         self.heard = time.monotonic()
         if state.stamp < self.stamp - CLOCK_BACK_US:
-            self.vehicle.plant_lost("the plant has started anew")
+            self.vehicle.plant_lost("the plant has restarted")
             self._begin(self.heard)
         elif "plant" in self.vehicle.arming_blockers:
             del self.vehicle.arming_blockers["plant"]
-            self.vehicle.say(Severity.INFO, "the plant is heard again")
+            self.vehicle.say(Severity.INFO, "the plant sends frames again")
         if state.stamp > self.stamp:
             self.stamp = state.stamp
             self._compute(state)
-        self.plant.answer(self.stamp, self.situation.row["commands"], self.vehicle.armed)
-        self.lateness.answered()
-        self.situation.load = self.lateness.load
+        self.plant.answer(self.stamp, self.state.record["commands"], self.vehicle.armed)
+        self.response_times.note_answer()
+        self.state.load = self.response_times.load
 
-    def _break(self) -> None:
-        """Put the faults of now into the controller, and stop what steers."""
+    def _inject_faults(self) -> None:
+        """Inject the faults of this period into the controller, and cut the setpoints if they are faulty."""
         assert self.faults is not None
         self._zero = self.stamp if self._zero < 0 else self._zero
         k = round(1e-6 * (self.stamp - self._zero) / self.faults.Ts)
@@ -194,7 +197,7 @@ class Host:
 
     def _compute(self, state: PlantState) -> None:
         if self.faults is not None:
-            self._break()
+            self._inject_faults()
         state.measure(self.measurement)
         now = 1e-6 * self.stamp
         autopilot, m = self.autopilot, self.measurement
@@ -204,21 +207,21 @@ class Host:
         if self.pilot is not None:
             self.pilot.update(self.vehicle)
         demand = self.vehicle.step(now, estimate)
-        self._note_arming()
-        row = self.rows[0] if self.log is None else self.log.row(self.vehicle)
+        self._follow_arming()
+        row = self.rows[0] if self.log is None else self.log.next_row(self.vehicle)
         row["setpoint"] = demand[:3]
         row["excitation"] = self.excitation(now)
         autopilot.controls["landed"] = self.vehicle.vertical.landed
         tick(self.fixed, demand.collective, demand.altitude, m, row)
-        situation = self.situation
-        situation.stamp, situation.row, situation.state = self.stamp, row, state
-        situation.home = situation.home or (state.lat, state.lon, state.alt)
-        if self._periods % EXAMINED == 0 or row["fault"]:
-            self._examine(int(row["fault"]))
+        seen = self.state
+        seen.stamp, seen.record, seen.plant = self.stamp, row, state
+        seen.home = seen.home or (state.lat, state.lon, state.alt)
+        if self._periods % CHECK_PERIODS == 0 or row["fault"]:
+            self._check_controller(int(row["fault"]))
         self._periods += 1
 
-    def _note_arming(self) -> None:
-        """The controller and the log follow what the vehicle is."""
+    def _follow_arming(self) -> None:
+        """Arm or disarm controller and log with the vehicle."""
         armed = self.vehicle.armed
         if armed == bool(self.autopilot.controls["armed"][0]):
             return
@@ -235,23 +238,23 @@ class Host:
             kept = ", ".join(path.name for path in self.log.unsaved)
             text = f"not logged: {error.filename}: {error.strerror}; kept for the next disarming: {kept}"
             self.vehicle.say(Severity.CRITICAL, text)
-        self.lateness.nothing_waits(0.0, time.monotonic())  # writing is not counted: nothing flies
+        self.response_times.note_idle(0.0, time.monotonic())  # writing is not counted: nothing flies
 
-    def _examine(self, fault: int) -> None:
-        """What forbids arming and only we know."""
+    def _check_controller(self, fault: int) -> None:
+        """Pre-arm checks of the controller: its fault flag, its parameters, the plant's period."""
         found = {}
         if fault:
-            found["controller"] = f"the controller refuses its inputs (fault {fault}) and only damps the rates"
+            found["controller"] = f"the controller rejects its inputs (fault {fault}) and only damps the rates"
         gains = self.autopilot.controller.state["gains"][0]
         for parameter, value in zip(PARAMETERS, gains.tolist(), strict=True):
             if not parameter.minimum <= value <= parameter.maximum:
-                found["parameters"] = f"{parameter.name} is {value:g}, not within its range"
-        Ts, passed = float(gains[-1]), self._periods - self._examined
+                found["parameters"] = f"{parameter.name} is {value:g}, outside its range"
+        Ts, passed = float(gains[-1]), self._periods - self._checked
         period = (self.stamp - self._first) * 1e-6 / max(passed, 1)
-        if passed >= EXAMINED and abs(period - Ts) > 0.02 * Ts and not fault:
+        if passed >= CHECK_PERIODS and abs(period - Ts) > PERIOD_TOLERANCE * Ts and not fault:
             found["rate"] = f"the plant's period is {1e3 * period:.3g} ms, the gains are for {1e3 * Ts:.3g} ms"
         if not fault:
-            self._first, self._examined = self.stamp, self._periods
+            self._first, self._checked = self.stamp, self._periods
         for subject in ("controller", "parameters", "rate"):
             before = self.vehicle.arming_blockers.pop(subject, None)
             if subject in found:
@@ -259,19 +262,19 @@ class Host:
                 if before is None:
                     self.vehicle.say(Severity.CRITICAL, found[subject])
 
-    def _tell(self, ground: Ground, now: float) -> None:
-        """What the vehicle has said, to the ground stations and the console."""
+    def _send_texts(self, ground: GroundStationLink, now: float) -> None:
+        """Send the vehicle's texts to the ground stations and the console."""
         for severity, text in self.vehicle.said:
-            if now - self._told.get(text, -REPEATED_S) >= REPEATED_S:
-                self._told[text] = now
-                ground.say(severity, text)
+            if now - self._sent_texts.get(text, -REPEAT_S) >= REPEAT_S:
+                self._sent_texts[text] = now
+                ground.send_text(severity, text)
                 print(f"[{max(self.vehicle.now, 0):.2f} s] {text}", flush=True)
         self.vehicle.said.clear()
-        if len(self._told) > 100:
-            self._told.clear()
+        if len(self._sent_texts) > MAX_TEXTS:
+            self._sent_texts.clear()
 
     def leave(self) -> list[Path]:
-        """Nobody flies any more: the logs that were written.
+        """End: write the open flight, and return the logs written.
 
         Raises
         ------
@@ -282,4 +285,7 @@ class Host:
             return [] if self.log is None else self.log.save()
         except OSError as error:
             lost = ", ".join(map(str, self.log.unsaved)) if self.log else ""
-            raise SitlError(f"{error.filename}: {error.strerror}; lost: {lost}", exit_code=1) from error
+            raise SitlError(
+                f"{error.filename}: {error.strerror}; flights lost: {lost}; next time give a --log that can be written",
+                exit_code=1,
+            ) from error

@@ -1,4 +1,4 @@
-"""The vehicle's parameters: the tables of codegen, their values in the running controller and injector."""
+"""The vehicle's end of the parameter protocol (mavlink.io/en/services/parameter.html): tables, values, writes."""
 
 from __future__ import annotations
 
@@ -13,21 +13,24 @@ from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.native import NativeController
 from mimopilot.sitl.autopilot.excitation_injector import AXIS, Injector
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import REAL32, shortest, single
 from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
+from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest, single
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from pymavlink.dialects.v20 import common as mavlink
 
-#: PARAM_ERROR (345) reasons; pymavlink's own enumeration ends before some of them.
-DOES_NOT_EXIST, OUT_OF_RANGE, READ_ONLY, TYPE_MISMATCH = 1, 2, 5, 7
-#: Names that are told at the start, at most.
-TOLD = 5
+#: MAV_PARAM_ERROR, the reasons of PARAM_ERROR; pymavlink's enumeration ends before the last.
+DOES_NOT_EXIST: int = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
+OUT_OF_RANGE: int = mavlink.MAV_PARAM_ERROR_VALUE_OUT_OF_RANGE
+READ_ONLY: int = mavlink.MAV_PARAM_ERROR_READ_ONLY
+TYPE_MISMATCH = 7
+#: Most names in the summary at the start; chosen.
+SUMMARY_NAMES = 5
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One line of the vehicle's list; integers are published as floats, which every ground station understands."""
+class ServedParameter:
+    """One parameter of the vehicle's list. Integers are sent as floats, which every ground station understands."""
 
     name: str
     minimum: float
@@ -36,33 +39,33 @@ class Entry:
     integer: bool = False
 
     def accepts(self, value: float) -> bool:
-        """Whether a value is one that the vehicle may hold."""
+        """Whether a value is within the range, and whole for an integer."""
         return self.minimum <= value <= self.maximum and not (self.integer and value != round(value))
 
     @property
     def range(self) -> str:
-        """For messages."""
+        """Expected range, for messages."""
         return f"expected {'a whole number from ' if self.integer else ''}{self.minimum:g} to {self.maximum:g}"
 
 
 class ParameterServer:
-    """Answers the parameter protocol; a change acts on the controller at once, bumpless.
+    """Answers the parameter protocol; a write acts on the controller at once, bumpless.
 
     Parameters
     ----------
     controller : NativeController or EmulatedController
         The running controller.
     gains : Gains
-        What it runs with.
+        Its gains at the start.
     injector : Injector
-        What its settings act on.
+        The excitation injector, configured by the MIMO_EX parameters.
     store : ParameterStore, optional
-        Where changes are kept; what it holds outranks the gains.
+        Stores changes; its values override the gains.
 
     Raises
     ------
     SitlError
-        When the store holds what this vehicle cannot take.
+        When the store holds a value that this vehicle cannot accept.
     """
 
     def __init__(
@@ -74,12 +77,12 @@ class ParameterServer:
     ) -> None:
         self.controller, self.injector, self.store = controller, injector, store
         identity = gains.identity()
-        self.table: tuple[Entry, ...] = (
-            *(Entry(p.name, p.minimum, p.maximum, p.writable) for p in PARAMETERS),
-            *(Entry(p.name, p.minimum, p.maximum, False) for p in IDENTITY if p.name in identity),
-            *(Entry(s.name, s.minimum, s.maximum, True, s.integer) for s in EXCITATION),
+        self.table: tuple[ServedParameter, ...] = (
+            *(ServedParameter(p.name, p.minimum, p.maximum, p.writable) for p in PARAMETERS),
+            *(ServedParameter(p.name, p.minimum, p.maximum, False) for p in IDENTITY if p.name in identity),
+            *(ServedParameter(s.name, s.minimum, s.maximum, True, s.integer) for s in EXCITATION),
         )
-        self.index = {entry.name: i for i, entry in enumerate(self.table)}
+        self.index = {served.name: i for i, served in enumerate(self.table)}
         settings = {setting.name: single(setting.default) for setting in EXCITATION}
         values = [*to_array(gains).tolist(), *map(single, identity.values()), *settings.values()]
         self.defaults: dict[str, float] = dict(zip(self.index, values, strict=True))
@@ -89,37 +92,37 @@ class ParameterServer:
         self._configure()
 
     def _restore(self, store: ParameterStore) -> None:
-        """Take over what was kept."""
+        """Restore the stored values."""
         for name, value in store.held.items():
             if name not in self.index:
-                raise SitlError(f"{store.path}: {name}: this vehicle has no such parameter; take the line out")
-            entry = self.table[self.index[name]]
-            if not entry.writable and value != self.values[name]:
+                raise SitlError(f"{store.path}: {name}: this vehicle has no such parameter; delete the line")
+            served = self.table[self.index[name]]
+            if not served.writable and value != self.values[name]:
                 raise SitlError(
                     f"{store.path}: {name} is {shortest(value)}, the gains are for {shortest(self.values[name])}: "
-                    "it was kept for another vehicle; name another file"
+                    "the file belongs to another vehicle; name another file"
                 )
-            if not entry.accepts(value):
-                raise SitlError(f"{store.path}: {name}: got {shortest(value)}, {entry.range}; correct the line")
+            if not served.accepts(value):
+                raise SitlError(f"{store.path}: {name}: got {shortest(value)}, {served.range}; correct the line")
             self.values[name] = value
-        self.values[AXIS] = 0.0  # what was asked in an earlier flight
+        self.values[AXIS] = 0.0  # an excitation of an earlier flight must not start again
         if not self.controller.set_gains(self._gains(self.values)):
-            raise SitlError(f"{store.path}: the controller refuses these gains; take its lines out")
+            raise SitlError(f"{store.path}: the controller rejects these gains; delete their lines")
 
     @property
     def summary(self) -> str:
-        """What outranks the gains at the start; empty: nothing."""
+        """Stored values that override the gains at the start; empty: none."""
         changed = self.changed
         if self.store is None or not changed:
             return ""
-        told = [f"{name} {shortest(value)} (else {shortest(self.defaults[name])})" for name, value in changed.items()]
-        more = f" and {len(told) - TOLD} more" if len(told) > TOLD else ""
-        verb = "parameter outranks" if len(told) == 1 else "parameters outrank"
-        return f"{self.store.path}: {len(told)} {verb} the gains: {', '.join(told[:TOLD])}{more}"
+        names = [f"{name} {shortest(value)} (else {shortest(self.defaults[name])})" for name, value in changed.items()]
+        more = f" and {len(names) - SUMMARY_NAMES} more" if len(names) > SUMMARY_NAMES else ""
+        verb = "parameter overrides" if len(names) == 1 else "parameters override"
+        return f"{self.store.path}: {len(names)} {verb} the gains: {', '.join(names[:SUMMARY_NAMES])}{more}"
 
     @property
     def changed(self) -> dict[str, float]:
-        """Name -> value of all that is not as the gains and the defaults have it."""
+        """Name -> value of all parameters that differ from the gains and the defaults."""
         return {name: value for name, value in self.values.items() if value != self.defaults[name] and name != AXIS}
 
     def message(self, index: int) -> Any:
@@ -132,33 +135,33 @@ class ParameterServer:
         return [self.message(i) for i in range(len(self.table))]
 
     def read(self, name: str, index: int) -> list[Any]:
-        """Answer to PARAM_REQUEST_READ: by index when that is not negative, else by name."""
+        """Answer PARAM_REQUEST_READ: by index when it is not negative, else by name."""
         found = index if index >= 0 else self.index.get(name, -1)
         if not 0 <= found < len(self.table):
             return [_error(name, index, DOES_NOT_EXIST)]
         return [self.message(found)]
 
     def write(self, name: str, value: float, kind: int) -> list[Any]:
-        """Answer to PARAM_SET: the held value, with an error in front when the new one was refused."""
+        """Execute PARAM_SET: return the current value, after a PARAM_ERROR when the new one was refused."""
         index = self.index.get(name)
         if index is None:
             return [_error(name, -1, DOES_NOT_EXIST)]
-        refusal = self._refusal(self.table[index], value + 0.0, kind)
+        refusal = self._try_set(self.table[index], value + 0.0, kind)
         held = self.message(index)
         return [held] if refusal is None else [_error(name, index, refusal), held]
 
-    def _refusal(self, entry: Entry, value: float, kind: int) -> int | None:
-        """Why a value is not taken; None: it was."""
-        if not entry.writable:
+    def _try_set(self, served: ServedParameter, value: float, kind: int) -> int | None:
+        """Set a value; return the MAV_PARAM_ERROR when it was refused, else None."""
+        if not served.writable:
             return READ_ONLY
         if kind != REAL32:
             return TYPE_MISMATCH
-        if not (math.isfinite(value) and entry.accepts(value)):
+        if not (math.isfinite(value) and served.accepts(value)):
             return OUT_OF_RANGE
-        if value == self.values[entry.name]:
+        if value == self.values[served.name]:
             return None
-        wanted = self.values | {entry.name: value}
-        if self.index[entry.name] < len(PARAMETERS):
+        wanted = self.values | {served.name: value}
+        if self.index[served.name] < len(PARAMETERS):
             if not self.controller.set_gains(self._gains(wanted)):
                 return OUT_OF_RANGE
             self.values = wanted
@@ -166,26 +169,26 @@ class ParameterServer:
             self.values = wanted
             self._configure()
         if self.store is not None:
-            self.store.keep(self.kept)
+            self.store.keep(self.stored_values)
         return None
 
     def flush(self) -> bool:
-        """Write what was not kept yet; False: it failed."""
+        """Store pending changes now; False when that fails."""
         return self.store is None or self.store.flush()
 
-    def complaint(self) -> str:
-        """Why something could not be kept, told once; empty: all is well."""
-        return self.store.complaint() if self.store else ""
+    def take_write_error(self) -> str:
+        """Return the store's last write error and clear it; empty: none."""
+        return self.store.take_write_error() if self.store else ""
 
     def close(self) -> None:
-        """Keep what was not kept yet."""
+        """Store pending changes."""
         if self.store is not None:
             self.store.close()
 
     @property
-    def kept(self) -> dict[str, float]:
-        """What a file holds: whose parameters they are, and what was changed."""
-        fixed = {entry.name: self.values[entry.name] for entry in self.table if not entry.writable}
+    def stored_values(self) -> dict[str, float]:
+        """Content of the stored file: the read-only parameters, which identify the vehicle, and the changed ones."""
+        fixed = {served.name: self.values[served.name] for served in self.table if not served.writable}
         return fixed | self.changed
 
     @staticmethod

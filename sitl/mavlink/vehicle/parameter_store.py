@@ -1,8 +1,7 @@
-"""Where a simulated vehicle keeps what ground stations change: a QGroundControl parameter file.
+"""Storage of the vehicle's changed parameters: a QGroundControl parameter file.
 
-It holds what differs from the gains that the vehicle was started with, as a real one's memory holds what differs
-from its firmware's defaults, and a few fixed parameters that tell whose it is. A thread writes it: the control
-loop never waits for a disk.
+Like a real vehicle's memory, it holds only what differs from the defaults: the gains that the vehicle was started
+with. A few fixed parameters identify the vehicle. A thread writes the file: the control loop never waits for a disk.
 """
 
 from __future__ import annotations
@@ -16,68 +15,69 @@ from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_par
 
 from mimopilot.common.files import write_atomically
 
-#: A change is written so long after it, s: others that come with it are written together.
+#: Delay from a change to its write, s; chosen: changes that follow are written together.
 DELAY_S = 0.2
 
 
 class ParameterStore:
-    """One such file.
+    """One parameter file.
 
     Parameters
     ----------
     path : Path
-        It need not be there yet.
+        The file; it may not exist yet.
 
     Attributes
     ----------
     held : dict
-        Name -> value of what it held at the start.
+        Name -> value, as read at the start.
 
     Raises
     ------
     SitlError
-        When it is damaged.
+        When the file is damaged.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.held = read_parameters(path) if path.exists() else {}
         self._wanted: Mapping[str, float] | None = None
-        self._complaint = ""
+        self._write_error = ""
         self._changed, self._leaving = threading.Event(), threading.Event()
-        self._writing, self._taking = threading.Lock(), threading.Lock()  # the first is held for long, by writers only
+        # `_writing` is held during a write, `_taking` only for an assignment.
+        self._writing, self._taking = threading.Lock(), threading.Lock()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def keep(self, values: Mapping[str, float]) -> None:
-        """Write these soon; returns at once."""
+        """Schedule these values to be written; returns at once."""
         with self._taking:
             self._wanted = dict(values)
         self._changed.set()
 
     def flush(self) -> bool:
-        """Write now what was not written yet; False when that fails."""
+        """Write pending values now; False when that fails."""
         with self._writing:
             with self._taking:
                 wanted, self._wanted = self._wanted, None
             if wanted is None:
                 return True
             try:
-                write_atomically(self.path, parameter_text("qgc", wanted, seal=False))
+                write_atomically(self.path, parameter_text("qgc", wanted, checksum=False))
             except OSError as error:
                 with self._taking:
                     self._wanted = self._wanted or wanted
-                self._complaint = f"parameters not kept: {error.filename}: {error.strerror}"
+                self._write_error = f"parameters not stored: {error.filename}: {error.strerror}"
                 return False
             return True
 
-    def complaint(self) -> str:
-        """Why writing failed, told once; empty when nothing has."""
-        told, self._complaint = self._complaint, ""
-        return told
+    def take_write_error(self) -> str:
+        """Return the last write error and clear it; empty: none."""
+        taken, self._write_error = self._write_error, ""
+        return taken
 
     def close(self) -> None:
-        """Write what was not written yet.
+        """Write pending values and end the thread.
 
         Raises
         ------
@@ -88,7 +88,7 @@ class ParameterStore:
         self._changed.set()
         self._thread.join()
         if not self.flush():
-            raise SitlError(self.complaint(), exit_code=1)
+            raise SitlError(self.take_write_error(), exit_code=1)
 
     def _run(self) -> None:
         while not self._leaving.is_set():

@@ -1,4 +1,4 @@
-"""Messages that steer: attitude set-points, sticks, motion capture. What is not credible is dropped, and said."""
+"""Attitude setpoints, sticks and motion capture poses from MAVLink; implausible ones are refused and reported."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.autopilot.flight_modes import Commander, Severity
 from mimopilot.sitl.autopilot.setpoints import AttitudeSetpoint, Pose, Sticks
+from mimopilot.sitl.mavlink.wire.codec import SYSTEM
 from mimopilot.sitl.physics.state_estimate import euler_angles
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -17,27 +18,36 @@ RATES_IGNORED = (
     mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE,
     mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE,
 )
-THRUST_BODY_SET = 32  # pymavlink's enumeration lacks it
-NOT_FLOWN = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE | THRUST_BODY_SET
-DEAD_BAND = 0.05  # of the climb stick
-PULSE_MIN, PULSE_MAX = 800, 2200  # us, of a credible RC channel
-FARTHEST = 1e5  # m
+THRUST_BODY_SET = 32  # ATTITUDE_TARGET_TYPEMASK_THRUST_BODY_SET, which pymavlink's enumeration lacks
+UNSUPPORTED_BITS = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE | THRUST_BODY_SET
+DEAD_BAND = 0.05  # of the climb stick's range; chosen
+PULSE_MIN, PULSE_MAX = 800, 2200  # us; chosen: plausible RC pulse widths
+PULSE_MIDDLE, PULSE_SPAN = 1500, 500  # us, the RC convention: 1000 to 2000
+CHANNEL_UNCHANGED = 65535  # RC_CHANNELS_OVERRIDE: leave the channel as it was; 0: release it
+MAX_DISTANCE = 1e5  # m; chosen: a pose farther away is implausible
+QUATERNION_NORM = 0.9, 1.1  # chosen: norms outside are no quaternion
+REFUSAL_INTERVAL_S = 1.0  # s, least interval between reports of a refusal; chosen
 
 
-class Steering:
-    """Feeds a vehicle from messages.
+class SetpointReceiver:
+    """Passes setpoints from messages to a vehicle.
 
     Parameters
     ----------
     vehicle : Commander
+
+    Attributes
+    ----------
+    handlers : dict
+        Message name -> function that returns the reason of a refusal; empty: accepted.
     """
 
     def __init__(self, vehicle: Commander) -> None:
         self.vehicle = vehicle
         self._channels: list[int] = [0, 0, 0, 0]
-        self._seen = -1
-        self._complained = -math.inf
-        self.takers: dict[str, Callable[[Any], str]] = {
+        self._last_pose_us = -1
+        self._last_refusal = -math.inf
+        self.handlers: dict[str, Callable[[Any], str]] = {
             "SET_ATTITUDE_TARGET": self._attitude_target,
             "MANUAL_CONTROL": self._manual_control,
             "RC_CHANNELS_OVERRIDE": self._channels_override,
@@ -45,12 +55,12 @@ class Steering:
             "VISION_POSITION_ESTIMATE": self._vision,
         }
 
-    def take(self, message: Any) -> list[Any]:
-        """One message; a refusal is said at most once a second."""
-        refusal = self.takers[message.get_type()](message)
+    def receive(self, message: Any) -> list[Any]:
+        """Handle one message; a refusal is reported at most once a second."""
+        refusal = self.handlers[message.get_type()](message)
         now = max(self.vehicle.now, 0.0)
-        if refusal and not 0 <= now - self._complained < 1:
-            self._complained = now
+        if refusal and not 0 <= now - self._last_refusal < REFUSAL_INTERVAL_S:
+            self._last_refusal = now
             self.vehicle.say(Severity.WARNING, refusal)
         return []
 
@@ -58,20 +68,20 @@ class Steering:
         mask = message.type_mask
         rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
         angles = _angles(message.q)
-        if mask & NOT_FLOWN:
-            return f"set-point refused: type_mask {mask}: only attitude is flown, with or without thrust"
+        if mask & UNSUPPORTED_BITS:
+            return f"setpoint refused: type_mask {mask}: only attitude is supported, with or without thrust"
         if any(not mask & bit and rate != 0 for bit, rate in zip(RATES_IGNORED, rates, strict=True)):
-            return f"set-point refused: type_mask {mask}: body rates are not flown, add 7"
+            return f"setpoint refused: type_mask {mask}: body rates are not supported, add 7 to ignore them"
         if angles is None or max(abs(angles[0]), abs(angles[1])) > MAX_TILT:
-            return f"set-point refused: expected a quaternion, tilted by at most {math.degrees(MAX_TILT):.0f} degrees"
+            return f"setpoint refused: expected a quaternion, tilted by at most {math.degrees(MAX_TILT):.0f} degrees"
         thrust = None if mask & mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE else message.thrust
         if thrust is not None and not 0 <= thrust <= 1:
-            return f"set-point refused: thrust {thrust:g}, expected 0 to 1"
+            return f"setpoint refused: thrust {thrust:g}, expected 0 to 1"
         self.vehicle.attitude.put(AttitudeSetpoint(*angles, thrust), self.vehicle.now)
         return ""
 
     def _manual_control(self, message: Any) -> str:
-        if message.target != 1:
+        if message.target != SYSTEM:
             return ""
         roll, pitch, yaw = message.y / 1000, -message.x / 1000, message.r / 1000
         climb = message.z / 500 - 1
@@ -81,14 +91,14 @@ class Steering:
         return ""
 
     def _channels_override(self, message: Any) -> str:
-        """Channels 1 to 4: roll, pitch, throttle, yaw; 65535 leaves one as it was, 0 lets it go."""
+        """Channels 1 to 4: roll, pitch, throttle, yaw."""
         channels = [message.chan1_raw, message.chan2_raw, message.chan3_raw, message.chan4_raw]
-        held = [old if new == 65535 else new for old, new in zip(self._channels, channels, strict=True)]
+        held = [old if new == CHANNEL_UNCHANGED else new for old, new in zip(self._channels, channels, strict=True)]
         if any(value and not PULSE_MIN <= value <= PULSE_MAX for value in held):
             return f"channels refused: expected {PULSE_MIN} to {PULSE_MAX} us"
         self._channels = held
         if all(held):
-            roll, pitch, climb, yaw = (min(max((value - 1500) / 500, -1.0), 1.0) for value in held)
+            roll, pitch, climb, yaw = (min(max((value - PULSE_MIDDLE) / PULSE_SPAN, -1.0), 1.0) for value in held)
             self._stick(roll, pitch, yaw, climb)
         return ""
 
@@ -104,22 +114,22 @@ class Steering:
         return self._pose(message.usec, (message.x, message.y, message.z), message.yaw)
 
     def _pose(self, stamp: int, place: tuple[float, float, float], yaw: float) -> str:
-        if not all(abs(value) <= FARTHEST for value in (*place, yaw)):
-            return "pose refused: expected finite numbers and a quaternion"
+        if not all(abs(value) <= MAX_DISTANCE for value in (*place, yaw)):
+            return f"pose refused: expected a quaternion and finite positions within {MAX_DISTANCE:g} m"
         now, pose = self.vehicle.now, self.vehicle.pose
-        if stamp <= self._seen and pose.fresh(now):
-            return ""  # an older one, or a repeated one
+        if stamp <= self._last_pose_us and pose.fresh(now):
+            return ""  # older or repeated
         if not pose.fresh(now):
-            self.vehicle.say(Severity.INFO, "motion capture: its position is held")
-        self._seen = stamp
+            self.vehicle.say(Severity.INFO, "motion capture: position hold uses it")
+        self._last_pose_us = stamp
         pose.put(Pose(*place, math.remainder(yaw, math.tau)), now)
         return ""
 
 
 def _angles(q: Sequence[float]) -> tuple[float, float, float] | None:
-    """Roll, pitch, yaw of a quaternion; None when it is none."""
-    length = math.sqrt(sum(value * value for value in q))
-    if not 0.9 <= length <= 1.1:
+    """Roll, pitch, yaw of a quaternion, rad; None when its norm is not near one."""
+    norm = math.sqrt(sum(value * value for value in q))
+    if not QUATERNION_NORM[0] <= norm <= QUATERNION_NORM[1]:
         return None
-    roll, pitch, yaw = euler_angles(*(value / length for value in q))
+    roll, pitch, yaw = euler_angles(*(value / norm for value in q))
     return float(roll), float(pitch), float(yaw)

@@ -1,4 +1,4 @@
-"""The `sitl` command: a vehicle put together from its parts, and run until Ctrl-C."""
+"""The `sitl` command: assembles the vehicle, and runs it until Ctrl-C."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.flight.scripted_pilot import ScriptedPilot
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantLink
 from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
-from mimopilot.sitl.mavlink.vehicle.excitation import Excitation
-from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightLog
-from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
+from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightRecorder
+from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
 from mimopilot.sitl.mavlink.vehicle.host import Host
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
 from mimopilot.sitl.mavlink.vehicle.stations import Stations
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
+from mimopilot.sitl.mavlink.vehicle.torque_injection import TorqueInjection
 from mimopilot.sitl.mavlink.vehicle.vehicle_commands import VehicleCommands
 from mimopilot.sitl.mavlink.wire.signing import Signer, read_key
 from mimopilot.sitl.physics.airframe import Airframe
@@ -33,32 +33,33 @@ from mimopilot.tuning.gains import Gains
 
 
 @dataclass(frozen=True)
-class Options:
-    """What the command line says.
+class SitlOptions:
+    """Options of the `sitl` command.
 
     Attributes
     ----------
     name : str
         Name or file of the airframe.
-    airframe, gains
-        What flies.
+    airframe : Airframe
+    gains : Gains
     plant : (host, port) or None
-        Somebody else's plant; None: one is started.
+        Address of a running plant; None: start one.
     port : int
-        TCP port of the started one; 0: any.
+        TCP port of the started plant; 0: any.
     ground_port, vehicle_port, tcp_port, bind
-        Of `sitl.mavlink.vehicle.stations.Stations`.
+        See `sitl.mavlink.vehicle.stations.Stations`.
     signing_key : Path or None
-        File of the key.
+        File of the signing key.
     parameters : Path or None
-        Where changed parameters are kept.
+        File that stores changed parameters.
     speed : float or None
-        Times real time; None: as fast as it goes.
+        Times real time; None: as fast as possible.
     seed : int
+        Seed of the plant's noise.
     log : Path or None
-        Where the first flight is logged.
+        File of the first flight's log.
     scenario : Scenario or None
-        Flown at once, in place of waiting for a ground station.
+        Flown at once, without a ground station.
     faults : tuple of Fault
         In seconds from the first frame of the plant.
     """
@@ -81,8 +82,8 @@ class Options:
     faults: tuple[Fault, ...]
 
 
-def run(options: Options) -> None:
-    """Run the vehicle until Ctrl-C, or until its scenario is flown.
+def run(options: SitlOptions) -> None:
+    """Run the vehicle until Ctrl-C, or until the end of its scenario.
 
     Raises
     ------
@@ -95,38 +96,38 @@ def run(options: Options) -> None:
         begin = time.monotonic()
         try:
             host.run(ground)
-            pace = host.lateness.periods * options.gains.Ts / (time.monotonic() - begin)
+            pace = host.response_times.periods * options.gains.Ts / (time.monotonic() - begin)
             print(f"flown at {pace:.3g} times real time")
         except KeyboardInterrupt:
             written = host.leave()
-            print(f"ended: {host.lateness}{'; logged: ' if written else ''}{', '.join(map(str, written))}")
+            print(f"ended: {host.response_times}{'; logged: ' if written else ''}{', '.join(map(str, written))}")
 
 
-def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
+def _assemble(options: SitlOptions, leaving: ExitStack) -> tuple[Host, GroundStationLink]:
     gains, key = options.gains, options.signing_key
-    outside = _faults_of_the_plant(options)
+    plant_faults = _check_faults(options)
     signer = Signer(read_key(key)) if key else None
     stations = Stations(options.ground_port, options.vehicle_port, options.tcp_port, options.bind, signer)
     leaving.callback(stations.close)
     if stations.exposed:
-        print("warning: whoever reaches this address commands the vehicle; give --signing-key to ask for a key")
-    child = PlantProcess(options.name, options.port, gains.Ts, options.seed, options.speed, faults=outside)
+        print("warning: anyone who reaches this address can command the vehicle; require a key with --signing-key")
+    child = PlantProcess(options.name, options.port, gains.Ts, options.seed, options.speed, faults=plant_faults)
     link = PlantLink(options.plant or child)
     leaving.callback(link.close)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # what Ctrl-C leaves in order, this does, too
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # end as on Ctrl-C: logs written, plant ended
     if link.child is not None:
-        link.child.start()  # it comes up while we compile
+        link.child.start()  # it starts while we compile
     autopilot = Autopilot(options.airframe, gains)
     autopilot.warm_up()
-    log = FlightLog(options.log, options.airframe, gains.Ts) if options.log else None
+    log = FlightRecorder(options.log, options.airframe, gains.Ts) if options.log else None
     host = Host(autopilot, link, log)
     leaving.callback(host.leave)
-    if len(options.faults) > len(outside):
+    if len(options.faults) > len(plant_faults):
         host.faults = AutopilotFaults(options.faults, gains.Ts, autopilot)
-    telemetry = Telemetry(host.situation)
+    telemetry = Telemetry(host.state)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
     injector = Injector(gains.Ts)
-    host.excitation = Excitation(injector, host.situation)
+    host.excitation = TorqueInjection(injector, host.state)
     if options.scenario is not None:
         host.pilot = pilot = ScriptedPilot(options.scenario)
         host.excitation = lambda now: pilot.moment
@@ -137,14 +138,16 @@ def _assemble(options: Options, leaving: ExitStack) -> tuple[Host, Ground]:
         print(server.summary)
     if link.child is not None:
         link.child.wait()
-    return host, Ground(server, commands, telemetry, stations)
+    return host, GroundStationLink(server, commands, telemetry, stations)
 
 
-def _faults_of_the_plant(options: Options) -> list[Fault]:
-    """What happens in the plant and in its link, for a plant of ours."""
+def _check_faults(options: SitlOptions) -> list[Fault]:
+    """Check the faults; return those of the plant and its link, which only a plant of ours can have."""
     for fault in options.faults:
         check_fault(fault, options.airframe, options.gains.Ts, None)
-    outside = [fault for fault in options.faults if fault.place != "autopilot"]
-    if options.plant and outside:
-        raise SitlError(f"fault {str(outside[0])!r}: happens in the plant that runs already: give it to that one")
-    return outside
+    plant_faults = [fault for fault in options.faults if fault.place != "autopilot"]
+    if options.plant and plant_faults:
+        raise SitlError(
+            f"fault {str(plant_faults[0])!r}: belongs to the plant, which runs already: give it to that command"
+        )
+    return plant_faults

@@ -1,7 +1,7 @@
-"""Ground stations of one vehicle: several at once, by UDP and by TCP, none of which can hold up the flight.
+"""Connections to ground stations: several at once, over UDP and TCP, none of which can delay the flight.
 
-Whoever sends a sound frame is a station from then on. What is read in one call is bounded in time, what waits for a
-slow reader is bounded in size, and a frame is only read when it is for this vehicle and, with a key, signed.
+The sender of an intact frame becomes a station. The time of one call and the bytes queued for a slow reader are
+bounded. Only frames to this vehicle are handled and, with a key, only signed ones.
 """
 
 from __future__ import annotations
@@ -13,33 +13,36 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import Any, TypeVar
 
-from mimopilot.sitl.mavlink.wire.link import COMPONENT, KINDS, LOOPBACK, SYSTEM, Codec, listen, udp_socket
+from mimopilot.sitl.mavlink.wire.codec import COMPONENT, KINDS, SYSTEM, Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
+from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, listen, udp_socket
 
-#: Time that one call of `Stations.receive` may take, and one of `Stations.deliver`, s: an eighth of a control period.
+# All chosen:
+#: Time budget of one `Stations.receive` and one `Stations.deliver`, s: an eighth of a control period at 250 Hz.
 BUDGET_S = 0.0005
-#: Answers that a station is sent in one call, and how many may wait: what it asks then is not heard.
-SHARE, MAX_ANSWERS = 8, 100
-#: Most stations of one kind, and the silence (s) after which one of them gives way to another.
+#: Answers sent to a station in one call; answers queued for it before its requests are ignored.
+ANSWERS_PER_CALL, MAX_ANSWERS = 8, 100
+#: Most stations per transport; silence (s) after which a new station may replace one.
 MAX_STATIONS, SILENCE_S = 8, 10.0
-#: A TCP station that lets more wait than this is cut off, bytes.
-MAX_WAITING = 1 << 16
+#: Unsent bytes after which a TCP station is disconnected.
+MAX_UNSENT = 1 << 16
+#: Bytes read at once: more than any datagram of one Ethernet frame.
 CHUNK = 2048
 
 Address = tuple[str, int]
-Heard = tuple[Any, "Station"]
-#: Yields what was said by one message or none at all; None: nothing is there now.
-Reader = Iterator["list[Heard] | None"]
+Received = tuple[Any, "Station"]
+#: Yields the messages of each step; None: no data now.
+Reader = Iterator["list[Received] | None"]
 S = TypeVar("S", bound="Station")
 
 
 class Station:
-    """One ground station: counts its own messages, so that it does not take those of another for lost ones.
+    """One ground station, with its own sequence numbers, so that it sees no gaps from messages to other stations.
 
     Parameters
     ----------
     codec : Codec
-        Packs for it and parses what it says.
+        Packs messages to it and parses its messages.
     """
 
     def __init__(self, codec: Codec) -> None:
@@ -49,20 +52,20 @@ class Station:
 
     @property
     def busy(self) -> bool:
-        """True while so many answers wait for it that no further question of it is taken."""
+        """Whether so many answers are queued for it that its requests are ignored."""
         return len(self.answers) >= MAX_ANSWERS
 
     def send(self, message: Any) -> None:
-        """One message; a station that is not there is no error."""
+        """Send one message; an unreachable station is no error."""
         self.transmit(self.codec.pack(message))
 
     def transmit(self, data: bytes) -> None:
-        """Bytes of one message."""
+        """Send the bytes of one message."""
         raise NotImplementedError
 
 
 class UdpStation(Station):
-    """Behind an address."""
+    """A station at a UDP address."""
 
     def __init__(self, codec: Codec, link: socket.socket, address: Address) -> None:
         super().__init__(codec)
@@ -76,12 +79,12 @@ class UdpStation(Station):
 
 
 class TcpStation(Station):
-    """Behind a connection that it made."""
+    """A station on a TCP connection that it opened."""
 
     def __init__(self, codec: Codec, link: socket.socket) -> None:
         super().__init__(codec)
         self.link, self.open = link, True
-        self.waiting = b""
+        self.unsent = b""
         self.reader = self._read()
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -89,18 +92,18 @@ class TcpStation(Station):
     def transmit(self, data: bytes) -> None:  # noqa: D102
         if not self.open:
             return
-        self.waiting += data
+        self.unsent += data
         try:
-            self.waiting = self.waiting[self.link.send(self.waiting) :]
+            self.unsent = self.unsent[self.link.send(self.unsent) :]
         except BlockingIOError:
             pass
         except OSError:
             self.close()
-        if len(self.waiting) > MAX_WAITING:
+        if len(self.unsent) > MAX_UNSENT:
             self.close()
 
     def close(self) -> None:
-        """Cut it off."""
+        """Disconnect it."""
         self.open = False
         self.link.close()
 
@@ -118,7 +121,7 @@ class TcpStation(Station):
                 yield None
                 continue
             for message in self.codec.search(data):
-                yield [(message, self)] if message is not None and _is_ours(message) else []
+                yield [(message, self)] if message is not None and _is_for_us(message) else []
             yield []
 
 
@@ -128,13 +131,13 @@ class Stations:
     Parameters
     ----------
     ground_port : int
-        UDP port on this machine where a station listens; it is spoken to from the start.
+        UDP port on this machine where a station listens; messages go there from the start.
     udp_port, tcp_port : int
-        Local ports where stations may speak first; 0: any free one.
+        Local ports for stations that send first; 0: any free one.
     bind : str
         Local address of both.
     signer : Signer, optional
-        Signs all that is sent; nothing unsigned is then heard.
+        Signs all messages; unsigned ones from stations are then ignored.
 
     Raises
     ------
@@ -170,12 +173,12 @@ class Stations:
 
     @property
     def exposed(self) -> bool:
-        """Whether other machines can reach them, and nothing asks who they are."""
+        """Whether other machines can reach the ports without a key."""
         address = ipaddress.ip_address(self.udp.getsockname()[0])
         return self.signer is None and not address.is_loopback
 
     def __str__(self) -> str:
-        """Where they find the vehicle."""
+        """Addresses of the vehicle, for the console."""
         host, udp = self.udp.getsockname()
         others = f"others on {host}, UDP {udp} and TCP {self.tcp.getsockname()[1]}"
         return f"ground station on UDP {self.first[1]}, {others}{', signed' if self.signer else ''}"
@@ -187,8 +190,8 @@ class Stations:
         self.udp.close()
         self.tcp.close()
 
-    def hear(self, *kinds: str) -> None:
-        """Messages of these kinds mean something to the vehicle; others are passed over."""
+    def subscribe(self, *kinds: str) -> None:
+        """Decode messages of these names, too; others are ignored."""
         self.wanted.update(number for number, kind in KINDS.items() if kind.msgname in kinds)
 
     @property
@@ -196,53 +199,53 @@ class Stations:
         return (*self.by_address.values(), *self.connected)
 
     def send(self, message: Any) -> None:
-        """One message to every station, now."""
+        """Send one message to every station, now."""
         for station in self._all:
             station.send(message)
 
     def post(self, message: Any, station: Station | None = None) -> None:
-        """One message to a station, or to all, after what waits for it already; see `deliver`."""
+        """Queue one message for a station, or for all; `deliver` sends it."""
         for receiver in self._all if station is None else (station,):
             receiver.answers.append(message)
 
     def deliver(self) -> None:
-        """Send some of what waits, to each station in turn."""
+        """Send queued messages, to each station in turn, within the time budget."""
         end = time.perf_counter() + BUDGET_S
-        for _ in range(SHARE):
+        for _ in range(ANSWERS_PER_CALL):
             waiting = [station for station in self._all if station.answers]
             for station in waiting:
                 station.send(station.answers.popleft())
             if not waiting or time.perf_counter() > end:
                 return
 
-    def receive(self) -> Iterator[Heard]:
-        """What stations say to this vehicle, one message of each in turn, until nothing is left or the time is up."""
+    def receive(self) -> Iterator[Received]:
+        """Read messages to this vehicle, one of each station in turn, within the time budget."""
         end = time.perf_counter() + BUDGET_S
-        self._admit()
-        busy = [self.from_udp, *(station.reader for station in self.connected)]
-        while busy:
-            for reader in tuple(busy):
+        self._accept_connection()
+        readers = [self.from_udp, *(station.reader for station in self.connected)]
+        while readers:
+            for reader in tuple(readers):
                 found = next(reader)
                 if found is None:
-                    busy.remove(reader)
+                    readers.remove(reader)
                     continue
                 for message, station in found:
                     station.heard = time.monotonic()
                     if not station.busy:
                         yield message, station
                 if time.perf_counter() > end:
-                    busy.clear()
+                    readers.clear()
                     break
         self.connected = [station for station in self.connected if station.open]
 
-    def _admit(self) -> None:
-        """Let one more connection in."""
+    def _accept_connection(self) -> None:
+        """Accept one connection; when full, it replaces a silent station or is refused."""
         try:
             link, _ = self.tcp.accept()
         except OSError:
             return
         if len(self.connected) >= MAX_STATIONS:
-            silent = _silent(self.connected)
+            silent = _silent_station(self.connected)
             if silent is None:
                 link.close()
                 return
@@ -258,17 +261,17 @@ class Stations:
                 yield None
                 continue
             for message in self.datagrams.parse_datagram(data):
-                station = self._at(address) if _is_ours(message) else None
+                station = self._station_at(address) if _is_for_us(message) else None
                 yield [] if station is None else [(message, station)]
             yield []
 
-    def _at(self, address: Address) -> UdpStation | None:
-        """The station at an address, new or known; None when there are too many."""
+    def _station_at(self, address: Address) -> UdpStation | None:
+        """Find or add the station at an address; None when there are too many."""
         station = self.by_address.get(address)
         if station is None:
             learned = [other for other in self.by_address.values() if other.address != self.first]
             if len(learned) >= MAX_STATIONS:
-                silent = _silent(learned)
+                silent = _silent_station(learned)
                 if silent is None:
                     return None
                 del self.by_address[silent.address]
@@ -276,8 +279,8 @@ class Stations:
         return station
 
 
-def _is_ours(message: Any) -> bool:
-    """Whether a message is for this vehicle, and not one of its own that came back."""
+def _is_for_us(message: Any) -> bool:
+    """Whether a message is for this vehicle, and not one of its own that was echoed."""
     return (
         (message.get_srcSystem(), message.get_srcComponent()) != (SYSTEM, COMPONENT)
         and getattr(message, "target_system", 0) in (0, SYSTEM)
@@ -285,7 +288,7 @@ def _is_ours(message: Any) -> bool:
     )
 
 
-def _silent(stations: Sequence[S]) -> S | None:
-    """The station that was silent for longest, if that is long."""
+def _silent_station(stations: Sequence[S]) -> S | None:
+    """The station silent for longest, if longer than `SILENCE_S`."""
     oldest = min(stations, key=lambda station: station.heard)
     return oldest if time.monotonic() - oldest.heard > SILENCE_S else None

@@ -1,4 +1,4 @@
-"""When ground stations are shown what: each message at its rate."""
+"""Telemetry schedule: sends each message at its rate."""
 
 from __future__ import annotations
 
@@ -7,56 +7,56 @@ from collections.abc import Iterator
 from typing import Any
 
 from mimopilot.sitl.autopilot.flight_modes import Severity
-from mimopilot.sitl.mavlink.vehicle.situation import Situation
-from mimopilot.sitl.mavlink.vehicle.telemetry_messages import OF_NO_STREAM, TOPICS
+from mimopilot.sitl.mavlink.vehicle.telemetry_messages import NO_STREAM, TELEMETRY_MESSAGES
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from pymavlink.dialects.v20 import common as mavlink
 
-MAX_RATE = 250.0  # Hz, of one message
-TEXT = 50  # characters of one STATUSTEXT
+MAX_RATE = 250.0  # Hz, of one message: the default control rate
+STATUSTEXT_BYTES = 50  # length of STATUSTEXT.text
 
 
 class Telemetry:
-    """When each message is due.
+    """Schedules and builds the telemetry messages.
 
     Parameters
     ----------
-    situation : Situation
+    state : VehicleState
         What they are made from.
     """
 
-    def __init__(self, situation: Situation) -> None:
-        self.situation = situation
-        self.rates = {number: topic.rate for number, topic in TOPICS.items()}
+    def __init__(self, state: VehicleState) -> None:
+        self.state = state
+        self.rates = {number: entry.rate for number, entry in TELEMETRY_MESSAGES.items()}
         self.due = {number: 0.0 for number, rate in self.rates.items() if rate > 0}
         self.next = 0.0
 
     def set_rate(self, number: int, rate: float) -> None:
-        """Send a message so often, Hz; 0: never. More than `MAX_RATE` is that."""
+        """Set the rate of a message, Hz, at most `MAX_RATE`; 0: never."""
         self.rates[number] = min(rate, MAX_RATE)
         self.due.pop(number, None)
         if rate > 0:
             self.due[number] = self.next = 0.0
 
     def hurry(self, number: int) -> None:
-        """Send a message at once that is sent anyway: something has changed."""
+        """Send a scheduled message at once, because its content has changed."""
         if number in self.due:
             self.due[number] = self.next = 0.0
 
     def set_stream(self, stream: int, rate: float) -> None:
-        """The same for all messages of a data stream; stream 0 is all of them."""
-        for number, topic in TOPICS.items():
-            if topic.stream != OF_NO_STREAM and stream in (mavlink.MAV_DATA_STREAM_ALL, topic.stream):
-                self.set_rate(number, rate if TOPICS[number].rate > 0 else 0.0)
+        """Set the rate of all messages of a data stream, Hz; stream 0 is all of them."""
+        for number, entry in TELEMETRY_MESSAGES.items():
+            if entry.stream != NO_STREAM and stream in (mavlink.MAV_DATA_STREAM_ALL, entry.stream):
+                self.set_rate(number, rate if entry.rate > 0 else 0.0)
 
     def build(self, number: int) -> Any:
-        """One message now; None when what it tells is not known."""
-        topic = TOPICS[number]
-        if topic.needs and not getattr(self.situation, topic.needs):
+        """Build one message now; None when its content is not known yet."""
+        entry = TELEMETRY_MESSAGES[number]
+        if entry.needs and not getattr(self.state, entry.needs):
             return None
-        return topic.build(self.situation)
+        return entry.build(self.state)
 
-    def messages(self, now: float) -> Iterator[Any]:
-        """What is due at a monotonic time (s), what waits longest first; what is not taken stays due."""
+    def take_due(self, now: float) -> Iterator[Any]:
+        """Build the messages due at a monotonic time (s), the longest overdue first; those not taken stay due."""
         if now < self.next:
             return
         for number in sorted((number for number, due in self.due.items() if now >= due), key=self.due.__getitem__):
@@ -69,8 +69,8 @@ class Telemetry:
 
 
 def texts(severity: Severity, text: str, number: int) -> list[Any]:
-    """STATUSTEXT, in pieces when it is long; `number` tells one long text from another, 1 to 65535."""
+    """Build STATUSTEXT, in chunks when it is long; `number` (1 to 65535) is the id that joins the chunks."""
     data = text.encode("ascii", "replace")
-    pieces = [data[i : i + TEXT] for i in range(0, len(data), TEXT)] or [b""]
+    pieces = [data[i : i + STATUSTEXT_BYTES] for i in range(0, len(data), STATUSTEXT_BYTES)] or [b""]
     mark = number if len(pieces) > 1 else 0
     return [mavlink.MAVLink_statustext_message(severity.value, piece, mark, i) for i, piece in enumerate(pieces)]

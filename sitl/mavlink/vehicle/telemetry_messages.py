@@ -1,4 +1,4 @@
-"""The messages that show a vehicle to ground stations, each made from its situation."""
+"""The telemetry messages, each built from the vehicle's state."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from typing import Any
 
 from mimopilot.sitl.autopilot.flight_modes import Mode
 from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, quaternions
-from mimopilot.sitl.mavlink.vehicle.situation import Situation
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
+from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from pymavlink.dialects.v20 import common as mavlink
 
-UNKNOWN_16 = 65535
+UNKNOWN_16 = 65535  # "unknown" in a uint16 field, MAVLink common.xml
 CAPABILITIES = (
     mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
     | mavlink.MAV_PROTOCOL_CAPABILITY_SET_ATTITUDE_TARGET
@@ -42,7 +43,7 @@ MODE_FLAGS = {
 }
 
 
-def heartbeat(s: Situation) -> Any:
+def heartbeat(s: VehicleState) -> Any:
     """HEARTBEAT."""
     vehicle = s.vehicle
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
@@ -52,76 +53,68 @@ def heartbeat(s: Situation) -> Any:
         status = mavlink.MAV_STATE_BOOT
     elif vehicle.armed and vehicle.in_failsafe:
         status = mavlink.MAV_STATE_CRITICAL
-    return mavlink.MAVLink_heartbeat_message(
-        mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_GENERIC, base, custom_mode(vehicle.mode), status, 3
-    )
+    kind, mode = (mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_GENERIC), custom_mode(vehicle.mode)
+    return mavlink.MAVLink_heartbeat_message(*kind, base, mode, status, MAVLINK_VERSION)
 
 
-def _sys_status(s: Situation) -> Any:
+def _sys_status(s: VehicleState) -> Any:
     vehicle = s.vehicle
     present = SENSORS | mavlink.MAV_SYS_STATUS_PREARM_CHECK
     if vehicle.pose.fresh(vehicle.now):
         present |= mavlink.MAV_SYS_STATUS_SENSOR_VISION_POSITION | mavlink.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
     healthy = present if not vehicle.arming_problems() else present & ~mavlink.MAV_SYS_STATUS_PREARM_CHECK
     if "plant" in vehicle.arming_blockers:
-        healthy = mavlink.MAV_SYS_STATUS_GEOFENCE  # there is no fence to breach, which is what its absence means
+        healthy = mavlink.MAV_SYS_STATUS_GEOFENCE  # without this bit ground stations report a fence breach
     return mavlink.MAVLink_sys_status_message(
         present, present, healthy, round(1000 * min(s.load, 1)), UNKNOWN_16, -1, -1, 0, 0, 0, 0, 0, 0
     )
 
 
-def _attitude(s: Situation) -> Any:
-    return mavlink.MAVLink_attitude_message(s.milliseconds, *_floats(s.row["attitude"]), *_floats(s.row["rates"]))
+def _attitude(s: VehicleState) -> Any:
+    return mavlink.MAVLink_attitude_message(s.milliseconds, *_floats(s.record["attitude"]), *_floats(s.record["rates"]))
 
 
-def _attitude_quaternion(s: Situation) -> Any:
+def _attitude_quaternion(s: VehicleState) -> Any:
     return mavlink.MAVLink_attitude_quaternion_message(
-        s.milliseconds, *_floats(s.row["quaternion"]), *_floats(s.row["rates"])
+        s.milliseconds, *_floats(s.record["quaternion"]), *_floats(s.record["rates"])
     )
 
 
-def _attitude_target(s: Situation) -> Any:
-    wanted = _floats(quaternions(s.row["setpoint"][None])[0])
+def _attitude_target(s: VehicleState) -> Any:
+    wanted = _floats(quaternions(s.record["setpoint"][None])[0])
     return mavlink.MAVLink_attitude_target_message(
-        s.milliseconds, 0, wanted, *_floats(s.row["rates_setpoint"]), float(s.row["collective"])
+        s.milliseconds, 0, wanted, *_floats(s.record["rates_setpoint"]), float(s.record["collective"])
     )
 
 
-def _local_position(s: Situation) -> Any:
+def _local_position(s: VehicleState) -> Any:
     return mavlink.MAVLink_local_position_ned_message(s.milliseconds, *s.local())
 
 
-def _global_position(s: Situation) -> Any:
-    above = s.state.alt - s.home[2]
+def _global_position(s: VehicleState) -> Any:
+    plant = s.plant
+    place = (plant.lat, plant.lon, plant.alt, plant.alt - s.home[2])
     return mavlink.MAVLink_global_position_int_message(
-        s.milliseconds,
-        s.state.lat,
-        s.state.lon,
-        s.state.alt,
-        above,
-        s.state.vx,
-        s.state.vy,
-        s.state.vz,
-        _heading(s, UNKNOWN_16),
+        s.milliseconds, *place, plant.vx, plant.vy, plant.vz, _heading(s, UNKNOWN_16)
     )
 
 
-def _gps_raw(s: Situation) -> Any:
+def _gps_raw(s: VehicleState) -> Any:
     stamp, latitude, longitude, altitude, eph, epv, speed, _, _, _, course, kind, satellites, *_ = s.fix
     return mavlink.MAVLink_gps_raw_int_message(
         stamp, kind, latitude, longitude, altitude, eph, epv, speed, course, satellites
     )
 
 
-def _vfr_hud(s: Situation) -> Any:
+def _vfr_hud(s: VehicleState) -> Any:
     e = s.vehicle.estimate
     speed = math.hypot(e.north, e.east)
     return mavlink.MAVLink_vfr_hud_message(
-        speed, speed, _heading(s, 0) // 100, _int16(100 * float(s.row["collective"])), e.altitude, e.climb
+        speed, speed, _heading(s, 0) // 100, _int16(100 * float(s.record["collective"])), e.altitude, e.climb
     )
 
 
-def _altitude(s: Situation) -> Any:
+def _altitude(s: VehicleState) -> Any:
     altitude, ground = s.vehicle.estimate.altitude, s.vehicle.vertical.ground
     home = s.home[2] / 1000
     return mavlink.MAVLink_altitude_message(
@@ -129,28 +122,28 @@ def _altitude(s: Situation) -> Any:
     )
 
 
-def _highres_imu(s: Situation) -> Any:
+def _highres_imu(s: VehicleState) -> Any:
     return mavlink.MAVLink_highres_imu_message(*s.imu[:14], s.imu[14] & 0xFFFF)
 
 
-def _scaled_imu(s: Situation) -> Any:
+def _scaled_imu(s: VehicleState) -> Any:
     imu = s.imu
     acceleration = (_int16(value / GRAVITY * 1000) for value in imu[1:4])
     rates_and_field = (_int16(value * 1000) for value in imu[4:10])
     return mavlink.MAVLink_scaled_imu_message(s.milliseconds, *acceleration, *rates_and_field, _int16(imu[13] * 100))
 
 
-def _servo_output(s: Situation) -> Any:
-    pulses = [_int16(1000 + 1000 * value) for value in _floats(s.row["commands"])]
+def _servo_output(s: VehicleState) -> Any:
+    pulses = [_int16(1000 + 1000 * value) for value in _floats(s.record["commands"])]
     return mavlink.MAVLink_servo_output_raw_message(max(s.stamp, 0) % 2**32, 0, *pulses[:8])
 
 
-def _actuators(s: Situation) -> Any:
-    commands = _floats(s.row["commands"])
+def _actuators(s: VehicleState) -> Any:
+    commands = _floats(s.record["commands"])
     return mavlink.MAVLink_actuator_output_status_message(max(s.stamp, 0), len(commands), commands + [0.0] * 16)
 
 
-def _extended_state(s: Situation) -> Any:
+def _extended_state(s: VehicleState) -> Any:
     vehicle = s.vehicle
     state = mavlink.MAV_LANDED_STATE_ON_GROUND if vehicle.vertical.landed else mavlink.MAV_LANDED_STATE_IN_AIR
     if vehicle.armed and vehicle.mode is Mode.TAKEOFF:
@@ -160,30 +153,42 @@ def _extended_state(s: Situation) -> Any:
     return mavlink.MAVLink_extended_sys_state_message(mavlink.MAV_VTOL_STATE_UNDEFINED, state)
 
 
-def _battery(s: Situation) -> Any:
-    """Nothing is known of it: the simulator's link carries no battery."""
+def _battery(s: VehicleState) -> Any:
+    """All fields unknown: the simulator API carries no battery state."""
     return mavlink.MAVLink_battery_status_message(0, 0, 0, 32767, [UNKNOWN_16] * 10, -1, -1, -1, -1)
 
 
-def _home_position(s: Situation) -> Any:
+def _home_position(s: VehicleState) -> Any:
     return mavlink.MAVLink_home_position_message(*s.home, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0)
 
 
-def _excitation(s: Situation) -> Any:
-    """What is injected, as the firmware's module publishes it."""
-    roll, pitch, _ = _floats(s.row["excitation"])
-    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, max(s.stamp, 0), roll, pitch, float(s.excited))
+def _excitation(s: VehicleState) -> Any:
+    """Injected torque, as the firmware's module publishes it."""
+    roll, pitch, _ = _floats(s.record["excitation"])
+    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, max(s.stamp, 0), roll, pitch, float(s.excitation_phase))
 
 
-def _autopilot_version(s: Situation) -> Any:
+def _autopilot_version(s: VehicleState) -> Any:
     return mavlink.MAVLink_autopilot_version_message(CAPABILITIES, 0, 0, 0, 0, bytes(8), bytes(8), bytes(8), 0, 0, 0)
 
 
 @dataclass(frozen=True)
-class Topic:
-    """A message: how it is made, how often by default (Hz), its data stream, and what must be known for it."""
+class TelemetryMessage:
+    """One telemetry message.
 
-    build: Callable[[Situation], Any]
+    Attributes
+    ----------
+    build : callable
+        Builds it.
+    rate : float, Hz
+        Default rate; 0: only on request.
+    stream : int
+        Its MAV_DATA_STREAM, or `NO_STREAM`.
+    needs : str
+        The `VehicleState` attribute that must be known; empty: none.
+    """
+
+    build: Callable[[VehicleState], Any]
     rate: float
     stream: int
     needs: str = "home"
@@ -192,29 +197,29 @@ class Topic:
 _STATUS, _POSITION = mavlink.MAV_DATA_STREAM_EXTENDED_STATUS, mavlink.MAV_DATA_STREAM_POSITION
 _RAW, _CONTROLLER = mavlink.MAV_DATA_STREAM_RAW_SENSORS, mavlink.MAV_DATA_STREAM_RC_CHANNELS
 _ATTITUDE, _HUD = mavlink.MAV_DATA_STREAM_EXTRA1, mavlink.MAV_DATA_STREAM_EXTRA2
-OF_NO_STREAM = -1
+NO_STREAM = -1
 
-#: Message number -> topic.
-TOPICS = {
-    mavlink.MAVLINK_MSG_ID_HEARTBEAT: Topic(heartbeat, 1.0, OF_NO_STREAM, ""),
-    mavlink.MAVLINK_MSG_ID_SYS_STATUS: Topic(_sys_status, 1.0, _STATUS, ""),
-    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Topic(_extended_state, 2.0, _STATUS),
-    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: Topic(_battery, 0.5, _STATUS, ""),
-    mavlink.MAVLINK_MSG_ID_HOME_POSITION: Topic(_home_position, 0.5, OF_NO_STREAM),
-    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: Topic(_autopilot_version, 0.0, OF_NO_STREAM, ""),
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: Topic(_attitude, 20.0, _ATTITUDE),
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: Topic(_attitude_quaternion, 20.0, _ATTITUDE),
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_TARGET: Topic(_attitude_target, 5.0, _ATTITUDE),
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: Topic(_local_position, 10.0, _POSITION),
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: Topic(_global_position, 5.0, _POSITION),
-    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: Topic(_gps_raw, 2.0, _STATUS, "fix"),
-    mavlink.MAVLINK_MSG_ID_VFR_HUD: Topic(_vfr_hud, 5.0, _HUD),
-    mavlink.MAVLINK_MSG_ID_ALTITUDE: Topic(_altitude, 5.0, _HUD),
-    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: Topic(_highres_imu, 5.0, _RAW, "imu"),
-    mavlink.MAVLINK_MSG_ID_DEBUG_VECT: Topic(_excitation, 0.0, OF_NO_STREAM),
-    mavlink.MAVLINK_MSG_ID_SCALED_IMU: Topic(_scaled_imu, 0.0, _RAW, "imu"),
-    mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: Topic(_servo_output, 5.0, _CONTROLLER),
-    mavlink.MAVLINK_MSG_ID_ACTUATOR_OUTPUT_STATUS: Topic(_actuators, 0.0, OF_NO_STREAM),
+#: Message number -> how it is sent.
+TELEMETRY_MESSAGES = {
+    mavlink.MAVLINK_MSG_ID_HEARTBEAT: TelemetryMessage(heartbeat, 1.0, NO_STREAM, ""),
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS: TelemetryMessage(_sys_status, 1.0, _STATUS, ""),
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: TelemetryMessage(_extended_state, 2.0, _STATUS),
+    mavlink.MAVLINK_MSG_ID_BATTERY_STATUS: TelemetryMessage(_battery, 0.5, _STATUS, ""),
+    mavlink.MAVLINK_MSG_ID_HOME_POSITION: TelemetryMessage(_home_position, 0.5, NO_STREAM),
+    mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: TelemetryMessage(_autopilot_version, 0.0, NO_STREAM, ""),
+    mavlink.MAVLINK_MSG_ID_ATTITUDE: TelemetryMessage(_attitude, 20.0, _ATTITUDE),
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: TelemetryMessage(_attitude_quaternion, 20.0, _ATTITUDE),
+    mavlink.MAVLINK_MSG_ID_ATTITUDE_TARGET: TelemetryMessage(_attitude_target, 5.0, _ATTITUDE),
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: TelemetryMessage(_local_position, 10.0, _POSITION),
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: TelemetryMessage(_global_position, 5.0, _POSITION),
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: TelemetryMessage(_gps_raw, 2.0, _STATUS, "fix"),
+    mavlink.MAVLINK_MSG_ID_VFR_HUD: TelemetryMessage(_vfr_hud, 5.0, _HUD),
+    mavlink.MAVLINK_MSG_ID_ALTITUDE: TelemetryMessage(_altitude, 5.0, _HUD),
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: TelemetryMessage(_highres_imu, 5.0, _RAW, "imu"),
+    mavlink.MAVLINK_MSG_ID_DEBUG_VECT: TelemetryMessage(_excitation, 0.0, NO_STREAM),
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU: TelemetryMessage(_scaled_imu, 0.0, _RAW, "imu"),
+    mavlink.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: TelemetryMessage(_servo_output, 5.0, _CONTROLLER),
+    mavlink.MAVLINK_MSG_ID_ACTUATOR_OUTPUT_STATUS: TelemetryMessage(_actuators, 0.0, NO_STREAM),
 }
 
 
@@ -222,8 +227,8 @@ def _floats(values: Any) -> list[float]:
     return [float(value) for value in values]
 
 
-def _heading(s: Situation, unknown: int) -> int:
-    """0.01 deg; a plant may tell an attitude that is none."""
+def _heading(s: VehicleState, unknown: int) -> int:
+    """Heading, 0.01 deg; `unknown` when the plant's attitude is not finite."""
     yaw = s.vehicle.estimate.yaw
     return round(math.degrees(yaw) * 100) % 36000 if math.isfinite(yaw) else unknown
 

@@ -1,4 +1,4 @@
-"""MAVLink commands to the vehicle, and their acknowledgements."""
+"""MAVLink commands to the vehicle, and their acknowledgements (mavlink.io/en/services/command.html)."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 from mimopilot.sitl.autopilot.flight_modes import Commander, Denied, Failed, Mode, Refused, Severity
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
-from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TOPICS
+from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TELEMETRY_MESSAGES
 from mimopilot.sitl.mavlink.wire.px4_modes import mode_of, mode_of_pair
 from pymavlink.dialects.v20 import common as mavlink
 
-FORCE = 21196  # param2 of arm and disarm: override
-TAKEOFF_HEIGHT = 2.5  # m, when none is given
-MAX_INTERVAL_US = 2_000_000_000  # MESSAGE_INTERVAL can tell little more
+FORCE = 21196  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: override the checks
+TAKEOFF_HEIGHT = 2.5  # m, when none is given: PX4's default of MIS_TAKEOFF_ALT
+MAX_INTERVAL_US = 2_000_000_000  # us; MESSAGE_INTERVAL's int32 holds little more
 
 
 class Unsupported(Refused):
-    """Asked of many vehicles, and not known to this one: no news for the pilot."""
+    """The vehicle does not know what was requested. The pilot gets no text: ground stations probe routinely."""
 
 
 RESULTS = {
@@ -41,7 +41,7 @@ class Command:
     params : tuple of float
         param1 to param7; NaN: not given.
     absolute : bool
-        Whether param7 is an altitude above the sea.
+        Whether param7 is an altitude above mean sea level.
     """
 
     number: int
@@ -50,7 +50,7 @@ class Command:
 
     @classmethod
     def of(cls, message: Any) -> Command:
-        """From either message."""
+        """Make it from either message."""
         if message.get_type() == "COMMAND_LONG":
             last: tuple[float, float, float] = (message.param5, message.param6, message.param7)
             absolute = False
@@ -61,12 +61,12 @@ class Command:
         return cls(message.command, tuple(float(value) for value in params), absolute)
 
     def whole(self, place: int) -> int:
-        """A parameter (1 to 7) that is a whole number.
+        """Parameter 1 to 7 as a whole number.
 
         Raises
         ------
         Denied
-            When it is none.
+            When it is not a whole number.
         """
         value = self.params[place - 1]
         if not (math.isfinite(value) and value == round(value)):
@@ -74,24 +74,24 @@ class Command:
         return round(value)
 
 
-#: A command's handler: messages to send behind the acknowledgement; it may raise `Refused`.
+#: A command's handler: returns the messages to send after the acknowledgement; may raise `Refused`.
 Handler = Callable[[Command], list[Any]]
 
 
 class VehicleCommands:
-    """Carries commands out.
+    """Executes commands.
 
     Parameters
     ----------
     vehicle : Commander
     telemetry : Telemetry
     reboot : callable
-        Puts the vehicle back at its start; may raise `Refused`.
+        Resets the vehicle to its start; may raise `Refused`.
 
     Attributes
     ----------
     handlers : dict
-        MAV_CMD -> handler; others may add theirs.
+        MAV_CMD -> handler; other modules may add theirs.
     """
 
     def __init__(self, vehicle: Commander, telemetry: Telemetry, reboot: Callable[[], None]) -> None:
@@ -109,8 +109,8 @@ class VehicleCommands:
             mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
         }
 
-    def answer(self, message: Any) -> list[Any]:
-        """Carry a command out; the acknowledgement, and what comes with it."""
+    def execute(self, message: Any) -> list[Any]:
+        """Execute a command; return its acknowledgement and the messages that follow it."""
         sender = message.get_srcSystem(), message.get_srcComponent()
 
         def acknowledge(result: int) -> Any:
@@ -128,7 +128,7 @@ class VehicleCommands:
         return [acknowledge(mavlink.MAV_RESULT_ACCEPTED), *more]
 
     def set_mode(self, message: Any) -> list[Any]:
-        """SET_MODE, the older message: it has no acknowledgement."""
+        """Execute SET_MODE, the deprecated message; it has no acknowledgement."""
         try:
             self.vehicle.enter(mode_of(message.custom_mode))
         except Refused as refusal:
@@ -158,22 +158,22 @@ class VehicleCommands:
 
     def _set_mode(self, command: Command) -> list[Any]:
         if not command.whole(1) & mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED:
-            raise Denied("modes are set by their number: base_mode 1, custom_mode")
+            raise Denied("set modes by number: base_mode 1 and a custom_mode")
         main = command.whole(2)
-        whole = main > 0xFF  # the whole custom_mode in one, as MAVProxy sends it
+        whole = main > 0xFF  # the whole custom_mode in param2, as MAVProxy sends it
         self.vehicle.enter(mode_of(main) if whole else mode_of_pair(main, command.whole(3)))
         return []
 
-    def _topic(self, command: Command) -> int:
+    def _message_number(self, command: Command) -> int:
         number = command.whole(1)
-        if number not in TOPICS:
-            raise Unsupported(f"there is no message {number} here")
+        if number not in TELEMETRY_MESSAGES:
+            raise Unsupported(f"message {number} is not supported")
         return number
 
     def _set_interval(self, command: Command) -> list[Any]:
-        number, interval = self._topic(command), command.params[1]
+        number, interval = self._message_number(command), command.params[1]
         if interval == 0:
-            self.telemetry.set_rate(number, TOPICS[number].rate)
+            self.telemetry.set_rate(number, TELEMETRY_MESSAGES[number].rate)
         elif interval == -1:
             self.telemetry.set_rate(number, 0.0)
         elif 0 < interval <= MAX_INTERVAL_US:
@@ -191,10 +191,10 @@ class VehicleCommands:
         return [mavlink.MAVLink_message_interval_message(number % 65536, interval)]
 
     def _request_message(self, command: Command) -> list[Any]:
-        number = self._topic(command)
+        number = self._message_number(command)
         message = self.telemetry.build(number)
         if message is None:
-            raise Refused(f"message {number}: nothing is known yet")
+            raise Refused(f"message {number}: no data yet; wait for the plant")
         return [message]
 
     def _capabilities(self, command: Command) -> list[Any]:
@@ -203,13 +203,13 @@ class VehicleCommands:
     def _home(self, command: Command) -> list[Any]:
         message = self.telemetry.build(mavlink.MAVLINK_MSG_ID_HOME_POSITION)
         if message is None:
-            raise Refused("no home: no plant has told a position yet")
+            raise Refused("no home position: the plant has sent none yet")
         return [message]
 
     def _reboot(self, command: Command) -> list[Any]:
         if command.whole(1) not in (1, 3):
             raise Denied("reboot: param1 must be 1")
         if self.vehicle.armed:
-            raise Refused("no reboot: armed")
+            raise Refused("no reboot: armed; disarm first")
         self.reboot()
         return []

@@ -1,1 +1,1 @@
-"""Bytes and numbers of MAVLink 2, for both ends of a link."""
+"""MAVLink 2 wire format, for both ends of a link: frames, signing, sockets, mode numbers, parameter files."""

@@ -1,8 +1,7 @@
-"""MAVLink 2 at full rate: a message is a tuple of its fields in the order of the wire.
+"""MAVLink 2 codec for the control rate: a message is a tuple of its fields in wire order.
 
-The bytes, the layouts and the checks are pymavlink's; only the objects between bytes and numbers are left out,
-which cost more than everything else in a control period. `Codec` in `sitl.mavlink.wire.link` is for everything that
-is not sent hundreds of times a second.
+The bytes, layouts and checksums are pymavlink's. Only its message objects are left out: they cost more than
+everything else in a control period. For messages sent less often, see `sitl.mavlink.wire.codec.Codec`.
 """
 
 from __future__ import annotations
@@ -13,8 +12,9 @@ import struct
 import time
 from typing import Any
 
+from mimopilot.sitl.mavlink.wire.codec import CRC_BYTES, SIGNED, checksum
+from mimopilot.sitl.mavlink.wire.signing import SIGNATURE_BYTES
 from pymavlink.dialects.v20 import common as mavlink
-from pymavlink.generator.mavcrc import x25crc
 
 # Fields in wire order, arrays flattened:
 SENSOR = mavlink.MAVLink_hil_sensor_message  # time_usec, acc 3, gyro 3, mag 3, 4 of pressure, fields_updated, id
@@ -22,21 +22,21 @@ STATE = mavlink.MAVLink_hil_state_quaternion_message  # time_usec, q 4, rates 3,
 GPS = mavlink.MAVLink_hil_gps_message  # time_usec, lat lon alt, eph epv vel, v 3, cog, fix_type, satellites, id, yaw
 ACTUATORS = mavlink.MAVLink_hil_actuator_controls_message  # time_usec, flags, controls 16, mode
 
-MARK = b"\xfd"
+#: Bit of HIL_ACTUATOR_CONTROLS.mode, and of its flags.
+ARMED: int = mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+LOCKSTEP: int = mavlink.HIL_ACTUATOR_CONTROLS_FLAGS_LOCKSTEP
+
+MARK = bytes((mavlink.PROTOCOL_MARKER_V2,))
 HEADER = struct.Struct("<BBBBBBHB")  # length, 2 x flags, sequence, system, component, 3 bytes of message id
-OVERHEAD = 12  # mark, header, checksum
-SIGNED, SIGNATURE = 1, 13
-SPIN_S = 200e-6
+HEADER_BYTES = len(MARK) + HEADER.size
+OVERHEAD = HEADER_BYTES + CRC_BYTES
+READ_BYTES = 65536  # read from a link at once; chosen
+SPIN_S = 200e-6  # s; chosen longer than a peer at full speed takes to answer
 
 Message = tuple[Any, tuple[Any, ...]]
 
 
-def _checksum(data: bytes, extra: int) -> bytes:
-    value: int = x25crc(data + bytes((extra,))).crc
-    return value.to_bytes(2, "little")
-
-
-class LeanCodec:
+class FastCodec:
     """Packs and parses messages of one peer.
 
     Parameters
@@ -47,7 +47,7 @@ class LeanCodec:
     Attributes
     ----------
     skipped : int
-        Bytes received so far that belonged to no message.
+        Received bytes that belonged to no message.
     """
 
     def __init__(self, system: int, component: int) -> None:
@@ -56,7 +56,7 @@ class LeanCodec:
         self._rest = b""
 
     def pack(self, kind: Any, *fields: Any) -> bytes:
-        """Bytes of one message; `kind` is its class in pymavlink's dialect."""
+        """Pack one message; `kind` is its class in pymavlink's dialect."""
         payload = kind.unpacker.pack(*fields).rstrip(b"\0") or b"\0"
         number = kind.id
         header = HEADER.pack(
@@ -64,13 +64,13 @@ class LeanCodec:
         )
         self.sequence = (self.sequence + 1) % 256
         body = header + payload
-        return MARK + body + _checksum(body, kind.crc_extra)
+        return MARK + body + checksum(body, kind.crc_extra)
 
     def parse(self, data: bytes) -> list[Message]:
-        """Whole messages in the stream so far, each as its kind and its fields.
+        """Parse the complete messages in the stream so far, each as its kind and its fields.
 
-        A frame that has only begun never holds back a whole one behind it: noise that looks like the beginning
-        of a long message would make a peer in lockstep wait for ever.
+        An incomplete frame never holds back a complete one behind it. Otherwise noise that looks like the start of
+        a long message would block a peer in lockstep for ever.
         """
         buffer = self._rest + data
         found: list[Message] = []
@@ -95,35 +95,35 @@ class LeanCodec:
 
     @staticmethod
     def _end(buffer: bytes, at: int) -> int:
-        """Where the frame that may begin at `at` ends."""
+        """End of the frame that may start at `at`."""
         if len(buffer) - at < OVERHEAD:
             return at + OVERHEAD + 1
-        return at + OVERHEAD + buffer[at + 1] + (SIGNATURE if buffer[at + 2] & SIGNED else 0)
+        return at + OVERHEAD + buffer[at + 1] + (SIGNATURE_BYTES if buffer[at + 2] & SIGNED else 0)
 
     @staticmethod
     def _message(frame: bytes) -> Message | None:
-        """What a whole frame holds; None when it is none."""
+        """Decode a complete frame; None when it is not valid."""
         length, flags, _, _, _, _, low, high = HEADER.unpack_from(frame, 1)
         kind = mavlink.mavlink_map.get(low + (high << 16))
         if kind is None or flags & ~SIGNED:
             return None
-        stop = 10 + length
-        if _checksum(frame[1:stop], kind.crc_extra) != frame[stop : stop + 2]:
+        stop = HEADER_BYTES + length
+        if checksum(frame[1:stop], kind.crc_extra) != frame[stop : stop + CRC_BYTES]:
             return None
         size = kind.unpacker.size
-        return kind, kind.unpacker.unpack(frame[10:stop][:size].ljust(size, b"\0"))
+        return kind, kind.unpacker.unpack(frame[HEADER_BYTES:stop][:size].ljust(size, b"\0"))
 
 
 def receive(connection: socket.socket, spin: float = 0.0) -> bytes | None:
-    """What has come to a non-blocking socket, or comes within `spin` s; None when nothing, empty when the peer left.
+    """Read a non-blocking socket, polling for up to `spin` s; None when no data came, empty when the peer closed it.
 
-    A process that sleeps takes longer to wake than a peer at full speed takes to answer: both look for `SPIN_S`
-    before they sleep. Whoever else wants the processor gets it.
+    Waking from sleep takes longer than a peer at full speed needs to answer, so both ends poll for `SPIN_S` first.
+    Polling yields the processor to other processes.
     """
     until = time.monotonic() + spin
     while True:
         try:
-            return connection.recv(65536)
+            return connection.recv(READ_BYTES)
         except BlockingIOError:
             if time.monotonic() >= until:
                 return None

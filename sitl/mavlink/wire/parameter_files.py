@@ -1,7 +1,7 @@
-"""Parameter files of the three ground stations: every float32 is written so that it is read back with the same bits.
+"""Parameter files of QGroundControl, MAVProxy and Mission Planner: float32 values read back bit for bit.
 
-The first line, a comment to all three, says how many parameters follow and the SHA-256 of the rest: half of a gain
-matrix is never taken for the whole.
+The first line, a comment in all three formats, holds the number of parameters and the SHA-256 of the rest. So a
+truncated file, with half a gain matrix, is detected.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import REAL32, shortest, single
+from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
+from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest, single
 
 from mimopilot.common.files import read_text, sha256
 from mimopilot.common.toml import shown
 
-SEAL = re.compile(r"# mimopilot: (\d+) parameters, sha256 ([0-9a-f]{64})")
-NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")
+CHECKSUM_LINE = re.compile(r"# mimopilot: (\d+) parameters, sha256 ([0-9a-f]{64})")
+NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")  # 16 characters: MAVLink's param_id
 
 
 def _qgc(values: Mapping[str, float], system: int, component: int) -> str:
@@ -34,12 +35,12 @@ def _mission_planner(values: Mapping[str, float], system: int, component: int) -
     return "".join(f"{name},{shortest(value)}\n" for name, value in values.items())
 
 
-#: Format -> its writer: QGroundControl's .params, MAVProxy's .parm, Mission Planner's .param.
+#: Format -> writer: QGroundControl's .params, MAVProxy's .parm, Mission Planner's .param.
 FORMATS = {"qgc": _qgc, "mavproxy": _mavproxy, "missionplanner": _mission_planner}
 
 
 def parameter_text(
-    form: str, values: Mapping[str, float], system: int = 1, component: int = 1, seal: bool = True
+    form: str, values: Mapping[str, float], system: int = SYSTEM, component: int = COMPONENT, checksum: bool = True
 ) -> str:
     """Text of a parameter file.
 
@@ -50,73 +51,74 @@ def parameter_text(
     values : mapping
         Name -> value; rounded to single precision.
     system, component : int
-        The vehicle's, which only QGroundControl's files hold.
-    seal : bool
-        Begin with the line that vouches for the rest; False for a file that is meant to be edited.
+        The vehicle's identity; only QGroundControl's files hold it.
+    checksum : bool
+        Begin with the checksum line; False for a file that is meant to be edited.
     """
     body = FORMATS[form](values, system, component)
-    first = f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n" if seal else ""
+    first = f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n" if checksum else ""
     return first + body
 
 
 def read_parameters(path: Path) -> dict[str, float]:
-    """Name -> value in single precision, from a parameter file of any of the three formats.
+    """Read a parameter file of any of the three formats: name -> value in single precision.
 
     Raises
     ------
-    TuningError
+    InputFileError
         When the file cannot be read.
     SitlError
-        With the line, when it is none of them, a name is impossible or repeated, or a value is not a finite float. When
-        it is not what its first line says was written.
+        With the line, when the format is unknown, a name is invalid or repeated, or a value is not a finite float.
+        When the file does not match its checksum line.
     """
     text = read_text(path, "parameter file")
-    _check_seal(text, path)
+    _verify_checksum(text, path)
     values: dict[str, float] = {}
     for number, line in enumerate(text.splitlines(), 1):
         content = line.split("#")[0].strip()
         if not content:
             continue
         where = f"{path}, line {number}"
-        name, value = _entry(content, where)
+        name, value = _parse_line(content, where)
         if name in values:
-            raise SitlError(f"{where}: {name} stands in the file twice")
+            raise SitlError(f"{where}: {name} is in the file twice; delete one of the lines")
         values[name] = value
     if not values:
-        raise SitlError(f"{path}: holds no parameters")
+        raise SitlError(f"{path}: holds no parameters; use another file")
     return values
 
 
-def _check_seal(text: str, path: Path) -> None:
-    """Refuse a file that is not what its first line says was written."""
-    seal = SEAL.match(text)
-    if seal is None:
+def _verify_checksum(text: str, path: Path) -> None:
+    """Refuse a file that does not match its checksum line."""
+    expected = CHECKSUM_LINE.match(text)
+    if expected is None:
         return
-    body = text[seal.end() :].strip()
+    body = text[expected.end() :].strip()
     count = sum(bool(line) and not line.startswith("#") for line in body.splitlines())
-    if count != int(seal[1]):
+    if count != int(expected[1]):
         raise SitlError(
-            f"{path}: holds {count} parameters, but its first line says {seal[1]}: it is not whole; use another copy"
+            f"{path}: incomplete: holds {count} parameters, but its first line says {expected[1]}; use another copy"
         )
-    if sha256(body) != seal[2]:
+    if sha256(body) != expected[2]:
         raise SitlError(
-            f"{path}: is not what its first line vouches for: it was cut short, damaged or edited; use another copy, "
-            "or delete the first line to take the values as they are"
+            f"{path}: does not match the checksum in its first line: it was cut short, damaged or edited; use another "
+            "copy, or delete the first line to use the values as they are"
         )
 
 
-def _entry(content: str, where: str) -> tuple[str, float]:
+def _parse_line(content: str, where: str) -> tuple[str, float]:
     fields = content.split("\t")
     if len(fields) == 5:
         if fields[4] != str(REAL32):
-            raise SitlError(f"{where}: {fields[2]}: param_type {fields[4]}, expected {REAL32}: only floats are written")
+            raise SitlError(
+                f"{where}: {fields[2]}: param_type {fields[4]}, expected {REAL32}; "
+                "delete the line, only floats can be written"
+            )
         fields = fields[2:4]
     else:
         fields = content.split(",") if "," in content else content.split()
     if len(fields) != 2 or not NAME.fullmatch(fields[0].strip()):
-        raise SitlError(
-            f"{where}: got {shown(content)}, expected a parameter's name (16 capitals at most) and its value"
-        )
+        raise SitlError(f"{where}: got {shown(content)}, expected a parameter name (at most 16 capitals) and its value")
     try:
         value = float(fields[1])
     except ValueError:

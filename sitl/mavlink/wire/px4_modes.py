@@ -1,4 +1,4 @@
-"""Flight modes by number, as PX4 numbers them: MAVSDK speaks these to every autopilot that is not ArduPilot."""
+"""PX4's flight mode numbers (px4_custom_mode.h): MAVSDK uses them for every autopilot but ArduPilot."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ NUMBERS = {
     Mode.LAND: (4, 6),
     Mode.OFFBOARD: (6, 0),
 }
-#: And back; a main mode alone is its plainest mode.
+#: The inverse; main mode AUTO without a sub mode is HOLD.
 MODES = {numbers: mode for mode, numbers in NUMBERS.items()} | {(4, 0): Mode.HOLD}
 
-#: Mode -> PX4's nav_state, which MIMO_EX_MODE names.
+#: Mode -> PX4's nav_state (vehicle_status.msg), the value of MIMO_EX_MODE.
 NAV_STATES = {Mode.ALTITUDE: 1, Mode.HOLD: 4, Mode.OFFBOARD: 14, Mode.TAKEOFF: 17, Mode.LAND: 18}
-#: Mode of a PX4 in which something may be injected -> its nav_state, and its main and sub mode.
+#: PX4 mode in which excitation is allowed -> its nav_state, main mode and sub mode.
 EXCITED_MODES = {"altitude": (1, 2, 0), "position": (2, 3, 0), "hold": (4, 4, 3), "offboard": (14, 6, 0)}
 
 
@@ -28,7 +28,7 @@ def custom_mode(mode: Mode) -> int:
 
 
 def mode_of(custom: int) -> Mode:
-    """The mode of a custom_mode.
+    """Mode of a custom_mode.
 
     Raises
     ------
@@ -39,15 +39,15 @@ def mode_of(custom: int) -> Mode:
 
 
 def mode_of_pair(main: int, sub: int) -> Mode:
-    """The mode of a main and a sub mode; raises as `mode_of`."""
+    """Mode of a main and a sub mode; raises as `mode_of`."""
     found = MODES.get((main, sub))
     if found is None:
         known = ", ".join(f"{mode.value} {custom_mode(mode)}" for mode in NUMBERS if mode is not Mode.TAKEOFF)
-        raise Denied(f"no mode {main}/{sub}; there are {known}")
+        raise Denied(f"no mode {main}/{sub}; use one of {known}")
     return found
 
 
 def nav_state(custom: int) -> int:
-    """PX4's nav_state of a custom_mode, of the modes in which something may be injected; -1 of all others."""
+    """PX4's nav_state of a custom_mode in which excitation is allowed; -1 for any other."""
     pair = custom >> 16 & 0xFF, custom >> 24 & 0xFF
     return next((state for state, *numbers in EXCITED_MODES.values() if tuple(numbers) == pair), -1)

@@ -1,7 +1,7 @@
-"""MAVLink 2 signing: who holds the key may speak, and what was said once is not believed again.
+"""MAVLink 2 signing (mavlink.io/en/guide/message_signing.html): rejects frames without the key, and replayed ones.
 
-A signature is the first 48 bits of SHA-256 over the key and the frame, link number and time stamp included. The time
-stamp counts 10 us since 2015; on every stream (link, system, component) it must grow.
+The signature is the first 48 bits of SHA-256 over the key and the frame, including link number and timestamp. The
+timestamp counts units of 10 us since 2015-01-01. It must increase on every stream (link, system, component).
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from mimopilot.common.files import read_bytes
 
 KEY_BYTES = 32
 EPOCH_S, UNITS_PER_S = 1420070400, 100_000  # 2015-01-01
-#: A stream that was never heard may begin so long before our own time: clocks differ.
+#: How far the first timestamp of a stream may lag our clock: one minute, from the MAVLink guide.
 NEW_STREAM_UNITS = 60 * UNITS_PER_S
-#: Streams that are remembered: only who holds the key makes one.
+#: Most streams remembered, chosen to bound memory; only a holder of the key can open one.
 MAX_STREAMS = 1000
 STAMP_BYTES, TAIL_BYTES, SIGNATURE_BYTES = 6, 6, 13
 
 
 def read_key(path: Path) -> bytes:
-    """Signing key from a file: 32 bytes, or 64 hexadecimal digits.
+    """Read a signing key from a file: 32 bytes, or 64 hexadecimal digits.
 
     Raises
     ------
-    TuningError
-        When it cannot be read.
+    InputFileError
+        When the file cannot be read.
     SitlError
-        When it holds neither.
+        When it holds no key.
     """
     content = read_bytes(path, "signing key")
     if len(content) == KEY_BYTES:
@@ -48,20 +48,19 @@ def read_key(path: Path) -> bytes:
 
 
 class Signer:
-    """Signs frames and checks those of others; one for all links of a vehicle or ground station.
+    """Signs outgoing frames and checks incoming ones; one instance for all links of a vehicle or ground station.
 
     Parameters
     ----------
     key : bytes
-        The 32 bytes that both sides share.
+        The 32 bytes that both ends share.
     clock : callable
         Seconds since 1970.
 
     Attributes
     ----------
     behind : float, s
-        How far the last message that was made with the key, and was too old to begin a stream, is behind our time; 0:
-        there was none.
+        How far the last correctly signed frame that was too old to open a stream lags our clock; 0: none yet.
     """
 
     def __init__(self, key: bytes, clock: Callable[[], float] = time.time) -> None:
@@ -73,29 +72,35 @@ class Signer:
     def _tail(self, signed: bytes) -> bytes:
         return hashlib.sha256(self.key + signed).digest()[:TAIL_BYTES]
 
-    def _now(self) -> int:
-        """Own time, never earlier than what was heard or sent."""
+    def _advance_clock(self) -> int:
+        """Advance the signing clock to now; it never falls behind a timestamp received or sent."""
         self.stamp = max(self.stamp, int((self.clock() - EPOCH_S) * UNITS_PER_S))
         return self.stamp
 
     def sign(self, frame: bytes, link: int = 0) -> bytes:
-        """The frame (its flag is set already) with link number, time stamp and signature."""
-        self.stamp = self._now() + 1
+        """Append link number, timestamp and signature to a frame whose signed flag is set already."""
+        self.stamp = self._advance_clock() + 1
         signed = frame + bytes([link]) + self.stamp.to_bytes(STAMP_BYTES, "little")
         return signed + self._tail(signed)
 
-    def accepts(self, frame: bytes, system: int, component: int) -> bool:
-        """Whether a signed frame was made with the key and is newer than the last of its stream.
+    def accept(self, frame: bytes, system: int, component: int) -> bool:
+        """Take a signed frame if its signature is right and it is newer than the last of its stream.
 
-        The signature is checked first: a forged time stamp must not shut out the one whose stream it names.
+        The signature is checked first, so that a forged timestamp cannot block the stream that it names.
+
+        Returns
+        -------
+        bool
+            Whether the frame was accepted.
         """
         if not hmac.compare_digest(self._tail(frame[:-TAIL_BYTES]), frame[-TAIL_BYTES:]):
             return False
         stream = frame[-SIGNATURE_BYTES], system, component
         stamp = int.from_bytes(frame[-SIGNATURE_BYTES + 1 : -TAIL_BYTES], "little")
-        last = self.heard.get(stream, self._now() - NEW_STREAM_UNITS)
+        now = self._advance_clock()
+        last = self.heard.get(stream, now - NEW_STREAM_UNITS)
         if stamp <= last and stream not in self.heard:
-            self.behind = (self._now() - stamp) / UNITS_PER_S
+            self.behind = (now - stamp) / UNITS_PER_S
         if stamp <= last or (stream not in self.heard and len(self.heard) >= MAX_STREAMS):
             return False
         self.heard[stream] = stamp

@@ -1,6 +1,6 @@
-"""How late the control loop gets when a ground station floods it: `python -m tests.sitl.mavlink.flood`.
+"""Delay of the control loop when a ground station floods it: `python -m tests.sitl.mavlink.flood`.
 
-The vehicle runs in real time, with its plant; the flood comes from another process as fast as that can send.
+The vehicle runs in real time, with its plant; this process floods it as fast as it can send.
 """
 
 import os
@@ -10,15 +10,15 @@ import socket
 import time
 from typing import NamedTuple
 
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.common.console import print_table
 from tests.sitl.mavlink.running import running_sitl
 
 
-class Lateness(NamedTuple):
-    """Control periods, how long the worst waited (ms), and how many waited for more than a millisecond."""
+class FloodResult(NamedTuple):
+    """Control periods, the longest response (ms), responses longer than a millisecond, and datagrams sent."""
 
     periods: int
     worst_ms: float
@@ -27,7 +27,7 @@ class Lateness(NamedTuple):
 
 
 def datagrams(sort):
-    """What a flood is made of."""
+    """Datagrams of one sort of flood."""
     codec = Codec(255, 190)
 
     def pack(message):
@@ -35,7 +35,7 @@ def datagrams(sort):
 
     if sort == "junk":
         return [os.urandom(300) for _ in range(50)]
-    if sort == "lists asked for, 60 in a datagram":
+    if sort == "list requests, 60 in a datagram":
         return [b"".join(pack(mavlink.MAVLink_param_request_list_message(1, 1)) for _ in range(60)) for _ in range(50)]
     if sort == "parameters set":
         values = (0.15 + 1e-5 * i for i in range(50))
@@ -43,11 +43,11 @@ def datagrams(sort):
     raise ValueError(sort)
 
 
-SORTS = ("junk", "lists asked for, 60 in a datagram", "parameters set")
+SORTS = ("junk", "list requests, 60 in a datagram", "parameters set")
 
 
 def flood(port, sort, seconds):
-    """Send for so long; how many went out."""
+    """Flood a port for a time, s; return the number of datagrams sent."""
     link, sent, end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM), 0, time.monotonic() + seconds
     pieces = datagrams(sort)
     with link:
@@ -59,22 +59,23 @@ def flood(port, sort, seconds):
 
 
 def measure(sort="", seconds=10.0):
-    """Run a vehicle for so long, flooded or not."""
+    """Run a vehicle for a time, s, flooded or not."""
     with running_sitl() as sitl:
         sitl.until("plant connected")
         sent = flood(sitl.local, sort, seconds) if sort else time.sleep(seconds) or 0
         sitl.process.send_signal(signal.SIGINT)
         sitl.until("after more than")
     found = re.search(r"(\d+) periods, answered within ([\d.]+) ms, (\d+) of them", sitl.output)
-    return Lateness(int(found[1]), float(found[2]), int(found[3]), sent)
+    return FloodResult(int(found[1]), float(found[2]), int(found[3]), sent)
 
 
 def rows():
-    """A row for each sort of flood, and one without."""
+    """One row without a flood, and one for each sort."""
     found = []
     for sort in ("", *SORTS):
         seen = measure(sort)
-        title = f"control loop, 10 s of real time, {f'{seen.sent / 10:.0f} datagrams/s of {sort}' if sort else 'calm'}"
+        load = f"{seen.sent / 10:.0f} datagrams/s of {sort}" if sort else "no flood"
+        title = f"control loop, 10 s of real time, {load}"
         found.append([title, f"{seen.worst_ms:.1f} ms late at worst", f"{seen.late} of {seen.periods} above 1 ms"])
     return found
 

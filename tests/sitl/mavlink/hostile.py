@@ -1,6 +1,6 @@
-"""A vehicle in the air, and hostile datagrams for it: none of them may change, stop or slow anything.
+"""Hostile datagrams against a vehicle in the air: none may change, stop or delay anything.
 
-`python -m tests.sitl.mavlink.hostile 1000000` sends as many and prints what became of them.
+`python -m tests.sitl.mavlink.hostile 1000000` sends that many and prints the result.
 """
 
 import gc
@@ -16,13 +16,14 @@ from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.excitation_injector import Injector
 from mimopilot.sitl.autopilot.flight_modes import Commander, Mode
-from mimopilot.sitl.mavlink.vehicle.excitation import Excitation
-from mimopilot.sitl.mavlink.vehicle.ground_link import Ground
+from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.stations import Stations
-from mimopilot.sitl.mavlink.vehicle.telemetry import Situation, Telemetry
+from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
+from mimopilot.sitl.mavlink.vehicle.torque_injection import TorqueInjection
 from mimopilot.sitl.mavlink.vehicle.vehicle_commands import VehicleCommands
-from mimopilot.sitl.mavlink.wire.link import KINDS, Codec
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
+from mimopilot.sitl.mavlink.wire.codec import KINDS, Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.state_estimate import euler_angles
@@ -34,13 +35,13 @@ from tests.sitl.mavlink.running import PATIENCE_S
 KEY = bytes(range(32))
 FLOATS = (math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 1e-45, -0.0, 0.0, 1.0, -1.0, 123456.0)
 INTEGERS = {"b": 8, "B": 8, "h": 16, "H": 16, "i": 32, "I": 32, "q": 64, "Q": 64}
-#: Commands that are a valid change whatever their parameters are.
-OBEYED = {mavlink.MAV_CMD_NAV_LAND}
-TALK_EVERY = 1000
+#: Commands that are a valid change with any parameters; they are not sent.
+ALWAYS_VALID = {mavlink.MAV_CMD_NAV_LAND}
+CHECK_EVERY = 1000  # datagrams between checks that the vehicle still answers
 
 
-class InTheAir:
-    """A vehicle that hovers, with everything but a plant, and an attacker's sockets."""
+class VehicleUnderAttack:
+    """A hovering vehicle without a plant, with an attacker's sockets and an authorised ground station's codec."""
 
     def __init__(self, key=None):
         body = load_airframe("adam0")
@@ -48,21 +49,21 @@ class InTheAir:
         self.autopilot = Autopilot(body.airframe, gains, NativeController(load_native(gains), gains))
         self.vehicle = Commander(self.autopilot.hover)
         self.vehicle.armed, self.vehicle.mode, self.vehicle.now = True, Mode.HOLD, 100.0
-        situation = Situation(self.vehicle)
+        state = VehicleState(self.vehicle)
         self.injector = Injector(gains.Ts)
-        self.excitation = Excitation(self.injector, situation)
+        self.excitation = TorqueInjection(self.injector, state)
         self.server = ParameterServer(self.autopilot.controller, gains, self.injector)
-        telemetry = Telemetry(situation)
+        telemetry = Telemetry(state)
         self.commands = VehicleCommands(self.vehicle, telemetry, self.reboot)
         self.signer = Signer(key) if key else None
         self.attacker = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.attacker.bind(("127.0.0.1", 0))
         self.stations = Stations(self.attacker.getsockname()[1], 0, 0, signer=self.signer)
-        self.ground = Ground(self.server, self.commands, telemetry, self.stations)
+        self.ground = GroundStationLink(self.server, self.commands, telemetry, self.stations)
         self.udp, self.tcp_address = self.stations.udp.getsockname(), self.stations.tcp.getsockname()
         self.tcp = socket.create_connection(self.tcp_address)
         self.friend = Codec(255, 190, Signer(key) if key else None)
-        euler_angles(1.0, 0.0, 0.0, 0.0)  # compiled now
+        euler_angles(1.0, 0.0, 0.0, 0.0)  # compile now
         self.slowest = 0.0
         self.rebooted = False
 
@@ -74,8 +75,8 @@ class InTheAir:
         self.attacker.close()
         self.tcp.close()
 
-    def state(self):
-        """All that nobody may change."""
+    def snapshot(self):
+        """The state that must not change."""
         return (
             dict(self.server.values),
             self.autopilot.controller.state.tobytes(),
@@ -84,7 +85,7 @@ class InTheAir:
         )
 
     def turn(self):
-        """One turn of the control loop's ground part."""
+        """Run the ground station part of the control loop once."""
         now = time.monotonic()
         begin = time.thread_time()
         self.ground.receive(now)
@@ -93,12 +94,12 @@ class InTheAir:
         self.ground.send(now)
 
     def answers(self, message, over_tcp=False, wait=PATIENCE_S):
-        """Kinds of the vehicle's answers, once there is a PARAM_VALUE among them; empties the sockets before."""
+        """Empty the sockets, send a message, and return the kinds of the answers up to a PARAM_VALUE."""
         link = self.tcp if over_tcp else self.attacker
         drain(link)
         data = self.friend.pack(message)
         if over_tcp:
-            link.sendall(data * 30)  # what a false start may swallow
+            link.sendall(data * 30)  # a false frame start may swallow some
         else:
             link.sendto(data, self.udp)
         heard, codec, end = [], Codec(255, 190), time.monotonic() + wait
@@ -109,7 +110,7 @@ class InTheAir:
 
 
 def drain(link):
-    """All that waits in a socket."""
+    """Read all data from a socket."""
     link.setblocking(False)
     data = b""
     try:
@@ -123,7 +124,7 @@ def drain(link):
 
 
 def frame(number, payload, seq, signer=None):
-    """A sound frame around any payload."""
+    """An intact frame around any payload."""
     payload = payload.rstrip(b"\0") or b"\0"
     flags = mavlink.MAVLINK_IFLAG_SIGNED if signer else 0
     body = bytes([len(payload), flags, 0, seq, 255, 190]) + number.to_bytes(3, "little") + payload
@@ -133,7 +134,7 @@ def frame(number, payload, seq, signer=None):
 
 
 class Attacks:
-    """Seeded datagrams of every sort, by name; none is a change that a vehicle in the air should obey."""
+    """Seeded datagrams of every sort, by name; none is a valid change for a vehicle in the air."""
 
     def __init__(self, seed, target, replay=b""):
         self.random, self.signer = random.Random(seed), target.friend.signer
@@ -145,12 +146,12 @@ class Attacks:
             "behind a marker": lambda: self.random.choice([b"\xfd", b"\xfe"]) + self.noise(),
             "flipped bits": self.flipped,
             "truncated": self.truncated,
-            "oversized": lambda: self.sound() + self.random.randbytes(self.random.randrange(65000)),
+            "oversized": lambda: self.intact() + self.random.randbytes(self.random.randrange(65000)),
             "wrong checksum": self.wrong_checksum,
-            "wrong target": lambda: self.sound(target=False),
-            "extreme values": self.sound,
-            "several in one": lambda: b"".join(self.sound() for _ in range(self.random.randrange(2, 30))),
-            "other messages": lambda: self.sound(self.random.choice(self.all)),
+            "wrong target": lambda: self.intact(target=False),
+            "extreme values": self.intact,
+            "several in one": lambda: b"".join(self.intact() for _ in range(self.random.randrange(2, 30))),
+            "other messages": lambda: self.intact(self.random.choice(self.all)),
             "bad parameters": self.bad_parameter,
         }
         if self.signer:
@@ -165,22 +166,22 @@ class Attacks:
         return self.random.randbytes(self.random.randrange(300))
 
     def flipped(self):
-        data = bytearray(self.sound())
+        data = bytearray(self.intact())
         for _ in range(self.random.randrange(1, 4)):
             data[self.random.randrange(len(data))] ^= 1 << self.random.randrange(8)
         return bytes(data)
 
     def truncated(self):
-        data = self.sound()
+        data = self.intact()
         return data[: self.random.randrange(len(data))]
 
     def wrong_checksum(self):
-        data = bytearray(self.sound())
+        data = bytearray(self.intact())
         data[-1 - self.random.randrange(2)] ^= self.random.randrange(1, 256)
         return bytes(data)
 
-    def sound(self, number=None, target=True):
-        """A sound frame with extreme values in it, to this vehicle or to another."""
+    def intact(self, number=None, target=True):
+        """An intact frame with extreme values, to this vehicle or to another."""
         number = self.random.choice(self.known) if number is None else number
         kind = KINDS[number]
         fields = {
@@ -193,7 +194,7 @@ class Attacks:
             fields[name] = [self.random.choice([0, 1]) if target else self.random.randrange(2, 256)]
         if kind.msgname in ("COMMAND_LONG", "COMMAND_INT") and self.random.random() < 0.5:
             fields["command"] = [self.random.choice(self.commands)]
-        if fields.get("command", [0])[0] in OBEYED:
+        if fields.get("command", [0])[0] in ALWAYS_VALID:
             fields["command"] = [0]
         if kind.msgname == "PARAM_SET" and fields["param_type"] == [9]:
             fields["param_type"] = [10]
@@ -203,7 +204,7 @@ class Attacks:
         return self.wrap(number, kind.unpacker.pack(*values))
 
     def wrap(self, number, payload):
-        """A frame; on a signed link half of them are signed with the key."""
+        """Build a frame; on a signed link half of them are signed with the key."""
         signer = self.signer if self.signer and self.random.random() < 0.5 else None
         return frame(number, payload, self.random.randrange(256), signer)
 
@@ -220,7 +221,7 @@ class Attacks:
         return self.random.choice([low, high, 0, 1, high - 1, low + 1, self.random.randint(low, high)])
 
     def bad_parameter(self):
-        """PARAM_SET that is to be refused: not finite, out of range, unknown, read only or of another type."""
+        """PARAM_SET that must be refused: not finite, out of range, unknown, read-only or of another type."""
         name, value, kind = self.random.choice(
             [
                 (self.random.choice(self.names), self.random.choice(FLOATS[:5]), 9),
@@ -235,16 +236,16 @@ class Attacks:
 
 
 def attack(target, count, seed):
-    """Send so many datagrams, a tenth of them into a TCP stream: how many by sort. Raises when anything changed."""
+    """Send datagrams, a tenth of them into a TCP stream; return the count by sort. Raises when anything changed."""
     replay = target.friend.pack(mavlink.MAVLink_param_set_message(1, 1, b"MIMO_RP_RR", 0.12, 9))
     if target.signer:
         target.attacker.sendto(replay, target.udp)
         target.turn()
         if abs(target.server.values["MIMO_RP_RR"] - 0.12) > 1e-6:
-            raise AssertionError("a signed change was not taken")
+            raise AssertionError("a signed change was not accepted")
         target.server.write("MIMO_RP_RR", 0.14, 9)
     attacks = Attacks(seed, target, replay)
-    sent, before = Counter(), target.state()
+    sent, before = Counter(), target.snapshot()
     question = mavlink.MAVLink_param_request_read_message(1, 1, b"MIMO_RP_RR", -1)
     for number in range(count):
         sort, make = attacks.random.choice(list(attacks.sorts.items()))
@@ -255,12 +256,12 @@ def attack(target, count, seed):
         else:
             target.tcp.sendall(data[:2000])
         target.turn()
-        if target.state() != before:
+        if target.snapshot() != before:
             raise AssertionError(f"datagram {number} ({sort}) changed the vehicle: {data.hex()}")
-        if number % TALK_EVERY == 0:
+        if number % CHECK_EVERY == 0:
             for over_tcp in (False, True):
                 if "PARAM_VALUE" not in target.answers(question, over_tcp):
-                    raise AssertionError(f"after datagram {number} ({sort}) nobody answers, over TCP: {over_tcp}")
+                    raise AssertionError(f"after datagram {number} ({sort}) there is no answer, over TCP: {over_tcp}")
     return sent
 
 
@@ -268,7 +269,7 @@ def main():
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
     seed = int(sys.argv[2]) if len(sys.argv) > 2 else 0
     for signed in (False, True):
-        target = InTheAir(KEY if signed else None)
+        target = VehicleUnderAttack(KEY if signed else None)
         gc.collect()
         gc.freeze()  # as the host does
         begin = time.perf_counter()
@@ -278,7 +279,7 @@ def main():
         rows = [[sort, str(number)] for sort, number in sent.items()]
         rows.append(["all, and nothing changed", str(sent.total())])
         print_table(f"{'signed' if signed else 'unsigned'} link, seed {seed + signed}", ["datagrams", "number"], rows)
-        print(f"{seconds:.0f} s; longest turn of receiving {1e3 * target.slowest:.2f} ms of processor time")
+        print(f"{seconds:.0f} s; longest call of receive {1e3 * target.slowest:.2f} ms of processor time")
 
 
 if __name__ == "__main__":

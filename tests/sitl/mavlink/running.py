@@ -1,4 +1,4 @@
-"""The vehicle as its users run it: processes, ports, and clients that speak to it."""
+"""The vehicle as users run it: processes, ports, and a ground station client."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
-#: An event that comes at all is waited for so long, s: however busy the machine is, no test is decided by its speed.
+#: Timeout for any expected event, s: so long that a busy machine does not fail a test.
 PATIENCE_S = 180.0
-#: Waits of an upload, shortened where a test does not measure them, s: (module, name) -> seconds.
+#: Waits of an upload, s, shortened where a test does not measure them: (module, name) -> seconds.
 WAITS = {
     ("mimopilot.sitl.mavlink.ground_station.vehicle_contact", "LISTEN_S"): 0.15,
     ("mimopilot.sitl.mavlink.ground_station.parameter_protocol", "AUTOSAVE_S"): 0.15,
 }
 _PATCHES = "".join(f"import {module}; {module}.{name} = {value}; " for (module, name), value in WAITS.items())
-#: The command line with them.
-QUICK = (sys.executable, "-c", f"{_PATCHES}import mimopilot.cli.main; mimopilot.cli.main.main()")
+#: The command line with these waits.
+QUICK = (sys.executable, "-c", f"{_PATCHES}import mimopilot; mimopilot.main()")
 
 
 def free_port(kind=socket.SOCK_STREAM):
@@ -32,7 +32,7 @@ def free_port(kind=socket.SOCK_STREAM):
 
 
 def wait_for(condition, complaint=lambda: "it did not happen"):
-    """Wait until something is so that another thread or process does."""
+    """Wait until another thread or process has made a condition true."""
     deadline = time.monotonic() + PATIENCE_S
     while not condition():
         assert time.monotonic() < deadline, complaint()
@@ -40,7 +40,7 @@ def wait_for(condition, complaint=lambda: "it did not happen"):
 
 
 class Program:
-    """A process whose output is read as it comes."""
+    """A process whose output is read as it is written."""
 
     def __init__(self, *command, **keywords):
         self.process = subprocess.Popen(
@@ -60,7 +60,7 @@ class Program:
             self.output += text
 
     def until(self, text):
-        """Wait until it has said something."""
+        """Wait until its output holds a text."""
         wait_for(lambda: text in self.output, lambda: f"no {text!r} in:\n{self.output}")
 
     def say(self, line):
@@ -82,13 +82,13 @@ class Program:
 
 
 def start(*arguments, **keywords):
-    """A command of ours."""
+    """Start a mimopilot command."""
     return Program(sys.executable, "-u", "-m", "mimopilot", *arguments, **keywords)
 
 
 @contextmanager
 def running_sitl(*extra, **keywords):
-    """`mimopilot sitl adam0` on ports of its own; yields the program, with its `ports`."""
+    """`mimopilot sitl adam0` on free ports; yields the program, with its ports `udp`, `local` and `tcp`."""
     udp, local, tcp = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM), free_port()
     ports = ("--ground-port", udp, "--vehicle-port", local, "--tcp-port", tcp)
     program = start("sitl", "adam0", *ports, *extra, **keywords)
@@ -101,7 +101,7 @@ def running_sitl(*extra, **keywords):
 
 
 class Pilot:
-    """A ground station made of pymavlink alone."""
+    """A ground station, with a pilot's actions, on plain pymavlink."""
 
     def __init__(self, address):
         self.link = mavutil.mavlink_connection(address, dialect="common", source_system=255)
@@ -114,7 +114,7 @@ class Pilot:
         self.link.close()
 
     def take(self, timeout=0.05):
-        """One message, if there is one; 0: if it is there already."""
+        """Receive one message, if one arrives within the timeout, s; 0: only if it has arrived already."""
         message = self.last = self.link.recv_match(blocking=timeout > 0, timeout=timeout or None)
         if message is not None and message.get_type() == "STATUSTEXT":
             if message.chunk_seq and self.texts:  # the rest of a long one
@@ -127,20 +127,20 @@ class Pilot:
         return message
 
     def wait(self, condition):
-        """Listen until something is so."""
+        """Receive messages until a condition is true."""
         deadline = time.monotonic() + PATIENCE_S
         while not condition():
             assert time.monotonic() < deadline, self.texts
             self.take()
 
     def hears(self, text):
-        """Wait for a text; how many HEARTBEATs, which are sent once a second and with a text, came with it."""
+        """Wait for a text; return the number of HEARTBEATs until then. They come once a second and with a text."""
         before = self.beats
         self.wait(lambda: any(text in said for said in self.texts))
         return self.beats - before
 
     def asks(self, kind):
-        """The next message of a kind."""
+        """Wait for the next message of a kind."""
         deadline = time.monotonic() + PATIENCE_S
         while time.monotonic() < deadline:
             message = self.take()
@@ -149,8 +149,8 @@ class Pilot:
         raise AssertionError(f"no {kind}")
 
     def command(self, number, *params):
-        """COMMAND_LONG; the result in its acknowledgement."""
-        while self.take(0) is not None:  # a buffer that is full has no room for an answer
+        """Send COMMAND_LONG; return the result in its acknowledgement."""
+        while self.take(0) is not None:  # a full buffer would drop the answer
             pass
         self.link.mav.command_long_send(1, 1, number, 0, *params, *[0] * (7 - len(params)))
         while True:
@@ -169,7 +169,7 @@ class Pilot:
         )
 
     def flies(self, mode):
-        """Wait until the vehicle shows a mode."""
+        """Wait until the vehicle reports a mode."""
         self.wait(lambda: self.beat.custom_mode == custom_mode(mode))
 
     def armed(self):

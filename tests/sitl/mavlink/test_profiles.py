@@ -8,8 +8,8 @@ import pytest
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import single
 from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, make_restore_plan, off_diagonal_shares
+from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.parameters import MATRICES, PARAMETERS

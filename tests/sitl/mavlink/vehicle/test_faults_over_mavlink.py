@@ -1,4 +1,4 @@
-"""Faults of the plant process and of its link: the flight in process again."""
+"""Faults injected over MAVLink: the same flights as in one process."""
 
 import math
 from dataclasses import replace
@@ -46,7 +46,7 @@ def over_both(vehicle, library, scenario, *texts, seed=3):
         return flight, lockstep.fly(pilot(vehicle, library), scenario, port)
 
 
-def test_a_flight_with_broken_parts_and_late_commands_is_the_same_over_mavlink_in_every_bit(vehicle, library):
+def test_a_flight_with_component_faults_and_delays_over_mavlink_equals_the_one_in_process(vehicle, library):
     texts = (
         *("motor:3=0.8@1.1", "battery=0.9@0.5+0.4", "mass:0.1,-0.1,0=0.1@1.3", "delay=0.012@1.05", "jitter=0.008@1.2"),
         *("gyro-bias:roll=0.1@0.9", "gyro-noise=0.05@1.0+0.3", "gyro-stuck:pitch@1.15+0.05", "gyro-nan@1.5+0.02"),
@@ -56,7 +56,7 @@ def test_a_flight_with_broken_parts_and_late_commands_is_the_same_over_mavlink_i
     assert record.tobytes() == flight.record.tobytes()
 
 
-def test_ticks_that_the_link_loses_are_the_same_ones_over_mavlink(vehicle, library):
+def test_the_link_loses_the_same_periods_over_mavlink(vehicle, library):
     texts = ("loss=0.3@0.2+0.3", "skip=5@0.8", "link@1.0+0.2", "clock=0.1@1.5")
     flight, record = over_both(vehicle, library, hover("roll", 2.0, TS), *texts)
     seen = flight.record[flight.runs == 1]
@@ -64,31 +64,31 @@ def test_ticks_that_the_link_loses_are_the_same_ones_over_mavlink(vehicle, libra
     assert record[: len(seen)].tobytes() == seen.tobytes()
 
 
-def test_messages_that_come_twice_are_flown_once(vehicle, library):
+def test_duplicated_messages_are_flown_once(vehicle, library):
     flight, record = over_both(vehicle, library, hover("roll", 1.0, TS), "duplicate=0.5@0")
     assert (flight.runs == 2).any()
-    sound = fly(vehicle.airframe, pilot(vehicle, library), hover("roll", 1.0, TS), 3)
-    assert record.tobytes() == sound.record.tobytes()
+    healthy = fly(vehicle.airframe, pilot(vehicle, library), hover("roll", 1.0, TS), 3)
+    assert record.tobytes() == healthy.record.tobytes()
 
 
-def test_the_plant_refuses_what_it_cannot_do_before_it_listens(mimopilot):
+def test_the_plant_refuses_faults_it_cannot_inject_before_it_listens(mimopilot):
     assert_one_clear_line(mimopilot("plant", "adam0", "--port", 0, "--fault", "gain=2@1"), "'gain=2@1'", "autopilot")
     assert_one_clear_line(mimopilot("plant", "adam0", "--port", 0, "--fault", "motor:5=0@1"), "motors 1 to 4")
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("arguments", "parts"),
     [
-        (("--plant", "127.0.0.1:1", "--fault", "loss=0.1@1"), ("'loss=0.1@1'", "give it to that one")),
+        (("--plant", "127.0.0.1:1", "--fault", "loss=0.1@1"), ("'loss=0.1@1'", "give it to that command")),
         (("--fault", "gain:Kp_o=100@1"), ("MIMO_AP_RR would be 650", "a vehicle refuses that write")),
     ],
 )
-def test_the_vehicle_refuses_what_it_cannot_do_before_it_flies(mimopilot, words, told):
-    assert_one_clear_line(mimopilot("sitl", "adam0", *words), *told)
+def test_the_vehicle_refuses_faults_it_cannot_inject_before_it_flies(mimopilot, arguments, parts):
+    assert_one_clear_line(mimopilot("sitl", "adam0", *arguments), *parts)
 
 
-class Frames:
-    """A plant that only tells that the vehicle hangs in the air, level."""
+class NoPlantLink:
+    """Replaces the plant link: discards the answers."""
 
     socket = None
 
@@ -96,29 +96,29 @@ class Frames:
         pass
 
 
-def test_a_fault_at_the_moment_of_an_examination_is_not_taken_for_a_plant_of_another_rate(vehicle, library):
-    host = Host(pilot(vehicle, library), Frames())
+def test_a_controller_fault_during_the_pre_arm_check_is_not_reported_as_a_wrong_period(vehicle, library):
+    host = Host(pilot(vehicle, library), NoPlantLink())
     for k in range(1001):
         rate = math.nan if 450 <= k <= 520 else 0.0
         host._period(PlantState(7_000_000 + 4000 * k, 1, 0, 0, 0, rate, *[0.0] * 4, 10_000, *[0] * 8))
     texts = [text for _, text in host.vehicle.said]
-    assert any("the controller refuses its inputs" in text for text in texts)
+    assert any("the controller rejects its inputs" in text for text in texts)
     assert not any("period" in text for text in texts)
 
 
-def test_the_host_corrupts_its_gains_and_hears_no_set_points_in_the_time_of_the_fault(vehicle, library):
+def test_the_host_injects_gain_faults_and_stale_setpoints_at_their_times(vehicle, library):
     autopilot = pilot(vehicle, library)
     controller = autopilot.controller
     faults = AutopilotFaults(tuple(map(parse_fault, ("gain:Kp_i=0.5@0.2+0.4", "stale@0.4+0.8"))), TS, autopilot)
-    host = Host(autopilot, Frames())
+    host = Host(autopilot, NoPlantLink())
     host.faults = faults
-    sound, Kp_i, fresh = controller.state["gains"][0].copy(), slice(4, 8), []
+    healthy, Kp_i, fresh = controller.state["gains"][0].copy(), slice(4, 8), []
     for k in range(400):
         host._period(PlantState(7_000_000 + 4000 * k, 1, 0, 0, 0, *[0.0] * 5, 10_000, *[0] * 8))
         factor = 0.5 if 50 <= k < 150 else 1.0
-        assert (controller.state["gains"][0, Kp_i] == np.float32(factor) * sound[Kp_i]).all(), k
+        assert (controller.state["gains"][0, Kp_i] == np.float32(factor) * healthy[Kp_i]).all(), k
         fresh.append(host.vehicle.attitude.fresh(host.vehicle.now))
-        host.vehicle.attitude.put(AttitudeSetpoint(0.1, 0.0, 0.0, None), host.vehicle.now)  # a ground station steers
-    # The one of sample 99 counts for half a second; the first that is heard again comes after sample 300.
+        host.vehicle.attitude.put(AttitudeSetpoint(0.1, 0.0, 0.0, None), host.vehicle.now)
+    # The setpoint of sample 99 is valid for half a second; the next received one comes after sample 300.
     assert np.flatnonzero(~np.array(fresh)).tolist() == [0, *range(225, 301)]
-    assert (controller.state["gains"][0] == sound).all()
+    assert (controller.state["gains"][0] == healthy).all()

@@ -1,23 +1,23 @@
-"""How long a frame of the plant waits for its answer, at most; and how much of the time is worked."""
+"""Response times of the control loop to frames of the plant, and its processor load."""
 
 from __future__ import annotations
 
 import time
 
-LATE_S = 1e-3
+LATE_S = 1e-3  # s; chosen: a quarter of the default control period
 
 
-class Lateness:
-    """Times of one loop that waits for a plant and for others.
+class ResponseTimes:
+    """Response times of one control loop.
 
     Attributes
     ----------
     worst : float, s
-        Longest time that a frame can have waited, from when none was there yet to its answer.
+        Upper bound of the longest response: from the last time that no frame was waiting to the answer.
     late, periods : int
-        Frames that can have waited for more than 1 ms; all frames.
+        Frames that may have waited longer than `LATE_S`; all frames.
     load : float
-        Share of the last second that was worked.
+        Share of the last second in which the loop did not sleep.
     """
 
     def __init__(self) -> None:
@@ -27,13 +27,13 @@ class Lateness:
         self._empty = self._second = time.monotonic()
         self._slept = 0.0
 
-    def nothing_waits(self, slept: float, now: float) -> None:
-        """No frame was there until just now, monotonic time in s; the loop has slept for it."""
+    def note_idle(self, slept: float, now: float) -> None:
+        """No frame was waiting until `now`, monotonic time in s; the loop slept for `slept` s."""
         self._empty = now
         self._slept += slept
 
-    def answered(self) -> None:
-        """The frame that came is answered."""
+    def note_answer(self) -> None:
+        """A frame was answered now."""
         now = time.monotonic()
         waited = now - self._empty
         self._empty = now

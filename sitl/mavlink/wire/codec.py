@@ -1,22 +1,21 @@
-"""MAVLink 2 over sockets: packing, and finding whole, sound and trusted frames in whatever arrives."""
+"""MAVLink 2 codec: packs messages, and finds intact, trusted frames in any received bytes."""
 
 from __future__ import annotations
 
 import re
-import socket
 from collections.abc import Container, Iterator
 from typing import Any
 
-from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.signing import SIGNATURE_BYTES, Signer
 from pymavlink.dialects.v20 import common as mavlink
 
+#: Identity of the simulated vehicle: the first system, component MAV_COMP_ID_AUTOPILOT1.
 SYSTEM, COMPONENT = 1, 1
-LOOPBACK = "127.0.0.1"
 V1, V2 = mavlink.PROTOCOL_MARKER_V1, mavlink.PROTOCOL_MARKER_V2
 HEADER_BYTES: dict[int, int] = {V1: mavlink.HEADER_LEN_V1, V2: mavlink.HEADER_LEN_V2}
 SIGNED = mavlink.MAVLINK_IFLAG_SIGNED
-CRC_BYTES = 2
+CRC_BYTES = 2  # CRC-16/MCRF4XX
+MAVLINK_VERSION = 3  # HEARTBEAT.mavlink_version of MAVLink 2
 MARKER = re.compile(b"[\xfd\xfe]")
 KINDS: dict[int, Any] = mavlink.mavlink_map
 EVERY = frozenset(KINDS)
@@ -30,16 +29,16 @@ class Codec:
     system, component : int
         Identity in outgoing messages.
     signer : Signer, optional
-        Signs what goes out; what comes in without its signature is then dropped.
+        Signs outgoing frames; incoming frames without a valid signature are then dropped.
     wanted : container of int
-        Numbers of the messages to read; the others are passed over.
+        Message numbers to decode; others are ignored.
 
     Attributes
     ----------
     refused : int
-        Sound frames that were dropped because their signature was missing, wrong or old.
+        Intact frames dropped because their signature was missing, wrong or old.
     unasked : int
-        Signed frames that were taken as they are, because there is no key here.
+        Signed frames accepted unchecked, because this end has no key.
     """
 
     def __init__(
@@ -61,16 +60,16 @@ class Codec:
         if self.signer is None:
             return frame
         body = frame[1:2] + bytes([frame[2] | SIGNED]) + frame[3:-CRC_BYTES]
-        return self.signer.sign(frame[:1] + body + _crc(body, message.crc_extra))
+        return self.signer.sign(frame[:1] + body + checksum(body, message.crc_extra))
 
     def parse(self, data: bytes) -> Iterator[Any]:
-        """Whole messages in the stream so far; damaged ones are dropped."""
+        """Yield the complete messages in the stream so far; damaged ones are dropped."""
         return (message for message in self.search(data) if message is not None)
 
     def search(self, data: bytes) -> Iterator[Any]:
-        """The same, and None after each damaged one: who has little time can pause there.
+        """Yield as `parse`, and None after each damaged frame, so that a caller short of time can pause.
 
-        Every byte of a chunk may look like the beginning of a long frame, whose checksum must be looked at.
+        Every byte may look like the start of a long frame, whose checksum must then be computed.
         """
         data = self._rest + data
         self._rest = b""
@@ -82,7 +81,7 @@ class Codec:
                 self._rest = data[place:]
                 return
             frame = data[place : place + length]
-            if not _is_sound(frame):
+            if not _is_intact(frame):
                 place += 1
                 yield None
                 continue
@@ -90,21 +89,21 @@ class Codec:
             yield from self._read(frame)
 
     def parse_datagram(self, data: bytes) -> Iterator[Any]:
-        """Messages of a datagram, which holds whole frames: nothing behind a broken one is looked at."""
+        """Yield the messages of one datagram, which holds whole frames; stop at the first broken one."""
         place = 0
         while place < len(data) and data[place] in HEADER_BYTES:
             frame = data[place : place + _frame_length(data, place)]
-            if not _is_sound(frame):
+            if not _is_intact(frame):
                 return
             place += len(frame)
             yield from self._read(frame)
 
     def _read(self, frame: bytes) -> Iterator[Any]:
-        """The message of a sound frame; nothing when it is not trusted or not wanted."""
+        """Yield the message of an intact frame, unless it is not trusted or not wanted."""
         signed = _is_signed(frame)
         if self.signer is None:
             self.unasked += signed
-        elif not (signed and self.signer.accepts(frame, frame[5], frame[6])):
+        elif not (signed and self.signer.accept(frame, frame[5], frame[6])):
             self.refused += 1
             return
         if _number(frame) not in self.wanted:
@@ -121,12 +120,15 @@ def _is_signed(frame: bytes) -> bool:
 
 
 def _number(frame: bytes) -> int:
-    """Number of the message in a frame."""
+    """Message number of a frame."""
     return frame[5] if frame[0] == V1 else int.from_bytes(frame[7:10], "little")
 
 
 def _frame_length(data: bytes, place: int) -> int:
-    """Bytes of the frame that a marker begins; 0: it cannot be one. The shortest, while its header is not there yet."""
+    """Length of the frame at a marker, bytes; 0: not a frame.
+
+    While the header is incomplete: the length of the shortest frame.
+    """
     size = HEADER_BYTES[data[place]]
     header, shortest = data[place : place + size], size + CRC_BYTES
     if len(header) < size:
@@ -136,56 +138,15 @@ def _frame_length(data: bytes, place: int) -> int:
     return shortest + header[1] + (SIGNATURE_BYTES if _is_signed(header) else 0)
 
 
-def _is_sound(frame: bytes) -> bool:
-    """Whether what looks like a whole frame has the right checksum."""
+def _is_intact(frame: bytes) -> bool:
+    """Whether the bytes are a complete frame with the right checksum."""
     if not frame or len(frame) < _frame_length(frame, 0):
         return False
     end = len(frame) - (SIGNATURE_BYTES if _is_signed(frame) else 0)
-    return _crc(frame[1 : end - CRC_BYTES], KINDS[_number(frame)].crc_extra) == frame[end - CRC_BYTES : end]
+    return checksum(frame[1 : end - CRC_BYTES], KINDS[_number(frame)].crc_extra) == frame[end - CRC_BYTES : end]
 
 
-def _crc(body: bytes, extra: int) -> bytes:
-    checksum: int = mavlink.x25crc(body + bytes([extra])).crc
-    return checksum.to_bytes(CRC_BYTES, "little")
-
-
-def listen(host: str, port: int, backlog: int = 1, option: str = "--port") -> socket.socket:
-    """A listening TCP socket.
-
-    Raises
-    ------
-    SitlError
-        When the port is in use.
-    """
-    server = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-    server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        server.bind((host, port))
-        server.listen(backlog)
-    except OSError as error:
-        server.close()
-        raise SitlError(
-            f"TCP port {port} on {host} cannot be used: {error.strerror or error}; is another simulator "
-            f"running? Choose another port with {option}"
-        ) from error
-    return server
-
-
-def udp_socket(
-    host: str, port: int, advice: str = "is another vehicle running? Choose another port with --vehicle-port"
-) -> socket.socket:
-    """A non-blocking UDP socket bound to a local port.
-
-    Raises
-    ------
-    SitlError
-        When the port is in use.
-    """
-    link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    try:
-        link.bind((host, port))
-    except OSError as error:
-        link.close()
-        raise SitlError(f"UDP port {port} on {host} cannot be used: {error.strerror or error}; {advice}") from error
-    link.setblocking(False)
-    return link
+def checksum(body: bytes, extra: int) -> bytes:
+    """MAVLink checksum over header and payload; `extra` is the message's CRC_EXTRA."""
+    crc: int = mavlink.x25crc(body + bytes([extra])).crc
+    return crc.to_bytes(CRC_BYTES, "little")

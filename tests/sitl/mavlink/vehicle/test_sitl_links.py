@@ -1,4 +1,4 @@
-"""`mimopilot sitl` with a key, with a file of parameters, and with several ground stations."""
+"""`mimopilot sitl` with a signing key, with a parameter file, and with several ground stations."""
 
 import numpy as np
 from pymavlink import mavutil
@@ -9,7 +9,7 @@ from tests.sitl.mavlink.running import PATIENCE_S, Pilot, free_port, running_sit
 KEY = bytes(range(32))
 
 
-def test_a_signed_vehicle_obeys_who_has_the_key_and_nobody_else(tmp_path, mimopilot):
+def test_a_vehicle_with_a_key_obeys_only_stations_with_the_key(tmp_path, mimopilot):
     key = tmp_path / "key"
     key.write_bytes(KEY)
     with running_sitl("--signing-key", key) as sitl:
@@ -21,7 +21,7 @@ def test_a_signed_vehicle_obeys_who_has_the_key_and_nobody_else(tmp_path, mimopi
         assert_one_clear_line(unsigned, "no answer", "give --signing-key", code=1)
         # pymavlink's own signing, as MAVProxy uses it.
         other = mavutil.mavlink_connection(f"udpin:127.0.0.1:{sitl.udp}", dialect="common", source_system=254)
-        # It learns the protocol's version, and forgets a key that it had before.
+        # The first heartbeat tells it the protocol version, and makes it drop a key set before.
         other.wait_heartbeat(timeout=PATIENCE_S)
         other.setup_signing(KEY, sign_outgoing=True)
         assert other.wait_heartbeat(timeout=PATIENCE_S).get_signed()
@@ -30,7 +30,7 @@ def test_a_signed_vehicle_obeys_who_has_the_key_and_nobody_else(tmp_path, mimopi
         other.close()
 
 
-def test_what_a_ground_station_sets_outlives_a_kill_and_outranks_the_gains(tmp_path, mimopilot):
+def test_a_parameter_set_by_a_station_survives_a_kill_and_overrides_the_gains(tmp_path, mimopilot):
     kept = tmp_path / "vehicle.params"
     with running_sitl("--parameters", kept) as sitl:
         pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
@@ -41,7 +41,7 @@ def test_what_a_ground_station_sets_outlives_a_kill_and_outranks_the_gains(tmp_p
         sitl.process.kill()
         pilot.close()
     with running_sitl("--parameters", kept) as sitl:
-        assert f"{kept}: 1 parameter outranks the gains: MIMO_RP_RR 0.125 (else 0.15)" in sitl.output
+        assert f"{kept}: 1 parameter overrides the gains: MIMO_RP_RR 0.125 (else 0.15)" in sitl.output
         pilot = Pilot(f"tcp:127.0.0.1:{sitl.tcp}")
         pilot.link.mav.param_request_read_send(1, 1, b"MIMO_RP_RR", -1)
         assert pilot.asks("PARAM_VALUE").param_value == 0.125
@@ -60,7 +60,7 @@ def test_two_stations_by_udp_and_tcp_see_each_others_changes_and_only_their_own_
         second.link.mav.param_request_read_send(1, 1, b"MIMO_TS", -1)
         assert second.asks("PARAM_VALUE").param_value == np.float32(0.004)
         first.link.mav.param_request_read_send(1, 1, b"MIMO_RP_RR", -1)
-        assert first.asks("PARAM_VALUE").param_id == "MIMO_RP_RR"  # it did not hear the other's answer before
+        assert first.asks("PARAM_VALUE").param_id == "MIMO_RP_RR"  # it did not receive the other's answer
         assert second.link.packet_loss() == 0.0
         assert first.link.packet_loss() == 0.0
         for pilot in (first, second):
@@ -71,7 +71,7 @@ def test_two_stations_by_udp_and_tcp_see_each_others_changes_and_only_their_own_
         second.close()
 
 
-def test_an_address_or_port_that_cannot_be_bound_is_one_clear_line(mimopilot):
+def test_an_address_or_port_that_cannot_be_bound_is_one_clear_error(mimopilot):
     ports = ("--ground-port", free_port(), "--vehicle-port", 0, "--tcp-port", 0)
     assert_one_clear_line(mimopilot("sitl", "adam0", *ports, "--bind", "192.0.2.1"), "192.0.2.1")
     assert_one_clear_line(mimopilot("sitl", "adam0", *ports, "--bind", "no such host"), "no such host")

@@ -1,4 +1,4 @@
-"""`mimopilot sitl` flown by real clients, and what it survives."""
+"""`mimopilot sitl` flown by real clients, and its reaction to killed processes."""
 
 import math
 import os
@@ -24,7 +24,7 @@ ACCEPTED, TEMPORARILY_REJECTED = 0, 1
 
 
 class Sender:
-    """Sends an attitude set-point again and again, as a companion computer does."""
+    """Sends an attitude setpoint repeatedly, as a companion computer does."""
 
     def __init__(self, pilot, seconds):
         self.pilot, self.seconds = pilot, seconds
@@ -44,8 +44,8 @@ class Sender:
         self.thread.join()
 
 
-def steered(pilot):
-    """Back to OFFBOARD after a pause in which this busy machine sent no set-points."""
+def in_offboard(pilot):
+    """Whether it flies OFFBOARD, again after a pause in which a busy machine sent no setpoints."""
     return pilot.beat.custom_mode == custom_mode(Mode.OFFBOARD) or pilot.command(SET_MODE, 1, 6) == ACCEPTED
 
 
@@ -69,9 +69,9 @@ def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logg
         pilot.command(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, mavlink.MAVLINK_MSG_ID_ATTITUDE, 10_000)
         for roll in (0.3, -0.3, 0.0):
             sender.roll = roll
-            pilot.wait(lambda roll=roll: steered(pilot) and abs(pilot.asks("ATTITUDE").roll - roll) < 0.05)
+            pilot.wait(lambda roll=roll: in_offboard(pilot) and abs(pilot.asks("ATTITUDE").roll - roll) < 0.05)
         sender.stop()
-        # Nobody steers any more: level, then down.
+        # No more setpoints: level, then landing.
         pilot.hears("no setpoints for 0.5 s: level")
         pilot.hears("no setpoints for 2.5 s: landing")
         pilot.hears("disarmed: landed")
@@ -88,7 +88,7 @@ def test_a_pilot_arms_takes_off_flies_a_doublet_and_lands_and_the_flight_is_logg
     assert max(commands[f"control[{i}]"].max() for i in range(4)) > 0.4
 
 
-def test_a_plant_that_is_killed_in_flight_is_told_within_a_second_and_comes_back(tmp_path):
+def test_a_plant_killed_in_flight_is_reported_within_a_second_and_restarted(tmp_path):
     with running_sitl("--log", tmp_path / "f.ulg") as sitl:
         pilot = Pilot(f"tcp:127.0.0.1:{sitl.tcp}")
         pilot.ready()
@@ -98,8 +98,8 @@ def test_a_plant_that_is_killed_in_flight_is_told_within_a_second_and_comes_back
         pilot.wait(lambda: getattr(pilot.last, "relative_alt", 0) > 200)
         (plant,) = children(sitl.process.pid)
         os.kill(plant, signal.SIGKILL)
-        assert pilot.hears("the plant is gone") <= 3  # within a second
-        sitl.until("the plant is gone")
+        assert pilot.hears("the plant disconnected") <= 3  # within a second
+        sitl.until("the plant disconnected")
         assert pilot.command(ARM, 1) in (ACCEPTED, TEMPORARILY_REJECTED)  # answered all the time
         beats = pilot.beats
         pilot.wait(lambda: pilot.beats > beats + 1)
@@ -110,8 +110,8 @@ def test_a_plant_that_is_killed_in_flight_is_told_within_a_second_and_comes_back
         pilot.wait(lambda: pilot.armed() and pilot.beats > beats + 1)
         assert children(sitl.process.pid) != [plant]
         pilot.close()
-    assert (tmp_path / "f.ulg").is_file()  # what flew before the loss
-    assert (tmp_path / "f-2.ulg").is_file()  # and what was on the way when it ended
+    assert (tmp_path / "f.ulg").is_file()  # the flight before the loss
+    assert (tmp_path / "f-2.ulg").is_file()  # the flight at the end
 
 
 def test_a_scenario_is_flown_from_the_ground_to_the_ground_and_equal_seeds_give_equal_logs(mimopilot, tmp_path):
@@ -141,7 +141,7 @@ def children(parent):
 
 
 def runs(process):
-    """Whether it exists and is no zombie that nobody has collected."""
+    """Whether it exists and is not a zombie."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
@@ -152,7 +152,7 @@ def until_gone(process):
     wait_for(lambda: not runs(process), lambda: "the plant outlives its host")
 
 
-def test_a_host_that_is_killed_leaves_no_plant_behind():
+def test_a_plant_ends_when_its_host_is_killed():
     with running_sitl() as sitl:
         (plant,) = children(sitl.process.pid)
         sitl.process.kill()
@@ -160,7 +160,7 @@ def test_a_host_that_is_killed_leaves_no_plant_behind():
         until_gone(plant)
 
 
-def test_ctrl_c_ends_both_processes_and_says_how_late_the_loop_was():
+def test_ctrl_c_ends_both_processes_and_prints_the_response_times():
     with running_sitl() as sitl:
         (plant,) = children(sitl.process.pid)
         pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
@@ -172,7 +172,7 @@ def test_ctrl_c_ends_both_processes_and_says_how_late_the_loop_was():
         until_gone(plant)
 
 
-def test_somebody_elses_plant_is_waited_for_and_found_again():
+def test_the_host_waits_for_an_external_plant_and_reconnects_to_it():
     port = free_port()
     with running_sitl("--plant", f"127.0.0.1:{port}") as sitl:
         pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
@@ -185,7 +185,7 @@ def test_somebody_elses_plant_is_waited_for_and_found_again():
             pilot.hears("plant connected")
             pilot.ready()
             plant.process.kill()
-            assert pilot.hears("the plant is gone") <= 3
+            assert pilot.hears("the plant disconnected") <= 3
             plant.end()
         pilot.close()
 
@@ -216,11 +216,11 @@ def test_mavproxy_connects_without_an_error_sets_parameters_and_flies(tmp_path, 
                 time.sleep(0.5)
                 return "COMPONENT_ARM_DISARM: ACCEPTED" in proxy.output
 
-            wait_for(armed, lambda: proxy.output)  # it may not be ready yet
+            wait_for(armed, lambda: proxy.output)  # the pre-arm check may still fail
             proxy.say("takeoff 2")
             proxy.until("mode hold")
             proxy.say(f"mode {custom_mode(Mode.LAND)}")
             proxy.until("disarmed: landed")
         finally:
-            proxy.process.kill()  # it does not always end when asked
+            proxy.process.kill()  # it does not always end on SIGTERM
             proxy.end()

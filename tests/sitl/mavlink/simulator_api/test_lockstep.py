@@ -1,4 +1,4 @@
-"""A scenario flown by two processes over PX4's simulator API."""
+"""A scenario flown by two processes in lockstep over PX4's simulator API."""
 
 import socket
 import threading
@@ -11,7 +11,8 @@ from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.mavlink.simulator_api import lockstep
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
-from mimopilot.sitl.mavlink.wire.link import Codec, listen
+from mimopilot.sitl.mavlink.wire.codec import Codec
+from mimopilot.sitl.mavlink.wire.sockets import listen
 from mimopilot.sitl.physics.airframe import load_airframe
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -26,7 +27,7 @@ def vehicle():
 
 
 @pytest.mark.parametrize("late", [0.0, 1.0])
-def test_a_flight_over_mavlink_has_the_same_bits_also_when_the_autopilot_starts_late(vehicle, late):
+def test_a_flight_over_mavlink_equals_the_one_in_process_even_when_the_autopilot_starts_late(vehicle, late):
     gains = vehicle.default_gains()
     scenario = doublet("roll", 0.39, 0.42, TS, tail=0.5)
     in_process = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), scenario, seed=5)
@@ -58,7 +59,7 @@ def test_the_plant_repeats_its_first_frame_until_it_is_answered_and_then_keeps_l
             link.recv(4096)
 
 
-def test_a_plant_that_goes_away_is_an_error_that_says_when(vehicle):
+def test_a_plant_that_disconnects_is_an_error_that_names_the_period(vehicle):
     server = listen("127.0.0.1", 0)
 
     def leave():
@@ -68,7 +69,7 @@ def test_a_plant_that_goes_away_is_an_error_that_says_when(vehicle):
     thread = threading.Thread(target=leave)
     thread.start()
     scenario = doublet("roll", 0.39, 0.42, TS)
-    with pytest.raises(SitlError, match="went away after 0 of"):
+    with pytest.raises(SitlError, match="disconnected after 0 of"):
         lockstep.fly(Autopilot(vehicle.airframe, vehicle.default_gains()), scenario, server.getsockname()[1])
     thread.join()
     server.close()

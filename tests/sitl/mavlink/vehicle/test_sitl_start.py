@@ -1,10 +1,10 @@
-"""How `mimopilot sitl` meets ground stations that only look, and mistakes."""
+"""`mimopilot sitl` and ground stations that connect, and mistakes on its command line."""
 
 import socket
 
 import numpy as np
 import pytest
-from mimopilot.sitl.mavlink.wire.link import listen
+from mimopilot.sitl.mavlink.wire.sockets import listen
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -39,14 +39,14 @@ def test_a_ground_station_sees_the_vehicle_and_changes_its_gains(pilot):
 
     mav.param_set_send(1, 1, b"MIMO_RP_RR", 0.12, 9)
     assert np.float32(pilot.asks("PARAM_VALUE").param_value) == np.float32(0.12)
-    # Another vehicle's message is not for us.
+    # A message to another vehicle is ignored.
     mav.param_set_send(7, 1, b"MIMO_RP_RR", 0.2, 9)
     mav.param_request_read_send(1, 1, b"MIMO_RP_RR", -1)
     assert np.float32(pilot.asks("PARAM_VALUE").param_value) == np.float32(0.12)
 
 
 def test_qgroundcontrols_start_sequence_is_answered_without_a_wait(pilot):
-    """What its InitialConnectStateMachine asks, in its order, then what follows: each is answered."""
+    """Each request of its InitialConnectStateMachine, in its order, and those that follow are answered."""
     mav = pilot.link.mav
     mav.heartbeat_send(mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 192, 0, 4)
     pilot.texts.clear()
@@ -66,10 +66,10 @@ def test_qgroundcontrols_start_sequence_is_answered_without_a_wait(pilot):
         assert pilot.command(unknown, 1) == UNSUPPORTED
     for known in (mavlink.MAV_CMD_GET_HOME_POSITION, mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES):
         assert pilot.command(known, 1) == ACCEPTED
-    assert pilot.texts == []  # nothing of this is a complaint
+    assert pilot.texts == []  # none of them is reported to the pilot
 
 
-def test_a_plant_port_in_use_is_one_clear_line(mimopilot):
+def test_a_plant_port_in_use_is_one_clear_error(mimopilot):
     with listen("127.0.0.1", 0) as taken:
         port = taken.getsockname()[1]
         free = ("--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", 0, "--tcp-port", 0)
@@ -89,6 +89,6 @@ def test_a_plant_port_in_use_is_one_clear_line(mimopilot):
         (("--log", "."), ("--log .", "cannot be written")),
     ],
 )
-def test_mistakes_are_one_clear_line(mimopilot, arguments, words):
+def test_mistakes_are_one_clear_error(mimopilot, arguments, words):
     links = ("--ground-port", free_port(socket.SOCK_DGRAM), "--vehicle-port", 0, "--tcp-port", 0)
     assert_one_clear_line(mimopilot("sitl", "adam0", *links, *arguments), *words)

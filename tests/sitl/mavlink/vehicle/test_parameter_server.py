@@ -1,4 +1,4 @@
-"""The vehicle's parameters: ranges, refusals, the running controller, and the file that keeps them."""
+"""The vehicle's parameters: ranges, refusals, the running controller, and the file that stores them."""
 
 import math
 
@@ -42,7 +42,7 @@ def test_a_written_parameter_changes_the_running_controller(server):
     assert server.read("MIMO_RP_RR", -1)[0].param_value == np.float32(0.12)
 
 
-def test_a_written_setting_reaches_the_injector(server):
+def test_a_written_excitation_parameter_reaches_the_injector(server):
     server.write("MIMO_EX_DUR", 3.0, 9)
     server.write("MIMO_EX_AX", 2.0, 9)
     assert server.injector.said == ["excitation: waits for its mode in the air"]
@@ -72,7 +72,7 @@ def test_a_refused_write_says_why_and_changes_nothing(server, name, value, kind,
     assert (server.controller.state.tobytes(), server.values) == before
 
 
-def test_the_list_holds_the_whole_table_in_order(server):
+def test_the_parameter_list_holds_the_whole_table_in_order(server):
     listing = server.listing()
     assert [m.param_index for m in listing] == list(range(ALL))
     assert {m.param_count for m in listing} == {ALL}
@@ -83,7 +83,7 @@ def test_the_list_holds_the_whole_table_in_order(server):
 
 @given(value=st.floats(-1, 1, width=32), rate=st.floats(-0.5, 0.5, width=32))
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_change_in_flight_does_not_move_the_moment(server, value, rate):
+def test_a_change_in_flight_does_not_change_the_torque_abruptly(server, value, rate):
     inputs = np.zeros(40, INPUT)
     inputs["armed"] = 1
     inputs["rates"][:, 0] = rate / 10
@@ -91,19 +91,19 @@ def test_a_change_in_flight_does_not_move_the_moment(server, value, rate):
     server.write("MIMO_RP_RR", value, 9)
     server.write("MIMO_RI_RR", 0.0001, 9)
     after = server.controller.run(inputs[:1])["moment"][0]
-    # One period's integral is all that may come on top; the integrator's own limit is not reached here.
+    # Only one period's integral may be added; the integrator limit is not reached here.
     assert np.abs(after - before).max() <= 0.004 * 0.05 * 1.0 + 1e-6
 
 
-# The file.
+# The parameter file.
 
 
-def settle(server):
+def close_and_read(server):
     server.close()
     return read_parameters(server.store.path)
 
 
-def test_a_change_is_in_the_file_soon_after_without_being_asked(tmp_path):
+def test_a_change_is_written_to_the_file_without_a_storage_command(tmp_path):
     server = start(ParameterStore(tmp_path / "p.params"))
     server.write("MIMO_RP_RR", 0.12, 9)
     wait_for(server.store.path.exists)
@@ -111,27 +111,27 @@ def test_a_change_is_in_the_file_soon_after_without_being_asked(tmp_path):
     server.close()
 
 
-def test_a_restart_keeps_what_was_changed_and_nothing_else(tmp_path):
+def test_changed_parameters_and_no_others_survive_a_restart(tmp_path):
     path = tmp_path / "p.params"
     server = start(ParameterStore(path))
     assert server.summary == ""
     server.write("MIMO_RP_RR", 0.12, 9)
     server.write("MIMO_EX_AMP", 0.2, 9)
     server.write("MIMO_EX_AX", 3.0, 9)
-    held = settle(server)
+    held = close_and_read(server)
     fixed = {"MIMO_TS", *(p.name for p in IDENTITY)}
     assert set(held) == fixed | {"MIMO_RP_RR", "MIMO_EX_AMP"}
 
     again = start(ParameterStore(path))
     assert again.controller.state["gains"][0, 4] == np.float32(0.12)
     assert again.values["MIMO_EX_AMP"] == np.float32(0.2)
-    assert again.values["MIMO_EX_AX"] == 0.0  # an experiment of an earlier flight starts nothing
-    assert again.summary.startswith(f"{path}: 2 parameters outrank the gains: MIMO_RP_RR 0.12 (else 0.15)")
+    assert again.values["MIMO_EX_AX"] == 0.0  # an experiment of an earlier flight does not start again
+    assert again.summary.startswith(f"{path}: 2 parameters override the gains: MIMO_RP_RR 0.12 (else 0.15)")
     again.write("MIMO_RP_RR", again.defaults["MIMO_RP_RR"], 9)
-    assert set(settle(again)) == fixed | {"MIMO_EX_AMP"}
+    assert set(close_and_read(again)) == fixed | {"MIMO_EX_AMP"}
 
 
-def test_nothing_is_written_when_nothing_changes(tmp_path):
+def test_no_file_is_written_when_no_value_changes(tmp_path):
     server = start(ParameterStore(tmp_path / "p.params"))
     server.write("MIMO_RP_RR", server.values["MIMO_RP_RR"], 9)
     server.write("MIMO_RP_RR", math.nan, 9)
@@ -152,10 +152,10 @@ LINE = "1\t1\t{}\t{}\t9\n"
         (LINE.format("MIMO_RP_RR", "99"), "MIMO_RP_RR: got 99.0, expected 0.0001 to 5"),
         (LINE.format("MIMO_EX_SEED", "1.5"), "MIMO_EX_SEED: got 1.5, expected a whole number"),
         (LINE.format("MIMO_TS", "0.002"), "MIMO_TS is 0.002, the gains are for 0.004"),
-        (LINE.format("MIMO_SCALE_R", "1"), "kept for another vehicle"),
+        (LINE.format("MIMO_SCALE_R", "1"), "belongs to another vehicle"),
     ],
 )
-def test_a_file_that_cannot_be_taken_is_one_clear_error_and_stays_as_it_is(tmp_path, content, message):
+def test_an_invalid_file_is_one_clear_error_and_stays_unchanged(tmp_path, content, message):
     path = tmp_path / "p.params"
     path.write_text(content)
     with pytest.raises(SitlError, match=message) as error:
@@ -165,14 +165,14 @@ def test_a_file_that_cannot_be_taken_is_one_clear_error_and_stays_as_it_is(tmp_p
     assert path.read_text() == content
 
 
-def test_a_file_that_cannot_be_written_is_told_and_tried_again(tmp_path):
+def test_a_failed_write_is_reported_and_tried_again(tmp_path):
     path = tmp_path / "p.params"
     server = start(ParameterStore(path))
     path.mkdir()
     server.write("MIMO_RP_RR", 0.12, 9)
     assert not server.flush()
-    assert "p.params" in server.complaint()
-    with pytest.raises(SitlError, match=r"not kept: .*p\.params"):
+    assert "p.params" in server.take_write_error()
+    with pytest.raises(SitlError, match=r"not stored: .*p\.params"):
         server.close()
     path.rmdir()
-    assert settle(server)["MIMO_RP_RR"] == np.float32(0.12)
+    assert close_and_read(server)["MIMO_RP_RR"] == np.float32(0.12)

@@ -1,36 +1,36 @@
-"""The injector on the vehicle: what it sees of the flight, and what ground stations see of it."""
+"""Excitation on the vehicle: steps the injector with the flight conditions, and publishes its phase and texts."""
 
 from __future__ import annotations
 
 from mimopilot.sitl.autopilot.excitation_injector import Conditions, Injector, Moment
 from mimopilot.sitl.autopilot.flight_modes import Severity
 from mimopilot.sitl.autopilot.setpoints import Sticks
-from mimopilot.sitl.mavlink.vehicle.situation import Situation
+from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.px4_modes import NAV_STATES
 
 NO_STICKS = Sticks(0.0, 0.0, 0.0, 0.0)
 
 
-class Excitation:
-    """Drives an injector once a period.
+class TorqueInjection:
+    """Steps an injector once a period.
 
     Parameters
     ----------
     injector : Injector
-    situation : Situation
-        The vehicle, with what the autopilot saw last.
+    state : VehicleState
+        The vehicle, with the autopilot's last record.
     """
 
-    def __init__(self, injector: Injector, situation: Situation) -> None:
-        self.injector, self.situation = injector, situation
+    def __init__(self, injector: Injector, state: VehicleState) -> None:
+        self.injector, self.state = injector, state
 
     def __call__(self, now: float) -> Moment:
-        """Moment to inject now; `now` is the vehicle's clock, s."""
-        vehicle, injector = self.situation.vehicle, self.injector
+        """Step the injector: torque (normalised) to inject now; `now` is the vehicle's clock, s."""
+        vehicle, injector = self.state.vehicle, self.injector
         estimate = vehicle.estimate
         moment = injector.step(
             Conditions(
-                ready=vehicle.armed and not vehicle.vertical.landed and not self.situation.row["fault"],
+                ready=vehicle.armed and not vehicle.vertical.landed and not self.state.record["fault"],
                 mode=NAV_STATES[vehicle.mode],
                 attitude=(estimate.roll, estimate.pitch),
                 sticks=vehicle.sticks.value if vehicle.sticks.fresh(now) else NO_STICKS,
@@ -39,5 +39,5 @@ class Excitation:
         for text in injector.said:
             vehicle.say(Severity.INFO, text)
         injector.said.clear()
-        self.situation.excited = injector.phase.published
+        self.state.excitation_phase = injector.phase.published
         return moment

@@ -1,4 +1,4 @@
-"""Parameter files: the same bits back, for us and for MAVProxy."""
+"""Parameter files: values read back bit for bit, by us and by MAVProxy."""
 
 import math
 import struct
@@ -7,14 +7,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import single
+from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, NAME, parameter_text, read_parameters
-from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.parameters import PARAMETERS
 from pymavlink.mavparm import MAVParmDict
 
+from mimopilot.common.errors import InputFileError
+
 names = st.from_regex(NAME, fullmatch=True)
-#: -0.0 comes back as 0.0 by intention: zero has no sign here.
+#: -0.0 is read back as 0.0 on purpose: zero has no sign here.
 floats32 = st.floats(width=32, allow_nan=False, allow_infinity=False).map(lambda v: v + 0.0)
 
 
@@ -25,7 +26,7 @@ def bits(value):
 @pytest.mark.parametrize("form", FORMATS)
 @given(values=st.dictionaries(names, floats32, min_size=1, max_size=30))
 @settings(deadline=None)
-def test_every_float_comes_back_with_the_same_bits(form, values, tmp_path_factory):
+def test_every_float_is_read_back_bit_for_bit(form, values, tmp_path_factory):
     path = tmp_path_factory.getbasetemp() / f"round.{form}"
     path.write_text(parameter_text(form, values))
     back = read_parameters(path)
@@ -43,7 +44,7 @@ def test_mavproxy_reads_the_same_bits(form, values, tmp_path_factory):
     assert {name: bits(value) for name, value in loaded.items()} == {name: bits(v) for name, v in values.items()}
 
 
-def test_a_value_that_six_digits_would_lose_is_kept(tmp_path):
+def test_a_value_that_needs_more_than_six_digits_is_kept(tmp_path):
     path = tmp_path / "small.parm"
     path.write_text(parameter_text("mavproxy", {"MIMO_RD_RP": 1.2345678e-8}))
     assert read_parameters(path) == {"MIMO_RD_RP": single(1.2345678e-8)}
@@ -55,7 +56,7 @@ def test_qgroundcontrols_five_columns_hold_the_vehicle_and_the_type():
     assert text.startswith("# ")
 
 
-def test_every_name_of_our_table_fits_a_file():
+def test_every_parameter_name_is_valid_in_a_file():
     assert all(NAME.fullmatch(p.name) for p in PARAMETERS)
 
 
@@ -64,20 +65,20 @@ def test_every_name_of_our_table_fits_a_file():
     [
         ("", "holds no parameters"),
         ("# only a comment\n", "holds no parameters"),
-        ("MIMO_RP_RR", r"line 1: got 'MIMO_RP_RR', expected a parameter's name"),
+        ("MIMO_RP_RR", r"line 1: got 'MIMO_RP_RR', expected a parameter name"),
         ("MIMO_RP_RR,0,12", r"line 1: got 'MIMO_RP_RR,0,12'"),
         ("MIMO_RP_RR,abc", r"line 1: MIMO_RP_RR: got 'abc', expected a finite number"),
         ("\nMIMO_RP_RR nan", r"line 2: MIMO_RP_RR: got 'nan'"),
         ("MIMO_RP_RR inf", "got 'inf'"),
         ("MIMO_RP_RR 1e39", "got '1e39'"),
-        ("MIMO_RP_RR 1\nMIMO_RP_RR 2", "line 2: MIMO_RP_RR stands in the file twice"),
-        ("MIMO_RP_RR_TOO_LONG 1", "16 capitals at most"),
+        ("MIMO_RP_RR 1\nMIMO_RP_RR 2", "line 2: MIMO_RP_RR is in the file twice"),
+        ("MIMO_RP_RR_TOO_LONG 1", "at most 16 capitals"),
         ("mimo 1", "got 'mimo 1'"),
         ("1\t1\tSYS_AUTOSTART\t4001\t6", "SYS_AUTOSTART: param_type 6, expected 9"),
         ("1\t1\tMIMO_RP_RR\t0.12", "got '1"),
     ],
 )
-def test_a_file_that_is_none_is_refused_with_its_line(tmp_path, text, message):
+def test_an_invalid_file_is_refused_with_its_line(tmp_path, text, message):
     path = tmp_path / "x.params"
     path.write_text(text)
     with pytest.raises(SitlError, match=message):
@@ -85,17 +86,17 @@ def test_a_file_that_is_none_is_refused_with_its_line(tmp_path, text, message):
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_a_file_of_ours_that_was_cut_or_changed_is_refused_at_every_byte(tmp_path, form):
+def test_a_file_that_was_truncated_or_edited_is_refused(tmp_path, form):
     values = {p.name: single(0.001 * i + 0.1) for i, p in enumerate(PARAMETERS)}
     path = tmp_path / "x.params"
     text = parameter_text(form, values)
-    for size in range(len(text) - 1):  # without its last line end it is whole
+    for size in range(len(text) - 1):  # without its last newline it is still complete
         path.write_text(text[:size])
-        with pytest.raises(SitlError, match=r"holds no parameters|not whole|cut short"):
+        with pytest.raises(SitlError, match=r"holds no parameters|incomplete|cut short"):
             read_parameters(path)
     lines = text.splitlines(keepends=True)
     path.write_text("".join(lines[:-10]))
-    with pytest.raises(SitlError, match=r"x\.params: holds 26 parameters, but its first line says 36: it is not whole"):
+    with pytest.raises(SitlError, match=r"x\.params: incomplete: holds 26 parameters, but its first line says 36"):
         read_parameters(path)
     path.write_text(text.replace("0.105", "0.106"))
     with pytest.raises(SitlError, match=r"damaged or edited.*delete the first line"):
@@ -105,10 +106,10 @@ def test_a_file_of_ours_that_was_cut_or_changed_is_refused_at_every_byte(tmp_pat
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path):
-    with pytest.raises(TuningError, match=r"none\.params: cannot read"):
+    with pytest.raises(InputFileError, match=r"none\.params: cannot read"):
         read_parameters(tmp_path / "none.params")
     (tmp_path / "binary.params").write_bytes(bytes(range(128, 256)))
-    with pytest.raises(TuningError, match=r"binary\.params: cannot read"):
+    with pytest.raises(InputFileError, match=r"binary\.params: cannot read"):
         read_parameters(tmp_path / "binary.params")
 
 

@@ -1,4 +1,4 @@
-"""What there is to know of a vehicle at one moment: all that telemetry is made from."""
+"""The state of the vehicle at one time, from which all telemetry is made."""
 
 from __future__ import annotations
 
@@ -13,48 +13,49 @@ from mimopilot.sitl.autopilot.setpoints import earth_to_heading
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState
 from mimopilot.sitl.physics.imu_baro_gps import METRES_PER_DEGREE
 
-NOWHERE = PlantState(*[0] * 19)
+UNKNOWN = PlantState(*[0] * 19)
 
 
 @dataclass
-class Situation:
-    """All that telemetry is made from.
+class VehicleState:
+    """What telemetry is made from.
 
     Attributes
     ----------
     vehicle : Commander
     stamp : int, us
         The plant's clock at the last period.
-    row : one of `sitl.autopilot.autopilot.RECORD`
-        What the autopilot saw and did then.
-    state : PlantState
+    record : one of `sitl.autopilot.autopilot.RECORD`
+        Inputs and outputs of the autopilot in that period.
+    plant : PlantState
+        The plant's last HIL_STATE_QUATERNION.
     imu, fix : tuple
         Fields of the plant's last HIL_SENSOR and HIL_GPS, in wire order, see `wire.fast_codec`; empty until then.
     home : (latitude, longitude, altitude), 1e-7 deg, mm
-        Where the vehicle was first seen; empty until then.
+        First position received from the plant; empty until then.
     load : float
-        Share of the period that is worked.
-    excited : int
-        Axis of the excitation: 0 roll, 1 pitch, 2 between them, -1 none.
+        Share of the last second in which the control loop did not sleep.
+    excitation_phase : int
+        0 roll, 1 pitch, 2 between them, -1 off.
     """
 
-    vehicle: Commander
+    vehicle : Commander
     stamp: int = -1
-    row: Any = field(default_factory=lambda: np.zeros(1, RECORD)[0])
-    state: PlantState = NOWHERE
+    record: Any = field(default_factory=lambda: np.zeros(1, RECORD)[0])
+    plant: PlantState = UNKNOWN
     imu: tuple[Any, ...] = ()
     fix: tuple[Any, ...] = ()
     home: tuple[int, ...] = ()
     load: float = 0.0
-    excited: int = -1
+    excitation_phase: int = -1
 
     @property
     def milliseconds(self) -> int:
-        """Time since boot as messages carry it."""
+        """Time since boot, ms, as a uint32."""
         return max(self.stamp, 0) // 1000 % 2**32
 
     def local(self) -> tuple[float, ...]:
-        """Position (m) and velocity (m/s), down positive: where motion capture sees it, else from home."""
+        """Position (m) and velocity (m/s), down positive: from motion capture while it is fresh, else from home."""
         estimate, vehicle = self.vehicle.estimate, self.vehicle
         if vehicle.pose.fresh(vehicle.now):
             pose = vehicle.pose.value
@@ -64,9 +65,9 @@ class Situation:
         metres = 1e-7 * METRES_PER_DEGREE
         east = metres * math.cos(math.radians(latitude * 1e-7))
         return (
-            (self.state.lat - latitude) * metres,
-            (self.state.lon - longitude) * east,
-            (altitude - self.state.alt) / 1000,
+            (self.plant.lat - latitude) * metres,
+            (self.plant.lon - longitude) * east,
+            (altitude - self.plant.alt) / 1000,
             estimate.north,
             estimate.east,
             -estimate.climb,

@@ -1,4 +1,4 @@
-"""Several ground stations at once, by UDP and TCP: who is told what."""
+"""Several ground stations at once over UDP and TCP: which messages each receives."""
 
 import socket
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.vehicle import stations as module
 from mimopilot.sitl.mavlink.vehicle.stations import MAX_STATIONS, Stations
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from pymavlink.dialects.v20 import common as mavlink
 
 from tests.sitl.mavlink.running import PATIENCE_S, wait_for
@@ -46,29 +46,29 @@ class Client:
 @pytest.fixture
 def stations():
     opened = Stations(9, 0)
-    opened.hear("HEARTBEAT", "PING")
+    opened.subscribe("HEARTBEAT", "PING")
     yield opened
     opened.close()
 
 
 def take(stations):
-    """What is heard in one turn."""
+    """Messages received in one call."""
     return [(message.get_type(), station) for message, station in stations.receive()]
 
 
 def receive(stations, count):
-    """The messages of as many turns as it takes."""
+    """Receive until this many messages have arrived."""
     heard = []
     wait_for(lambda: heard.extend(take(stations)) or len(heard) >= count)
     return heard
 
 
 def receive_all(stations):
-    """All that was sent by now: over loopback it is there as soon as it was sent, and each turn takes some."""
+    """Receive all messages sent so far: loopback delivers at once, and each call takes some."""
     return [entry for _ in range(100) for entry in take(stations)]
 
 
-def test_answers_go_to_whom_asked_and_telemetry_to_all(stations):
+def test_answers_go_to_the_requesting_station_and_telemetry_to_all(stations):
     clients = [Client(stations), Client(stations), Client(stations, tcp=True), Client(stations, tcp=True)]
     for client in clients:
         client.say(BEAT)
@@ -79,13 +79,13 @@ def test_answers_go_to_whom_asked_and_telemetry_to_all(stations):
     stations.deliver()
     assert clients[2].hear() == [("PING", 0)]
     stations.send(BEAT)
-    # Each counts its own messages: none takes those of another for lost ones.
+    # Each station has its own sequence numbers, so none sees gaps.
     assert [client.hear() for client in clients] == [[("HEARTBEAT", n)] for n in (0, 0, 1, 0)]
     assert kind == "PING"
     assert all(client.silent() for client in clients)
 
 
-def test_the_configured_station_is_told_before_it_speaks():
+def test_the_configured_station_receives_messages_before_it_sends_any():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))
         listener.settimeout(PATIENCE_S)
@@ -95,15 +95,15 @@ def test_the_configured_station_is_told_before_it_speaks():
         opened.close()
 
 
-def test_who_sends_no_sound_frame_is_no_station(stations):
+def test_a_sender_of_damaged_or_unsubscribed_frames_does_not_become_a_station(stations):
     stranger = Client(stations)
     stranger.link.send(b"\xfd\x09" + bytes(30))
-    stranger.say(mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))  # sound, but nothing to this vehicle
+    stranger.say(mavlink.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))  # intact, but not subscribed
     assert receive_all(stations) == []
     assert len(stations.by_address) == 1
 
 
-def test_messages_to_others_and_our_own_that_come_back_are_not_heard(stations):
+def test_messages_to_other_vehicles_and_echoes_of_our_own_are_ignored(stations):
     client = Client(stations)
     client.say(mavlink.MAVLink_ping_message(1, 1, 7, 1))
     client.say(mavlink.MAVLink_ping_message(1, 1, 1, 50))
@@ -112,7 +112,7 @@ def test_messages_to_others_and_our_own_that_come_back_are_not_heard(stations):
     assert [kind for kind, _ in receive_all(stations)] == ["PING"]
 
 
-def test_one_station_too_many_takes_the_place_of_a_silent_one_only(stations, monkeypatch):
+def test_a_new_station_beyond_the_limit_replaces_only_a_silent_one(stations, monkeypatch):
     clients = [Client(stations, tcp=kind) for kind in (True, False) for _ in range(MAX_STATIONS)]
     for client in clients:
         client.say(BEAT)
@@ -120,7 +120,7 @@ def test_one_station_too_many_takes_the_place_of_a_silent_one_only(stations, mon
     late = [Client(stations), Client(stations, tcp=True)]
     late[0].say(BEAT)
     assert receive_all(stations) == []
-    assert late[1].link.recv(1) == b""  # cut off
+    assert late[1].link.recv(1) == b""  # disconnected
     monkeypatch.setattr(module, "SILENCE_S", 0.0)
     late = [Client(stations), Client(stations, tcp=True)]
     for client in late:
@@ -129,7 +129,7 @@ def test_one_station_too_many_takes_the_place_of_a_silent_one_only(stations, mon
     assert (len(stations.by_address), len(stations.connected)) == (MAX_STATIONS + 1, MAX_STATIONS)
 
 
-def test_a_connection_that_ends_is_forgotten(stations):
+def test_a_closed_connection_is_removed(stations):
     client = Client(stations, tcp=True)
     client.say(BEAT)
     assert len(receive(stations, 1)) == 1
@@ -139,7 +139,7 @@ def test_a_connection_that_ends_is_forgotten(stations):
     stations.send(BEAT)
 
 
-def test_an_address_that_is_not_ours_is_one_clear_error():
+def test_a_foreign_bind_address_is_one_clear_error():
     with pytest.raises(SitlError, match=r"192\.0\.2\.1 cannot be used"):
         Stations(9, 0, bind="192.0.2.1")
 
@@ -149,7 +149,7 @@ FRAMES = [Codec(255, 190).pack(BEAT), Codec(255, 190).pack(PING)]
 
 @given(st.lists(st.one_of(st.binary(max_size=60), st.sampled_from(FRAMES)), max_size=12), st.integers(1, 40))
 @settings(max_examples=80, deadline=None)
-def test_a_stream_is_read_the_same_however_it_is_cut(pieces, size):
+def test_a_stream_parses_the_same_however_it_is_split(pieces, size):
     data = b"".join(pieces) + b"".join(FRAMES) * 20
     whole = [m.get_type() for m in Codec().parse(data)]
     codec = Codec()

@@ -1,9 +1,9 @@
-"""MAVLink 2 signing, against pymavlink's own, and what a thief can do with frames that he has heard."""
+"""MAVLink 2 signing: compatible with pymavlink's, and safe against forged and replayed frames."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.signing import EPOCH_S, UNITS_PER_S, Signer
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -21,7 +21,7 @@ def heard(codec, frame):
 
 
 def theirs(key=KEY, now=NOW):
-    """pymavlink's own end of a signed link."""
+    """pymavlink's end of a signed link."""
     mav = mavlink.MAVLink(None, 255, 190)
     mav.robust_parsing = True
     mav.signing.secret_key, mav.signing.sign_outgoing = key, True
@@ -29,7 +29,7 @@ def theirs(key=KEY, now=NOW):
     return mav
 
 
-def test_pymavlink_accepts_what_we_sign_and_we_what_it_signs():
+def test_pymavlink_accepts_our_signed_frames_and_we_accept_its():
     ours, mav = Codec(signer=signer()), theirs()
     for _ in range(3):
         (message,) = mav.parse_buffer(ours.pack(PING))
@@ -63,19 +63,19 @@ def test_a_replayed_frame_is_dropped_on_every_link_of_the_vehicle():
     assert heard(over_tcp, first) == []
 
 
-def test_a_stream_never_heard_may_be_a_minute_behind_and_not_more():
+def test_the_first_timestamp_of_a_stream_may_lag_by_at_most_a_minute():
     for late, taken in ((59.0, ["PING"]), (61.0, [])):
         assert heard(Codec(signer=signer()), Codec(255, 190, signer(now=NOW - late)).pack(PING)) == taken
 
 
-def test_a_clock_that_is_behind_is_told_from_a_wrong_key():
+def test_a_lagging_clock_is_distinguished_from_a_wrong_key():
     for key, late, behind in ((KEY, 3600.0, 3600.0), (KEY[::-1], 3600.0, 0.0), (KEY, 0.0, 0.0)):
         ours = signer()
         heard(Codec(signer=ours), Codec(255, 190, signer(key, NOW - late)).pack(PING))
         assert ours.behind == pytest.approx(behind, abs=0.1)
 
 
-def test_a_forged_time_stamp_does_not_shut_out_the_one_whose_stream_it_names():
+def test_a_forged_timestamp_does_not_block_the_stream_that_it_names():
     codec, sender = Codec(signer=signer()), Codec(255, 190, signer())
     forged = bytearray(sender.pack(PING))
     forged[-12:-6] = b"\xff" * 6
@@ -83,7 +83,7 @@ def test_a_forged_time_stamp_does_not_shut_out_the_one_whose_stream_it_names():
     assert heard(codec, sender.pack(PING)) == ["PING"]
 
 
-def test_our_time_stamps_grow_even_when_the_clock_goes_back():
+def test_our_timestamps_increase_even_when_the_clock_goes_back():
     times = iter([NOW, NOW - 100, NOW - 100, NOW + 1])
     ours, mav = Codec(signer=Signer(KEY, lambda: next(times))), theirs()
     for _ in range(4):

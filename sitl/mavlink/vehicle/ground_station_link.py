@@ -1,4 +1,4 @@
-"""The link to ground stations: who is there, what they ask and what they are answered."""
+"""The vehicle's link to ground stations: dispatches their messages, and sends answers, telemetry and texts."""
 
 from __future__ import annotations
 
@@ -8,31 +8,32 @@ from typing import Any
 
 from mimopilot.sitl.autopilot.flight_modes import Denied, Failed, Refused, Severity
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
-from mimopilot.sitl.mavlink.vehicle.setpoint_messages import Steering
+from mimopilot.sitl.mavlink.vehicle.setpoint_messages import SetpointReceiver
 from mimopilot.sitl.mavlink.vehicle.small_protocols import PROTOCOLS
 from mimopilot.sitl.mavlink.vehicle.stations import BUDGET_S, Stations
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry, texts
 from mimopilot.sitl.mavlink.vehicle.vehicle_commands import Command, VehicleCommands
 from pymavlink.dialects.v20 import common as mavlink
 
-GROUND_LOST_S = 5.0
+HEARTBEAT_TIMEOUT_S = 5.0  # s without a ground station's heartbeat before it is reported; chosen: five heartbeats
+MAX_TEXT_ID = 65535  # STATUSTEXT.id is a uint16; 0: a text of one chunk
 
-Answers = Callable[[Any], list[Any]]
+MessageHandler = Callable[[Any], list[Any]]
 
 
-class Ground:
-    """The vehicle as ground stations see it.
+class GroundStationLink:
+    """Serves ground stations.
 
     Parameters
     ----------
     parameters : ParameterServer
-        What they may read and write.
+        Answers the parameter protocol.
     commands : VehicleCommands
-        What they may command.
+        Executes commands.
     telemetry : Telemetry
-        What they are shown.
+        Schedules the telemetry.
     stations : Stations
-        Who they are.
+        The connections.
     """
 
     def __init__(
@@ -41,50 +42,50 @@ class Ground:
         self.parameters, self.telemetry, self.vehicle, self.stations = parameters, telemetry, commands.vehicle, stations
         self.now = 0.0
         self.heard: float | None = None
-        self._texts = 0
-        steering = Steering(self.vehicle)
-        self.answers: dict[str, Answers] = {
+        self._text_id = 0
+        setpoints = SetpointReceiver(self.vehicle)
+        self.handlers: dict[str, MessageHandler] = {
             **PROTOCOLS,
-            **dict.fromkeys(steering.takers, steering.take),
+            **dict.fromkeys(setpoints.handlers, setpoints.receive),
             "PARAM_REQUEST_LIST": lambda m: parameters.listing(),
             "PARAM_REQUEST_READ": lambda m: parameters.read(m.param_id, m.param_index),
             "PARAM_SET": lambda m: parameters.write(m.param_id, m.param_value, m.param_type),
-            "COMMAND_LONG": commands.answer,
-            "COMMAND_INT": commands.answer,
+            "COMMAND_LONG": commands.execute,
+            "COMMAND_INT": commands.execute,
             "SET_MODE": commands.set_mode,
             "REQUEST_DATA_STREAM": self._data_stream,
             "HEARTBEAT": self._heartbeat,
         }
-        stations.hear(*self.answers)
+        stations.subscribe(*self.handlers)
         commands.handlers[mavlink.MAV_CMD_PREFLIGHT_STORAGE] = self._store
 
     def receive(self, now: float) -> None:
-        """Take some of the messages that have arrived; `now` is a monotonic time in s."""
+        """Handle messages that have arrived, within the time budget; `now` is a monotonic time in s."""
         self.now = now
         for message, station in self.stations.receive():
             kind = message.get_type()
-            for answer in self.answers[kind](message):
-                # A new value is of interest to all.
+            for answer in self.handlers[kind](message):
+                # Every station must learn of a changed parameter.
                 for_all = kind == "PARAM_SET" and answer.get_type() == "PARAM_VALUE"
                 self.stations.post(answer, None if for_all else station)
 
-    def say(self, severity: Severity, text: str) -> None:
-        """STATUSTEXT to all; what is worth a word has most often changed the heartbeat, too."""
+    def send_text(self, severity: Severity, text: str) -> None:
+        """Send STATUSTEXT to all stations, and a heartbeat: its content has often changed, too."""
         self.telemetry.hurry(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
-        self._texts = self._texts % 65535 + 1
-        for piece in texts(severity, text, self._texts):
+        self._text_id = self._text_id % MAX_TEXT_ID + 1
+        for piece in texts(severity, text, self._text_id):
             self.stations.post(piece)
 
     def send(self, now: float) -> None:
-        """Send a few of the answers, and the telemetry that is due; `now` is a monotonic time in s."""
-        if self.heard is not None and now > self.heard + GROUND_LOST_S:
+        """Send due telemetry and queued answers, within the time budget; `now` is a monotonic time in s."""
+        if self.heard is not None and now > self.heard + HEARTBEAT_TIMEOUT_S:
             self.heard = None
-            self.vehicle.say(Severity.WARNING, f"no ground station for {GROUND_LOST_S:g} s")
-        complaint = self.parameters.complaint()
-        if complaint:
-            self.vehicle.say(Severity.CRITICAL, complaint)
+            self.vehicle.say(Severity.WARNING, f"no heartbeat from a ground station for {HEARTBEAT_TIMEOUT_S:g} s")
+        write_error = self.parameters.take_write_error()
+        if write_error:
+            self.vehicle.say(Severity.CRITICAL, write_error)
         end = time.perf_counter() + BUDGET_S
-        for message in self.telemetry.messages(now):
+        for message in self.telemetry.take_due(now):
             self.stations.send(message)
             if time.perf_counter() > end:
                 break
@@ -96,13 +97,13 @@ class Ground:
         return []
 
     def _store(self, command: Command) -> list[Any]:
-        """Parameters are kept as they change; here it is awaited."""
+        """Wait until the parameters are written; each change is written anyway."""
         if command.whole(1) not in (0, 1):
-            raise Denied("storage: param1 must be 1, to keep the parameters")
+            raise Denied("storage: param1 must be 1, to store the parameters")
         if self.vehicle.armed:
-            raise Refused("storage: not while armed; what changes is kept anyway")
+            raise Refused("storage: not while armed; changes are stored anyway")
         if not self.parameters.flush():
-            raise Failed(self.parameters.complaint())
+            raise Failed(self.parameters.take_write_error())
         return []
 
     def _data_stream(self, message: Any) -> list[Any]:
