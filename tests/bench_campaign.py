@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from mimopilot.sitl.campaign.flights import Stand
+from mimopilot.sitl.campaign.flights import FlightRunner
 from mimopilot.sitl.campaign.plan import plan_from_files, read_files
 
 from mimopilot.common.parallel import cores
@@ -60,15 +60,15 @@ def _campaign(folder: Path, spec: Path, runs: int) -> tuple[float, float]:
 
 def _parts(folder: Path) -> tuple[str, str]:
     """Where the time of one flight of a campaign goes, and what it is in all."""
-    stand = Stand(plan_from_files(read_files(folder)))
-    seed, noise = stand.plan.description.seed, stand.noise
-    draw = stand.draw(0)
-    flight = stand.fly(draw, "default", 0)
+    runner = FlightRunner(plan_from_files(read_files(folder)))
+    seed, noise = runner.plan.description.seed, runner.noise
+    draw = runner.draw(0)
+    flight = runner.fly(draw, "default", 0)
     seconds = (
-        best(lambda: stand.variator.draw(seed, 0), 50),
+        best(lambda: runner.sampler.draw(seed, 0), 50),
         best(lambda: np.random.default_rng([seed, 0, 1]).standard_normal(out=noise), 50),
-        best(lambda: stand.fly(draw, "default", 0), 50),
-        best(lambda: stand.row(0, draw, "default", "roll", flight), 50),
+        best(lambda: runner.fly(draw, "default", 0), 50),
+        best(lambda: runner.row(0, draw, "default", "roll", flight), 50),
     )
     return " + ".join(f"{part * 1e6:.0f}" for part in seconds) + " us", f"{sum(seconds) * 1e6:.0f} us"
 

@@ -32,11 +32,11 @@ PLANT = {
 }
 
 
-class ImpossibleError(Exception):
+class ImpossibleDrawError(Exception):
     """A draw that no vehicle has, or that cannot hover: another is drawn."""
 
 
-class Quantity(NamedTuple):
+class VariedQuantity(NamedTuple):
     """One number that is drawn: its column, distribution, the airframe's own value, and whether it is a whole one."""
 
     name: str
@@ -80,7 +80,7 @@ class Draw:
     rejected: int
 
 
-class Variator:
+class RunSampler:
     """Draws runs of one airframe; run k depends on the seed and k alone.
 
     Parameters
@@ -125,11 +125,11 @@ class Variator:
                 values[name] = float(round(value)) if whole else value
             try:
                 return self._make(run, values, attempt)
-            except ImpossibleError as reason:
+            except ImpossibleDrawError as reason:
                 last = reason
         raise SitlError(f"run {run}: {ATTEMPTS} draws in a row are of no vehicle that flies, the last because {last}")
 
-    def _quantities(self) -> Iterator[Quantity]:
+    def _quantities(self) -> Iterator[VariedQuantity]:
         """All that varies, in the order in which it is drawn."""
         v, base, noise = self.variation, self.base, self.airframe.noise
         inertia = {name: float(base.inertia[_place(name)]) for name in (*MOMENTS, *PRODUCTS)}
@@ -152,25 +152,25 @@ class Variator:
         for name, distribution in named:
             if name == "motors.effectiveness":
                 for i in range(len(base.rotors)):
-                    yield Quantity(f"{name}.{i + 1}", distribution, 1.0, False)
+                    yield VariedQuantity(f"{name}.{i + 1}", distribution, 1.0, False)
             else:
-                yield Quantity(name, distribution, own.get(name, 0.0), name == "delay" or name.endswith(".motor"))
+                yield VariedQuantity(name, distribution, own.get(name, 0.0), name == "delay" or name.endswith(".motor"))
 
     def _make(self, run: int, values: dict[str, float], attempt: int) -> Draw:
         """The vehicle of the values drawn."""
         plant = self._plant(values)
         delay = int(values.get("delay", self.airframe.computing_delay))
         if not 0 <= delay <= MAX_DELAY:
-            raise ImpossibleError(f"the delay is {delay} samples, expected 0 to {MAX_DELAY}")
+            raise ImpossibleDrawError(f"the delay is {delay} samples, expected 0 to {MAX_DELAY}")
         angle = values.get("noise.angle", self.airframe.noise.angle)
         rate = values.get("noise.rate", self.airframe.noise.rate)
         if angle < 0 or rate < 0:
-            raise ImpossibleError("a standard deviation of the noise is negative")
+            raise ImpossibleDrawError("a standard deviation of the noise is negative")
         factor = 1.0
         if "amplitude_deg" in values:
             amplitude = values["amplitude_deg"]
             if not 0 <= amplitude <= math.degrees(MAX_ANGLE):
-                raise ImpossibleError(f"the amplitude is {amplitude:.4g} degrees, expected 0 to 60")
+                raise ImpossibleDrawError(f"the amplitude is {amplitude:.4g} degrees, expected 0 to 60")
             factor = amplitude / self.amplitude_deg
         drawn = (self._fault(i, fault, values) for i, fault in enumerate(self.variation.fault))
         faults = (*self.scenario.faults, *drawn)
@@ -180,10 +180,10 @@ class Variator:
         changes: dict[str, Any] = {field: values[name] for name, field in PLANT.items() if name in values}
         for field, value in changes.items():
             if value < 0 or (value == 0 and field != "drag"):
-                raise ImpossibleError(f"{field} is {value:.4g}")
+                raise ImpossibleDrawError(f"{field} is {value:.4g}")
         if "rate_damping" in values:
             if values["rate_damping"] < 0:
-                raise ImpossibleError("the rate damping is negative")
+                raise ImpossibleDrawError("the rate damping is negative")
             changes["rate_damping"] = values["rate_damping"] * np.diag(np.array(self.airframe.inertia))
         inertia = self._inertia(values)
         if inertia is not None:
@@ -193,7 +193,7 @@ class Variator:
         plant = self.base._replace(effectiveness=np.array(effectiveness), wind=np.array(wind), **changes)
         weight, thrust = plant.mass * GRAVITY, plant.thrust_max * sum(effectiveness)
         if min(effectiveness) < 0 or weight > MAX_HOVER * thrust:
-            raise ImpossibleError(f"a weight of {weight:.4g} N against {thrust:.4g} N of thrust cannot hover")
+            raise ImpossibleDrawError(f"a weight of {weight:.4g} N against {thrust:.4g} N of thrust cannot hover")
         return plant
 
     def _inertia(self, values: dict[str, float]) -> NDArray[np.float64] | None:
@@ -205,13 +205,13 @@ class Variator:
             return None
         ratio = np.array([1.0 if m is None else m / own[i, i] for i, m in enumerate(moments)])
         if ratio.min() <= 0:
-            raise ImpossibleError("a moment of inertia is not positive")
+            raise ImpossibleDrawError("a moment of inertia is not positive")
         inertia: NDArray[np.float64] = own * np.sqrt(ratio[:, None] * ratio)
         for name, value in products.items():
             i, j = _place(name)
             inertia[i, j] = inertia[j, i] = value
         if not is_of_a_body(inertia):
-            raise ImpossibleError(f"no body has the inertia {inertia.tolist()} kg m^2")
+            raise ImpossibleDrawError(f"no body has the inertia {inertia.tolist()} kg m^2")
         return inertia
 
     def _fault(self, i: int, fault: FaultVariation, values: dict[str, float]) -> Fault:
@@ -224,7 +224,7 @@ class Variator:
             made = make_fault(table, name)
             check_fault(made, self.airframe, self.scenario.Ts, self.seconds)
         except SitlError as error:
-            raise ImpossibleError(str(error)) from error
+            raise ImpossibleDrawError(str(error)) from error
         return made
 
 

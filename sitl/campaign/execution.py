@@ -16,8 +16,8 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from mimopilot.sitl.campaign.flights import CHUNK, chunks, fly_chunk, label, stand_of
-from mimopilot.sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, Plan, settle
+from mimopilot.sitl.campaign.flights import CHUNK, chunks, flight_runner, fly_chunk, label
+from mimopilot.sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, CampaignPlan, write_plan_files
 from mimopilot.sitl.errors import SitlError
 
 from mimopilot.common.console import progress_console
@@ -29,12 +29,12 @@ SHOWN = 3  # parts that one message names
 AGAIN = "give the same command again to go on"
 
 
-def run_campaign(plan: Plan, folder: Path, workers: int, scheduler: str | None = None) -> Path:
+def run_campaign(plan: CampaignPlan, folder: Path, workers: int, scheduler: str | None = None) -> Path:
     """Fly all runs that are not flown yet, and merge them into one table.
 
     Parameters
     ----------
-    plan : Plan
+    plan : CampaignPlan
         What to fly.
     folder : Path
         Where its files and its results go; may hold a part of them from before.
@@ -60,9 +60,9 @@ def run_campaign(plan: Plan, folder: Path, workers: int, scheduler: str | None =
         inside(folder, name)
     results, parts = folder / RESULTS, folder / PARTS
     if not results.is_file():  # compiles before workers are forked, and finds what is wrong before the folder is taken
-        list(stand_of(tuple(plan.files.items())).flights(0))
-    with _alone(folder):
-        settle(plan, folder)
+        list(flight_runner(tuple(plan.files.items())).flights(0))
+    with _folder_lock(folder):
+        write_plan_files(plan, folder)
         if not results.is_file():
             missing = _missing(plan, parts)
             if missing:
@@ -76,7 +76,7 @@ def run_campaign(plan: Plan, folder: Path, workers: int, scheduler: str | None =
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
+def _folder_lock(folder: Path) -> Iterator[None]:
     """Keep other campaigns out of a folder; the lock ends with this process, however that ends."""
     path = inside(folder, LOCK)
     folder.mkdir(parents=True, exist_ok=True)
@@ -94,7 +94,7 @@ def _part(parts: Path, chunk: int) -> Path:
     return inside(parts, f"{chunk:07d}.part")
 
 
-def _missing(plan: Plan, parts: Path) -> list[int]:
+def _missing(plan: CampaignPlan, parts: Path) -> list[int]:
     """Chunks that are to be flown: their parts are not there, or not what they should be, which is told."""
     missing, wrong = [], []
     for chunk in range(chunks(plan)):
@@ -116,7 +116,7 @@ class _WrongPartError(SitlError):
     """A part that cannot be used."""
 
 
-def _table(plan: Plan, parts: Path, chunk: int) -> pa.BufferReader:
+def _table(plan: CampaignPlan, parts: Path, chunk: int) -> pa.BufferReader:
     """The Parquet file in a part, checked: whole, of this campaign, and of the runs of its chunk."""
     path, wanted = _part(parts, chunk), label(plan, chunk)
     found = unseal(path.read_bytes())
@@ -130,7 +130,7 @@ def _table(plan: Plan, parts: Path, chunk: int) -> pa.BufferReader:
     return pa.BufferReader(table)
 
 
-def _fly(plan: Plan, parts: Path, missing: list[int], workers: int, scheduler: str | None) -> None:
+def _fly(plan: CampaignPlan, parts: Path, missing: list[int], workers: int, scheduler: str | None) -> None:
     flights = len(plan.gains) * len(plan.scenarios)
     flown = chunks(plan) - len(missing)
     with _executor(workers, scheduler) as (executor, ahead), _progress(plan, flown) as advance:
@@ -177,7 +177,7 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, i
 
 
 @contextmanager
-def _progress(plan: Plan, flown: int) -> Iterator[Callable[[int], Any]]:
+def _progress(plan: CampaignPlan, flown: int) -> Iterator[Callable[[int], Any]]:
     """A bar with the rate and the time left, on a terminal; yields what advances it by so many flights."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -198,7 +198,7 @@ def _progress(plan: Plan, flown: int) -> Iterator[Callable[[int], Any]]:
         yield advance
 
 
-def _merge(plan: Plan, parts: Path, results: Path) -> None:
+def _merge(plan: CampaignPlan, parts: Path, results: Path) -> None:
     """All parts as one file, in order; only one row group is in memory at a time."""
     whole, count = inside(parts, RESULTS), chunks(plan)
     begin = pq.read_table(_table(plan, parts, 0))

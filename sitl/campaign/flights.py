@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from mimopilot.codegen.render import generator_version
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot
-from mimopilot.sitl.campaign.draws import Draw, Variator
-from mimopilot.sitl.campaign.plan import Plan, plan_from_files
+from mimopilot.sitl.campaign.draws import Draw, RunSampler
+from mimopilot.sitl.campaign.plan import CampaignPlan, plan_from_files
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_plant import Injection
 from mimopilot.sitl.flight.metrics import Performance, performance
@@ -29,16 +29,16 @@ FIGURES = tuple(field.name for field in fields(Performance))
 _one_at_a_time = Lock()
 
 
-class Stand:
+class FlightRunner:
     """A vehicle, its gain sets and buffers for one flight, used again and again.
 
     Parameters
     ----------
-    plan : Plan
+    plan : CampaignPlan
         What is flown.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: CampaignPlan) -> None:
         self.plan = plan
         first = next(iter(plan.gains.values()))
         self.autopilots = {name: Autopilot(plan.airframe, gains) for name, gains in plan.gains.items()}
@@ -53,13 +53,13 @@ class Stand:
         self.truth = np.zeros(samples, TRUTH)
         self.record = np.zeros(samples, RECORD)
         self.runs = np.ones(samples, np.int64)
-        self.variator = Variator(plan.airframe, plan.description.vary, plan.scenarios[0])
+        self.sampler = RunSampler(plan.airframe, plan.description.vary, plan.scenarios[0])
 
     def draw(self, run: int) -> Draw:
         """Everything random of a run: what varies, and the noise, which is the same for all its flights."""
         seed = self.plan.description.seed
         np.random.default_rng([seed, run, 1]).standard_normal(out=self.noise)
-        return self.variator.draw(seed, run)
+        return self.sampler.draw(seed, run)
 
     def fly(self, draw: Draw, gains: str, index: int) -> Flight:
         """One flight of the run that was drawn last, on the axis of the scenario `index`; the next overwrites it."""
@@ -105,17 +105,17 @@ class Stand:
         }
 
 
-def chunks(plan: Plan) -> int:
+def chunks(plan: CampaignPlan) -> int:
     """In how many chunks a campaign is flown."""
     return -(-plan.description.runs // CHUNK)
 
 
-def runs_of(plan: Plan, chunk: int) -> range:
+def runs_of(plan: CampaignPlan, chunk: int) -> range:
     """The runs of a chunk."""
     return range(chunk * CHUNK, min((chunk + 1) * CHUNK, plan.description.runs))
 
 
-def label(plan: Plan, chunk: int) -> str:
+def label(plan: CampaignPlan, chunk: int) -> str:
     """What a part is: of which campaign, and of which of its runs."""
     runs = runs_of(plan, chunk)
     return f"{plan.digest} runs {runs[0]} to {runs[-1]}"
@@ -127,7 +127,7 @@ def fly_chunk(files: dict[str, str], chunk: int) -> bytes:
     Parameters
     ----------
     files : dict
-        Of the `Plan`.
+        Of the `CampaignPlan`.
     chunk : int
         From 0.
 
@@ -141,15 +141,15 @@ def fly_chunk(files: dict[str, str], chunk: int) -> bytes:
     SitlError
         When this machine has another version of mimopilot than the one that leads.
     """
-    with _one_at_a_time:  # a cluster's worker may have several threads, the stand is one
-        stand = stand_of(tuple(files.items()))
-        version = stand.plan.description.mimopilot
+    with _one_at_a_time:  # a cluster's worker may have several threads, the runner is one
+        runner = flight_runner(tuple(files.items()))
+        version = runner.plan.description.mimopilot
         if version != generator_version():
             raise SitlError(f"a worker has mimopilot {generator_version()}, the campaign is one of {version}")
-        rows = [row for run in runs_of(stand.plan, chunk) for row, _ in stand.flights(run)]
+        rows = [row for run in runs_of(runner.plan, chunk) for row, _ in runner.flights(run)]
     stream = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(rows, schema(rows[0])), stream)
-    return seal(stream.getvalue(), label(stand.plan, chunk))
+    return seal(stream.getvalue(), label(runner.plan, chunk))
 
 
 def schema(row: dict[str, Any]) -> pa.Schema:
@@ -159,6 +159,6 @@ def schema(row: dict[str, Any]) -> pa.Schema:
 
 
 @lru_cache(maxsize=1)
-def stand_of(files: tuple[tuple[str, str], ...]) -> Stand:
-    """The stand of a plan, kept for the next chunk of the same."""
-    return Stand(plan_from_files(dict(files)))
+def flight_runner(files: tuple[tuple[str, str], ...]) -> FlightRunner:
+    """The runner of a plan, kept for the next chunk of the same."""
+    return FlightRunner(plan_from_files(dict(files)))

@@ -1,4 +1,4 @@
-"""What a campaign flies, as the text files that stand beside its results: the same texts, the same results."""
+"""What a campaign flies, as the text files that runner beside its results: the same texts, the same results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HEAD = "# A campaign of mimopilot. Run k is drawn from the seed and k alone; eve
 MAX_RUNS = 100_000_000
 
 
-class Description(BaseModel):
+class CampaignSpec(BaseModel):
     """The campaign's own file, `spec.toml`.
 
     Attributes
@@ -67,14 +67,14 @@ class Description(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class CampaignPlan:
     """A campaign.
 
     Attributes
     ----------
     files : dict
         Name -> text: what `plan_from_files` makes the same plan of, on this machine or another.
-    description : Description
+    description : CampaignSpec
     airframe : Airframe
     gains : dict of Gains
         By name, in order.
@@ -83,7 +83,7 @@ class Plan:
     """
 
     files: dict[str, str]
-    description: Description
+    description: CampaignSpec
     airframe: Airframe
     gains: dict[str, Gains]
     scenarios: list[Scenario]
@@ -94,7 +94,7 @@ class Plan:
         return sha256(json.dumps(self.files, sort_keys=True))
 
 
-def make_plan(vehicle: Vehicle, gains: dict[str, Gains], **entries: Any) -> Plan:
+def make_plan(vehicle: Vehicle, gains: dict[str, Gains], **entries: Any) -> CampaignPlan:
     """A plan from its parts.
 
     Parameters
@@ -104,7 +104,7 @@ def make_plan(vehicle: Vehicle, gains: dict[str, Gains], **entries: Any) -> Plan
     gains : dict of Gains
         By name.
     **entries
-        The rest of `Description`; `vary` as a mapping.
+        The rest of `CampaignSpec`; `vary` as a mapping.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def gains_file(name: str) -> str:
     return f"gains/{name}.gains.toml"
 
 
-def plan_from_files(files: dict[str, str], where: str = "campaign") -> Plan:
+def plan_from_files(files: dict[str, str], where: str = "campaign") -> CampaignPlan:
     """The plan that a campaign's files describe.
 
     Raises
@@ -134,7 +134,7 @@ def plan_from_files(files: dict[str, str], where: str = "campaign") -> Plan:
         When a file is not TOML, or an entry is unknown or impossible.
     """
     try:
-        description = checked(Description, parse_toml(files[SPEC], f"{where}/{SPEC}"), f"{where}/{SPEC}")
+        description = checked(CampaignSpec, parse_toml(files[SPEC], f"{where}/{SPEC}"), f"{where}/{SPEC}")
         airframe = airframe_from_toml(files[AIRFRAME], f"{where}/{AIRFRAME}")
         names = description.gains
         gains = {name: gains_from_toml(files[gains_file(name)], f"{where}/{gains_file(name)}") for name in names}
@@ -147,7 +147,7 @@ def plan_from_files(files: dict[str, str], where: str = "campaign") -> Plan:
     faults = tuple(map(parse_fault, d.faults))
     made = (make_scenario(d.manoeuvre, axis, d.amplitude_deg, d.period_s, Ts, d.tail_s) for axis in d.axes)
     scenarios = [replace(scenario, faults=faults) for scenario in made]
-    return Plan(files, description, airframe, gains, scenarios)
+    return CampaignPlan(files, description, airframe, gains, scenarios)
 
 
 def read_files(folder: Path) -> dict[str, str]:
@@ -163,7 +163,7 @@ def read_files(folder: Path) -> dict[str, str]:
     return texts
 
 
-def settle(plan: Plan, folder: Path) -> None:
+def write_plan_files(plan: CampaignPlan, folder: Path) -> None:
     """Put the plan's files into a folder.
 
     Raises
@@ -197,7 +197,7 @@ def _difference(there: dict[str, str], here: dict[str, str]) -> str:
 
 
 @contextmanager
-def reading(results: Path) -> Iterator[None]:
+def damage_explained(results: Path) -> Iterator[None]:
     """A table of results that is damaged is told in one line."""
     try:
         yield

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from mimopilot.sitl.campaign.flights import Stand
-from mimopilot.sitl.campaign.plan import RESULTS, SPEC, Plan, plan_from_files, read_files, reading
+from mimopilot.sitl.campaign.flights import FlightRunner
+from mimopilot.sitl.campaign.plan import RESULTS, SPEC, CampaignPlan, damage_explained, plan_from_files, read_files
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.simulator import Flight
 
 
 @dataclass(frozen=True, eq=False)
-class Again:
+class Replay:
     """The flight, its row of figures, and the row that the results have for it (None before they are merged)."""
 
-    plan: Plan
+    plan: CampaignPlan
     flight: Flight
     row: dict[str, Any]
     flown: dict[str, Any] | None
@@ -41,7 +41,7 @@ class Again:
                 )
 
 
-def fly_again(folder: Path, run: int, gains: str | None, axis: str | None) -> Again:
+def fly_again(folder: Path, run: int, gains: str | None, axis: str | None) -> Replay:
     """Fly a run again.
 
     Parameters
@@ -68,17 +68,17 @@ def fly_again(folder: Path, run: int, gains: str | None, axis: str | None) -> Ag
             f"--run {run} --gains {gains} --axis {axis}: the campaign has runs 0 to {d.runs - 1}, gains "
             f"{', '.join(d.gains)} and axes {', '.join(d.axes)}"
         )
-    stand = Stand(plan)
-    draw = stand.draw(run)
-    flight = stand.fly(draw, gains, d.axes.index(axis))
-    return Again(plan, flight, stand.row(run, draw, gains, axis, flight), _flown(folder / RESULTS, run, gains, axis))
+    runner = FlightRunner(plan)
+    draw = runner.draw(run)
+    flight = runner.fly(draw, gains, d.axes.index(axis))
+    return Replay(plan, flight, runner.row(run, draw, gains, axis, flight), _flown(folder / RESULTS, run, gains, axis))
 
 
 def _flown(results: Path, run: int, gains: str, axis: str) -> dict[str, Any] | None:
     if not results.is_file():
         return None
     chosen = (pc.field("run") == run) & (pc.field("gains") == gains) & (pc.field("axis") == axis)
-    with reading(results):
+    with damage_explained(results):
         (row,) = pq.read_table(results, filters=chosen, page_checksum_verification=True).to_pylist()
     return dict(row)
 

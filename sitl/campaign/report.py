@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mimopilot.sitl.campaign import figures
-from mimopilot.sitl.campaign.flights import stand_of
+from mimopilot.sitl.campaign import campaign_figures
+from mimopilot.sitl.campaign.flights import flight_runner
 from mimopilot.sitl.campaign.plan import REPORT, SPEC
 from mimopilot.sitl.campaign.summary import (
     FIGURE_COLUMNS,
     SURVIVAL_COLUMNS,
     WORST_COLUMNS,
-    Results,
-    Summary,
+    CampaignResults,
+    CampaignSummary,
     figure_rows,
     survival_rows,
     worst_rows,
@@ -28,20 +28,22 @@ INTERVALS = (
 )
 
 
-def write_campaign_report(results: Results, summary: Summary, over: tuple[str, str] | None = None) -> Path:
+def write_campaign_report(
+    results: CampaignResults, summary: CampaignSummary, over: tuple[str, str] | None = None
+) -> Path:
     """Write `report.html` beside the results.
 
     Parameters
     ----------
-    results : Results
+    results : CampaignResults
         What was flown, and the table.
-    summary : Summary
+    summary : CampaignSummary
         Of it.
     over : (str, str), optional
-        The quantities of the survival map; by default `sitl.campaign.figures.choose_map`.
+        The quantities of the survival map; by default `sitl.campaign.campaign_figures.choose_map`.
     """
     plan = results.plan
-    d, stand = plan.description, stand_of(tuple(plan.files.items()))
+    d, runner = plan.description, flight_runner(tuple(plan.files.items()))
     what = [f"{d.amplitude_deg:g} degrees", f"{d.period_s:g} s", *d.faults]
     lead = (
         f"{plan.airframe.name}: {d.runs} runs, seed {d.seed}, each a {d.manoeuvre} on {' and '.join(d.axes)} "
@@ -53,29 +55,31 @@ def write_campaign_report(results: Results, summary: Summary, over: tuple[str, s
         Table("Figures", FIGURE_COLUMNS, figure_rows(summary)),
         Table("Worst flights; the commands are for this folder", WORST_COLUMNS, worst_rows(summary, ".")),
     ]
-    sample = figures.fly_sample(stand)
+    sample = campaign_figures.fly_sample(runner)
     envelopes = [
-        svg(figures.envelope_figure(stand, sample, results, index), f"envelope {axis}")
+        svg(campaign_figures.envelope_figure(runner, sample, results, index), f"envelope {axis}")
         for index, axis in enumerate(d.axes)
     ]
     sections = [
         Section("Summary", INTERVALS, tables=tables),
         Section(
             "Responses",
-            f"True angles of those of the first {min(d.runs, figures.ENVELOPE_RUNS)} runs that survived, and of the "
-            "worst run of all.",
+            "True angles of the surviving runs among the first "
+            f"{min(d.runs, campaign_figures.ENVELOPE_RUNS)}, and of the worst run of all.",
             figures=envelopes,
         ),
         Section(
             "Distributions",
             "Share of all flights whose figure is at most that of the abscissa: left is better, and a curve that ends "
             "below 1 has lost the rest.",
-            figures=[svg(figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes],
+            figures=[
+                svg(campaign_figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes
+            ],
         ),
     ]
-    names = over or figures.choose_map(results)
+    names = over or campaign_figures.choose_map(results)
     if names:
-        maps = [svg(figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
+        maps = [svg(campaign_figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
         sections.append(Section("Survival", "Over two of the quantities that vary.", figures=maps))
     sections.append(
         Section("What was flown", "", tables=[Table(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])])

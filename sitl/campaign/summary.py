@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from mimopilot.sitl.campaign.plan import Plan, reading
+from mimopilot.sitl.campaign.plan import CampaignPlan, damage_explained
+from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from numpy.typing import NDArray
 
-from mimopilot.cli.bench import UNITS
 from mimopilot.common.intervals import quantile, wilson
 
 #: Figures that are summed up.
@@ -23,7 +23,7 @@ BATCH = 1 << 14  # rows
 
 
 @dataclass(frozen=True)
-class Worst:
+class WorstFlight:
     """A bad flight and what became of it."""
 
     run: int
@@ -32,7 +32,7 @@ class Worst:
 
 
 @dataclass(frozen=True)
-class Group:
+class GroupSummary:
     """All flights of one gain set on one axis.
 
     Attributes
@@ -44,7 +44,7 @@ class Group:
     quantiles : dict
         Figure -> {"0.5": (value, low, high), ...}, 95 % intervals; a lost flight counts as worse than all others:
         infinity.
-    worst : tuple of Worst
+    worst : tuple of WorstFlight
         Lost ones first, by time; then by J_M,o.
     """
 
@@ -54,16 +54,16 @@ class Group:
     survived: int
     survived_share: tuple[float, float]
     quantiles: dict[str, dict[str, tuple[float, float, float]]]
-    worst: tuple[Worst, ...]
+    worst: tuple[WorstFlight, ...]
 
 
 @dataclass(frozen=True)
-class Summary:
+class CampaignSummary:
     """Of a whole campaign; `rejected` impossible draws were replaced."""
 
     runs: int
     rejected: int
-    groups: tuple[Group, ...]
+    groups: tuple[GroupSummary, ...]
 
     def as_json(self, folder: str) -> dict[str, Any]:
         """The object that ``--json`` prints and `summary.json` holds; commands are for a campaign in `folder`."""
@@ -79,18 +79,18 @@ def replay_command(folder: str, run: int, gains: str, axis: str) -> str:
     return shlex.join(["mimopilot", "replay", folder, "--run", str(run), "--gains", gains, "--axis", axis])
 
 
-class Results:
+class CampaignResults:
     """The table of a campaign, column by column: 8 bytes a flight are in memory at a time.
 
     Parameters
     ----------
-    plan : Plan
-        What was flown: rows stand by run, gain set and axis.
+    plan : CampaignPlan
+        What was flown: rows runner by run, gain set and axis.
     path : Path
         Parquet file.
     """
 
-    def __init__(self, plan: Plan, path: Path) -> None:
+    def __init__(self, plan: CampaignPlan, path: Path) -> None:
         self.plan, self.path = plan, path
 
     def column(self, name: str, gains: str, axis: str) -> NDArray[Any]:
@@ -99,34 +99,34 @@ class Results:
         stride = len(self.plan.gains) * len(axes)
         offset = list(self.plan.gains).index(gains) * len(axes) + axes.index(axis)
         parts, start = [], 0
-        with reading(self.path), pq.ParquetFile(self.path, page_checksum_verification=True) as table:
+        with damage_explained(self.path), pq.ParquetFile(self.path, page_checksum_verification=True) as table:
             for batch in table.iter_batches(BATCH, columns=[name]):
                 values = batch.column(0).to_numpy(zero_copy_only=False)
                 parts.append(values[(offset - start) % stride :: stride].copy())
                 start += len(values)
         return np.concatenate(parts)
 
-    def worst(self, gains: str, axis: str, count: int) -> list[Worst]:
+    def worst(self, gains: str, axis: str, count: int) -> list[WorstFlight]:
         """The worst flights of a group: lost ones first, by time; then by J_M,o."""
         badness, lost_at = self.column("J_M_o", gains, axis), self.column("lost_at_s", gains, axis)
         lost = np.isfinite(lost_at)
         order = np.lexsort((-np.where(lost, 0.0, badness), np.where(lost, lost_at, np.inf)))[:count]
-        return [Worst(int(i), float(lost_at[i]) if lost[i] else None, float(badness[i])) for i in order]
+        return [WorstFlight(int(i), float(lost_at[i]) if lost[i] else None, float(badness[i])) for i in order]
 
-    def summarise(self) -> Summary:
+    def summarise(self) -> CampaignSummary:
         """Sum up all groups."""
         d = self.plan.description
         groups = tuple(self._group(gains, axis) for gains in d.gains for axis in d.axes)
-        return Summary(d.runs, int(self.column("rejected_draws", d.gains[0], d.axes[0]).sum()), groups)
+        return CampaignSummary(d.runs, int(self.column("rejected_draws", d.gains[0], d.axes[0]).sum()), groups)
 
-    def _group(self, gains: str, axis: str) -> Group:
+    def _group(self, gains: str, axis: str) -> GroupSummary:
         survived = self.column("survived", gains, axis)
         n, k = len(survived), int(survived.sum())
         quantiles = {}
         for name in SHOWN:
             ordered = np.sort(np.where(survived, self.column(name, gains, axis), np.inf))
             quantiles[name] = {f"{p:g}": quantile(ordered, p) for p in QUANTILES}
-        return Group(gains, axis, n, k, wilson(k, n), quantiles, tuple(self.worst(gains, axis, WORST)))
+        return GroupSummary(gains, axis, n, k, wilson(k, n), quantiles, tuple(self.worst(gains, axis, WORST)))
 
 
 SURVIVAL_COLUMNS = ("gains, axis", "survived", "95 % interval")
@@ -134,7 +134,7 @@ FIGURE_COLUMNS = ("figure", "gains, axis", "median", "95 % interval", "95 % quan
 WORST_COLUMNS = ("gains, axis", "run", "lost at [s]", "J_M,o [rad^2]", "flown again by")
 
 
-def survival_rows(summary: Summary) -> list[list[str]]:
+def survival_rows(summary: CampaignSummary) -> list[list[str]]:
     """A row for each gain set and axis."""
     return [
         [f"{g.gains}, {g.axis}", f"{g.survived}/{g.flights}", "{:.2%} to {:.2%}".format(*g.survived_share)]
@@ -142,23 +142,27 @@ def survival_rows(summary: Summary) -> list[list[str]]:
     ]
 
 
-def figure_rows(summary: Summary) -> list[list[str]]:
+def figure_rows(summary: CampaignSummary) -> list[list[str]]:
     """A row for each figure of each gain set and axis: quantiles with their intervals."""
     return [
-        [UNITS[name], f"{group.gains}, {group.axis}", *(cell for p in QUANTILES for cell in _cells(group, name, p))]
+        [
+            FIGURE_LABELS[name],
+            f"{group.gains}, {group.axis}",
+            *(cell for p in QUANTILES for cell in _cells(group, name, p)),
+        ]
         for name in SHOWN
         for group in summary.groups
     ]
 
 
-def _cells(group: Group, name: str, p: float) -> tuple[str, str]:
+def _cells(group: GroupSummary, name: str, p: float) -> tuple[str, str]:
     """A quantile and its interval; a bound that the sample is too small for is a dash."""
     found = group.quantiles[name][f"{p:g}"]
     value, low, high = ("lost" if v == np.inf else "-" if np.isnan(v) else f"{v:.3g}" for v in found)
     return value, f"{low} to {high}"
 
 
-def worst_rows(summary: Summary, folder: str) -> list[list[str]]:
+def worst_rows(summary: CampaignSummary, folder: str) -> list[list[str]]:
     """A row for each of the worst flights."""
     return [
         [

@@ -69,7 +69,7 @@ def _absolute(value: Distribution) -> Distribution:
     return value
 
 
-class _Table(BaseModel):
+class _VariationTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     def entries(self) -> Iterator[tuple[str, Distribution]]:
@@ -79,7 +79,7 @@ class _Table(BaseModel):
                 yield name, value
 
 
-class InertiaVariation(_Table):
+class InertiaVariation(_VariationTable):
     """Moments of inertia, kg m^2: each axis is scaled, the share of coupling (product over their root) stays."""
 
     xx: Distribution | None = None
@@ -87,7 +87,7 @@ class InertiaVariation(_Table):
     zz: Distribution | None = None
 
 
-class ProductVariation(_Table):
+class ProductVariation(_VariationTable):
     """Off-diagonal elements of the tensor, kg m^2 (minus the products of inertia), in place of the airframe's."""
 
     xy: Distribution | None = None
@@ -95,7 +95,7 @@ class ProductVariation(_Table):
     yz: Distribution | None = None
 
 
-class MotorVariation(_Table):
+class MotorVariation(_VariationTable):
     """Constants of all motors, as in the airframe's file; `effectiveness` (share of thrust) is drawn for each motor."""
 
     thrust_max: Distribution | None = None
@@ -104,14 +104,14 @@ class MotorVariation(_Table):
     effectiveness: Distribution | None = None
 
 
-class NoiseVariation(_Table):
+class NoiseVariation(_VariationTable):
     """Standard deviation of the state estimate: angle (rad), rate (rad/s)."""
 
     angle: Distribution | None = None
     rate: Distribution | None = None
 
 
-class _AbsoluteTable(_Table):
+class _AbsoluteVariationTable(_VariationTable):
     @model_validator(mode="after")
     def _is_absolute(self) -> Any:
         for _, value in self.entries():
@@ -119,7 +119,7 @@ class _AbsoluteTable(_Table):
         return self
 
 
-class WindVariation(_AbsoluteTable):
+class WindVariation(_AbsoluteVariationTable):
     """Constant wind, m/s: velocity of the air."""
 
     north: Distribution | None = None
@@ -127,7 +127,7 @@ class WindVariation(_AbsoluteTable):
     down: Distribution | None = None
 
 
-class AngleVariation(_AbsoluteTable):
+class AngleVariation(_AbsoluteVariationTable):
     """Three angles or body rates at the start."""
 
     roll: Distribution | None = None
@@ -135,7 +135,7 @@ class AngleVariation(_AbsoluteTable):
     yaw: Distribution | None = None
 
 
-class FaultVariation(_Table):
+class FaultVariation(_VariationTable):
     """A fault, see `sitl.faults.kinds.Fault`, whose numbers may be distributions; a drawn motor is a whole number."""
 
     kind: str
@@ -154,7 +154,7 @@ class FaultVariation(_Table):
         return self
 
 
-class Variation(_Table):
+class Variation(_VariationTable):
     """A specification; what is not named stays as the airframe has it.
 
     Attributes

@@ -17,7 +17,7 @@ from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.physics.airframe import Vehicle, load_airframe
 from mimopilot.sitl.studies.autotune import autotune
 from mimopilot.sitl.studies.benchmarks import TABLES
-from mimopilot.sitl.studies.optimum import Task, best_gains, flown_effort
+from mimopilot.sitl.studies.optimum import OptimumTask, best_gains, flown_effort
 from mimopilot.tuning.analysis.certificate import DENSE, certify, sensitivity_peak
 from mimopilot.tuning.analysis.doublet_prediction import doublet_model, effort
 from mimopilot.tuning.design.cascade import tune
@@ -26,8 +26,8 @@ from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.motors import fit_motors
 from mimopilot.tuning.plant.frequency_response import measured_plant
-from mimopilot.tuning.plant.inertia import rigid_body
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
+from mimopilot.tuning.plant.rigid_body_fit import rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel, second_order
 from mimopilot.tuning.spec import Manoeuvre, TuningSpec
 from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS
@@ -48,7 +48,7 @@ Model = tuple[float, float, int]
 
 
 @dataclass(frozen=True)
-class Study:
+class AttitudeStudy:
     """One vehicle and what is asked of it.
 
     Attributes
@@ -106,7 +106,7 @@ class Study:
         return [DEFAULT, AUTOTUNE, SISO, *own, MIMO, REFINED, BEST, BOUND]
 
 
-def studies() -> dict[str, Study]:
+def studies() -> dict[str, AttitudeStudy]:
     """The studies by name, from the thesis' tables; the strongly coupled one is our own."""
     printed = json.loads(TABLES.read_text())
 
@@ -115,7 +115,7 @@ def studies() -> dict[str, Study]:
 
     def made(
         name: str, title: str, airframe: str, key: str, gains: str, costs: str, offaxis: float | None, **changes: Any
-    ) -> Study:
+    ) -> AttitudeStudy:
         part = printed[key]
         models = part.get("reference_models", {"MIMO": part, "SISO": part})
         inner, outer = (model(models["MIMO"][loop]) for loop in ("inner", "outer"))
@@ -143,7 +143,7 @@ def studies() -> dict[str, Study]:
             ),
             "offaxis": offaxis,
         }
-        return Study(**(entry | changes))
+        return AttitudeStudy(**(entry | changes))
 
     simulation = made("adam0-sim", "ADAM-0, 10 % coupling", "adam0", "adam0_simulation", "5.4", "", 1 / 3)
     return {
@@ -186,7 +186,7 @@ def studies() -> dict[str, Study]:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class AttitudeRun:
     """One experiment and what came of it.
 
     Attributes
@@ -227,7 +227,7 @@ def _safe(flight: Flight, airframe: str, scenario: Scenario) -> Flight:
     return flight
 
 
-def experiment(study: Study, airframe: str, seed: int, noise: bool = True) -> tuple[Flight, Experiment]:
+def experiment(study: AttitudeStudy, airframe: str, seed: int, noise: bool = True) -> tuple[Flight, Experiment]:
     """The excitation flight of a study on a vehicle, and its signals as they are logged; with or without noise."""
     vehicle, default, _ = _bench(airframe)
     scenario = excitation_flight(*study.excitation, default.Ts, np.random.default_rng(seed))
@@ -238,7 +238,7 @@ def experiment(study: Study, airframe: str, seed: int, noise: bool = True) -> tu
     return flight, Experiment(Ts=default.Ts, source=f"{airframe}, seed {seed}", flown=default, motors=motors, **signals)
 
 
-def tune_all(study: Study, measured: Measured, siso_log: Experiment) -> dict[str, Gains]:
+def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experiment) -> dict[str, Gains]:
     """Every data-driven method, each from one log."""
     log = measured.experiment
     default = _bench(study.airframe)[1]
@@ -256,21 +256,21 @@ def tune_all(study: Study, measured: Measured, siso_log: Experiment) -> dict[str
     return found
 
 
-def logs(study: Study, seed: int) -> tuple[Flight, Experiment, Experiment]:
+def logs(study: AttitudeStudy, seed: int) -> tuple[Flight, Experiment, Experiment]:
     """The study's excitation flight, its log, and the log that SISO is tuned on."""
     flight, log = experiment(study, study.airframe, seed)
     other = log if study.siso_airframe == study.airframe else experiment(study, study.siso_airframe, seed)[1]
     return flight, log, other
 
 
-def optimum(study: Study) -> dict[str, Gains]:
+def optimum(study: AttitudeStudy) -> dict[str, Gains]:
     """The best gains on the true plant: with the effort of the refined ones and the certificate's margins, and with
     those margins and as much effort as it takes.
     """
     found, errors, bands = [], [], []
     for seed in TYPICAL:
         _, log, siso_log = logs(study, seed)
-        measured = Measured(log)
+        measured = PlantEstimates(log)
         plant = measured.response
         found.append(tune_all(study, measured, siso_log))
         errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
@@ -288,7 +288,7 @@ def optimum(study: Study) -> dict[str, Gains]:
     low, high = np.median(bands, axis=0)
     plant = plant.at((low <= plant.omega) & (plant.omega <= high)).interpolated(DENSE)
     vehicle, _, library = _bench(study.airframe)
-    task = Task(
+    task = OptimumTask(
         vehicle.airframe,
         library,
         doublets,
@@ -303,10 +303,10 @@ def optimum(study: Study) -> dict[str, Gains]:
     return {BEST: best, BOUND: best_gains(replace(task, effort=None), [best])}
 
 
-def run(study: Study, seed: int, best: dict[str, Gains]) -> Run:
+def run(study: AttitudeStudy, seed: int, best: dict[str, Gains]) -> AttitudeRun:
     """Fly the experiment, tune, certify, and fly both doublets with every set."""
     flight, log, siso_log = logs(study, seed)
-    measured = Measured(log)
+    measured = PlantEstimates(log)
     inner, outer = ([model] * 2 for model in study.models(MIMO, log.Ts))
     gains = {
         method: certify(found, measured.response, inner, outer).bound_to(found)
@@ -320,10 +320,10 @@ def run(study: Study, seed: int, best: dict[str, Gains]) -> Run:
         ]
         for method, both in flights.items()
     }
-    return Run(flight, gains, flights, figures)
+    return AttitudeRun(flight, gains, flights, figures)
 
 
-def numbers(found: Run) -> dict[str, Any]:
+def numbers(found: AttitudeRun) -> dict[str, Any]:
     """What of a run goes into statistics: figures, verdicts and gains by method."""
     return {
         method: {

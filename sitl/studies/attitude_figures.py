@@ -12,8 +12,8 @@ from mimopilot.sitl.flight.figures import STYLES
 from mimopilot.sitl.flight.metrics import reference_responses
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.flight.simulator import Flight
-from mimopilot.sitl.studies.attitude import MIMO, REFINED, SISO, Run, Study
-from mimopilot.sitl.studies.attitude_runs import Statistics
+from mimopilot.sitl.studies.attitude import MIMO, REFINED, SISO, AttitudeRun, AttitudeStudy
+from mimopilot.sitl.studies.attitude_runs import StudyStatistics
 from numpy.typing import NDArray
 
 #: A colour, a line and a marker of its own for each method that is compared everywhere.
@@ -33,7 +33,7 @@ COSTS = {
 LOW, HIGH = 5, 95
 
 
-def tracking_figure(found: Run, study: Study) -> Figure:
+def tracking_figure(found: AttitudeRun, study: AttitudeStudy) -> Figure:
     """Distance of angle and rate to the reference models, driven by their own set-points, in both doublets."""
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     panels: Any = figure.subplots(2, 2, sharex=True, sharey="row")
@@ -68,7 +68,7 @@ def _shown(flight: Flight) -> NDArray[np.bool_]:
     return np.asarray((_time(flight) >= -0.1) & (_time(flight) <= 2 * (stop - start) * flight.scenario.Ts))
 
 
-def motors_figure(found: Run, rotors: int, title: str) -> Figure:
+def motors_figure(found: AttitudeRun, rotors: int, title: str) -> Figure:
     """Commands of all motors in both doublets, one row a motor."""
     figure = Figure(figsize=(9, 1.5 + 1.5 * rotors), layout="constrained")
     panels: Any = figure.subplots(rotors, 2, sharex=True, sharey=True)
@@ -92,7 +92,7 @@ def motors_figure(found: Run, rotors: int, title: str) -> Figure:
     return figure
 
 
-def gains_figure(found: Statistics, printed: Mapping[str, Any], table: str) -> Figure:
+def gains_figure(found: StudyStatistics, printed: Mapping[str, Any], table: str) -> Figure:
     """Every gain: median and 5 to 95 % over the seeds; a cross where the thesis prints one."""
     figure = Figure(figsize=(9, 8.5), layout="constrained")
     panels: Any = figure.subplots(4, 4)
@@ -118,7 +118,9 @@ def gains_figure(found: Statistics, printed: Mapping[str, Any], table: str) -> F
     return figure
 
 
-def costs_figure(found: Statistics, methods: Sequence[str], printed: Mapping[str, Any], axis_printed: str) -> Figure:
+def costs_figure(
+    found: StudyStatistics, methods: Sequence[str], printed: Mapping[str, Any], axis_printed: str
+) -> Figure:
     """Every figure of merit by method: median and 5 to 95 % over the seeds, roll and pitch."""
     figure = Figure(figsize=(9, 8.5), layout="constrained")
     panels: Any = figure.subplots(3, 2, sharey=True)

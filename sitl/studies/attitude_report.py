@@ -9,7 +9,18 @@ import numpy as np
 from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.sitl.studies.attitude import AUTOTUNE, BEST, BOUND, DEFAULT, EFFORT, MIMO, REFINED, SISO, SISO_OWN, Study
+from mimopilot.sitl.studies.attitude import (
+    AUTOTUNE,
+    BEST,
+    BOUND,
+    DEFAULT,
+    EFFORT,
+    MIMO,
+    REFINED,
+    SISO,
+    SISO_OWN,
+    AttitudeStudy,
+)
 from mimopilot.sitl.studies.attitude_figures import (
     COSTS,
     ELEMENTS,
@@ -21,7 +32,7 @@ from mimopilot.sitl.studies.attitude_figures import (
     motors_figure,
     tracking_figure,
 )
-from mimopilot.sitl.studies.attitude_runs import Statistics
+from mimopilot.sitl.studies.attitude_runs import StudyStatistics
 
 from mimopilot.common.html_report import Section, Table
 
@@ -42,7 +53,7 @@ COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].partition(":")[0] f
 CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms", "lost flights")
 
 
-def study_sections(found: Statistics) -> list[Section]:
+def study_sections(found: StudyStatistics) -> list[Section]:
     """Headings, tables and figures of a study."""
     study, name = found.study, found.study.name
     inner, outer = study.models(MIMO, found.shown.experiment.scenario.Ts)
@@ -87,7 +98,7 @@ def study_sections(found: Statistics) -> list[Section]:
     ]
 
 
-def _lead(study: Study, inner: str, outer: str) -> str:
+def _lead(study: AttitudeStudy, inner: str, outer: str) -> str:
     seconds, amplitude, bandwidth = study.excitation
     text = (
         f"{load_airframe(study.airframe).airframe.description}. PRBS of amplitude {amplitude:g} and {bandwidth:g} "
@@ -105,7 +116,7 @@ def _lead(study: Study, inner: str, outer: str) -> str:
     return text
 
 
-def gains_table(found: Statistics) -> Table:
+def gains_table(found: StudyStatistics) -> Table:
     """Medians and spread of every method, beside the thesis'."""
     number, printed = found.study.gains_table
     rows = []
@@ -123,7 +134,7 @@ def gains_table(found: Statistics) -> Table:
     return Table(f"{found.study.name}: gains, output <- error", SPREAD_COLUMNS, rows)
 
 
-def costs_table(found: Statistics) -> Table:
+def costs_table(found: StudyStatistics) -> Table:
     """Medians of every figure by method and axis, beside the thesis' real flights."""
     number, axis_printed, printed = found.study.costs_table
     rows = []
@@ -138,7 +149,7 @@ def costs_table(found: Statistics) -> Table:
     return Table(caption, COST_COLUMNS, rows)
 
 
-def certificates_table(found: Statistics) -> Table:
+def certificates_table(found: StudyStatistics) -> Table:
     """What the certificate says of every method, from the log that this vehicle flew."""
     rows = []
     for method in found.study.methods():
@@ -153,7 +164,7 @@ def certificates_table(found: Statistics) -> Table:
     )
 
 
-def study_figures(found: Statistics) -> dict[str, Any]:
+def study_figures(found: StudyStatistics) -> dict[str, Any]:
     """The study's part of what ``--json`` prints."""
     study = found.study
 
@@ -175,7 +186,7 @@ def study_figures(found: Statistics) -> dict[str, Any]:
     }
 
 
-def _printed(study: Study) -> Mapping[str, Any]:
+def _printed(study: AttitudeStudy) -> Mapping[str, Any]:
     number, axis, costs = study.costs_table
     found: dict[str, Any] = {}
     if study.gains_table[1]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mimopilot.sitl.studies.attitude import Run, Study, numbers, optimum, run
+from mimopilot.sitl.studies.attitude import AttitudeRun, AttitudeStudy, numbers, optimum, run
 from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
@@ -16,20 +16,20 @@ from mimopilot.common.parallel import cores, processes, run_all
 
 
 @dataclass(frozen=True, eq=False)
-class Statistics:
+class StudyStatistics:
     """What the runs of a study say.
 
     Attributes
     ----------
-    study : Study
-    shown : Run
+    study : AttitudeStudy
+    shown : AttitudeRun
         That of seed 0, for the figures.
     runs : list of dict
         `numbers` of every seed, in order.
     """
 
-    study: Study
-    shown: Run
+    study: AttitudeStudy
+    shown: AttitudeRun
     runs: list[dict[str, Any]]
 
     def values(self, method: str, axis: str, figure: str) -> NDArray[np.float64]:
@@ -50,24 +50,24 @@ class Statistics:
         return {verdict: found.count(verdict) for verdict in sorted(set(found))}
 
 
-def run_once(task: tuple[Study, int, dict[str, Gains]]) -> tuple[Run, dict[str, Any]]:
+def run_once(task: tuple[AttitudeStudy, int, dict[str, Gains]]) -> tuple[AttitudeRun, dict[str, Any]]:
     """One run of a study with a seed, beside the best sets, and its `numbers`."""
     found = run(*task)
     return found, numbers(found)
 
 
-def _counted(task: tuple[Study, int, dict[str, Gains]]) -> tuple[Run | None, dict[str, Any]]:
+def _counted(task: tuple[AttitudeStudy, int, dict[str, Gains]]) -> tuple[AttitudeRun | None, dict[str, Any]]:
     """`run_once`; flights take long to hand over, and only those of seed 0 are shown."""
     found, counted = run_once(task)
     return (found if task[1] == 0 else None), counted
 
 
-def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None) -> list[Statistics]:
+def run_studies(chosen: Sequence[AttitudeStudy], seeds: int, workers: int | None = None) -> list[StudyStatistics]:
     """Every study with every seed.
 
     Parameters
     ----------
-    chosen : sequence of Study
+    chosen : sequence of AttitudeStudy
     seeds : int
         Experiments a study.
     workers : int, optional
@@ -77,15 +77,15 @@ def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None)
 
     count = workers or cores()
     best: dict[str, dict[str, Gains]] = {}
-    runs: dict[tuple[str, int], tuple[Run | None, dict[str, Any]]] = {}
+    runs: dict[tuple[str, int], tuple[AttitudeRun | None, dict[str, Any]]] = {}
     with processes(count) as pool, Progress(console=progress_console(), transient=True) as bar:
         shown = bar.add_task("experiments", total=len(chosen) * (seeds + 1))
 
-        def keep_best(study: Study, sets: dict[str, Gains]) -> None:
+        def keep_best(study: AttitudeStudy, sets: dict[str, Gains]) -> None:
             best[study.name] = sets
             bar.advance(shown)
 
-        def keep_run(task: tuple[Study, int, Any], found: tuple[Run | None, dict[str, Any]]) -> None:
+        def keep_run(task: tuple[AttitudeStudy, int, Any], found: tuple[AttitudeRun | None, dict[str, Any]]) -> None:
             runs[task[0].name, task[1]] = found
             bar.advance(shown)
 
@@ -96,5 +96,5 @@ def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None)
     for study in chosen:
         first = runs[study.name, 0][0]
         assert first is not None
-        results.append(Statistics(study, first, [runs[study.name, seed][1] for seed in range(seeds)]))
+        results.append(StudyStatistics(study, first, [runs[study.name, seed][1] for seed in range(seeds)]))
     return results

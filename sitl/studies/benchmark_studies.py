@@ -13,7 +13,7 @@ import numpy as np
 from mimopilot.sitl.flight.figures import svg
 from mimopilot.sitl.studies.benchmark_figures import sensitivity_figure, step_figure
 from mimopilot.sitl.studies.benchmarks import Benchmark, Signal, excitation, lv100, numerical_example
-from mimopilot.sitl.studies.part import Part
+from mimopilot.sitl.studies.report_part import ReportPart
 from mimopilot.tuning.design.refine import refine
 from mimopilot.tuning.estimation.cbt_ift import Comparison, correlation_based_tuning, iterative_feedback_tuning
 from mimopilot.tuning.estimation.siso import siso_vrft
@@ -113,7 +113,7 @@ def gain_spread(task: Benchmark, samples: int, runs: int, seed: int) -> Signal:
         return np.array([gain for part in pool.map(chunk, starts) for gain in part])
 
 
-def study_numerical_example() -> Part:
+def study_numerical_example() -> ReportPart:
     """Table 5.3 and Figure 5.3: noise-free MIMO and SISO VRFT."""
     task = numerical_example()
     half = 1000
@@ -133,10 +133,10 @@ def study_numerical_example() -> Part:
         "The 2x2 numerical example of the thesis, tuned without noise: one input after the other, white, in open loop."
     )
     section = Section("Table 5.3 and Figure 5.3", "J_MR: (3.1), here on the true plant.", [table], [figure])
-    return Part(lead, [section], {"table_5_3": _numbers(task, shown, {})})
+    return ReportPart(lead, [section], {"table_5_3": _numbers(task, shown, {})})
 
 
-def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
+def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> ReportPart:
     """Tables 5.1 and 5.2, Figures 5.1 and 5.2, and J_MR from one experiment over noise seeds.
 
     Parameters
@@ -214,7 +214,7 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
         },
         "table_5_2_seconds": seconds,
     }
-    return Part("The LV100 gas turbine, M = 0.4/(z - 0.6) I, Ts = 0.1 s.", sections, figures)
+    return ReportPart("The LV100 gas turbine, M = 0.4/(z - 0.6) I, Ts = 0.1 s.", sections, figures)
 
 
 def _progress(text: str) -> Any:

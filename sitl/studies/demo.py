@@ -41,7 +41,7 @@ TABLES = Path(__file__).with_name("thesis_tables.json")
 
 
 @dataclass(frozen=True, eq=False)
-class Summary:
+class DemoSummary:
     """What the demo found: paths, gain sets, figures by axis and method, and the seconds it took."""
 
     paths: dict[str, Path]
@@ -80,7 +80,7 @@ def _stage(text: str) -> Iterator[None]:
         yield
 
 
-def run_demo(out: Path, seed: int) -> Summary:
+def run_demo(out: Path, seed: int) -> DemoSummary:
     """Fly, tune, generate, compile, fly again, compare with MAVLink, report.
 
     Parameters
@@ -138,7 +138,7 @@ def run_demo(out: Path, seed: int) -> Summary:
     with _stage("report"):
         _write_report(report, gains, figures, flights, flight)
     samples = len(flights["roll"]["mimo"].record)
-    return Summary(paths, gains, figures, report, log, samples, speed, time.monotonic() - begin)
+    return DemoSummary(paths, gains, figures, report, log, samples, speed, time.monotonic() - begin)
 
 
 def _controller(gains: Gains, folder: Path) -> NativeController:
@@ -275,7 +275,7 @@ def _write_report(
     write_report(path, "mimopilot demo", lead, sections)
 
 
-def print_summary(summary: Summary) -> None:
+def print_summary(summary: DemoSummary) -> None:
     """The tables, and where everything is."""
     print_table("Gains beside Table 5.4 of the thesis", GAIN_COLUMNS, _gain_rows(summary.gains))
     title = f"Doublet of {DOUBLET_DEG:g} deg, {DOUBLET_S:g} s: J in rad^2 and rad^2/s^2"

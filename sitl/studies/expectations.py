@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.studies.attitude import BEST, MIMO, REFINED, SISO
-from mimopilot.sitl.studies.attitude_runs import Statistics
+from mimopilot.sitl.studies.attitude_runs import StudyStatistics
 
 from mimopilot.common.html_report import Table
 
@@ -45,7 +45,7 @@ class Expectation:
         return self.ratios[method] <= self.limit
 
 
-def expectations(found: Sequence[Statistics]) -> list[Expectation]:
+def expectations(found: Sequence[StudyStatistics]) -> list[Expectation]:
     """Every expectation of every study, on the medians over the seeds."""
     rows = []
     for statistics in found:

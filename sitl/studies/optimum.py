@@ -23,7 +23,7 @@ from mimopilot.tuning.design.constrained_least_squares import MISSED, descend
 from mimopilot.tuning.design.refine_manoeuvre import OTHER_AXIS, typical_sizes
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import PlantResponse
-from mimopilot.tuning.plant.inertia import RigidBody
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 from mimopilot.tuning.reference_model import ReferenceModel
 from numpy.typing import NDArray
 
@@ -31,14 +31,14 @@ from numpy.typing import NDArray
 FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
 #: Relative step of the differences: the flown controller is single precision.
 STEP = 1e-3
-#: Limits of `Task.examine`, and what a gain set that cannot fly costs (rad^2).
+#: Limits of `OptimumTask.examine`, and what a gain set that cannot fly costs (rad^2).
 LIMITS, LOST = 5, 10.0
 
 Signal = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class OptimumTask:
     """What is to be flown best.
 
     Attributes
@@ -57,7 +57,7 @@ class Task:
     effort : sequence of 2 float or None
         RMS of the moments allowed in each doublet; None: as much as it takes.
     integral : float, 1/s
-        Integral action that is needed, see `tuning.plant.inertia.RigidBody.least`: a vehicle must find its trim.
+        Integral action that is needed, see `tuning.plant.rigid_body_fit.RigidBody.least`: a vehicle must find its trim.
     """
 
     airframe: Airframe
@@ -109,12 +109,12 @@ def flown_effort(flight: Flight) -> float:
     return float(moment_rms(flight.record["moment"][slice(*flight.scenario.window), :2].astype(np.float64)))
 
 
-def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
+def best_gains(task: OptimumTask, starts: Sequence[Gains]) -> Gains:
     """The gains that keep both angles nearest to the model in both doublets within the limits, from several starts.
 
     Parameters
     ----------
-    task : Task
+    task : OptimumTask
     starts : sequence of Gains
         Where the descent begins; the best end counts.
     """

@@ -9,10 +9,10 @@ from typing import Any
 
 from mimopilot.sitl.studies.attitude import studies
 from mimopilot.sitl.studies.attitude_report import IN_KIND, study_figures, study_sections
-from mimopilot.sitl.studies.attitude_runs import Statistics, run_studies
+from mimopilot.sitl.studies.attitude_runs import StudyStatistics, run_studies
 from mimopilot.sitl.studies.benchmark_studies import study_lv100, study_numerical_example
 from mimopilot.sitl.studies.expectations import expectations, expectations_table
-from mimopilot.sitl.studies.part import Part
+from mimopilot.sitl.studies.report_part import ReportPart
 
 from mimopilot.common.console import print_table
 from mimopilot.common.files import inside
@@ -20,7 +20,7 @@ from mimopilot.common.html_report import Section, Table, write_report
 
 #: Noise seeds of the attitude studies: what is expected is expected of their medians.
 SEEDS = 50
-BENCHMARKS: dict[str, Callable[[], Part]] = {"numerical-example": study_numerical_example, "lv100": study_lv100}
+BENCHMARKS: dict[str, Callable[[], ReportPart]] = {"numerical-example": study_numerical_example, "lv100": study_lv100}
 STUDIES = (*BENCHMARKS, *studies())
 ALL = "all"
 
@@ -73,7 +73,7 @@ def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = No
     return Reproduction({study: part.figures for study, part in parts.items()}, tables, report)
 
 
-def _attitude_parts(found: Sequence[Statistics], seeds: int) -> dict[str, Part]:
+def _attitude_parts(found: Sequence[StudyStatistics], seeds: int) -> dict[str, ReportPart]:
     """Expectations of all, then every study."""
     rows = expectations(found)
     section = Section("Expectations", f"Ratios of medians over {seeds} seeds. {UNMET}", [expectations_table(rows)])
@@ -82,8 +82,8 @@ def _attitude_parts(found: Sequence[Statistics], seeds: int) -> dict[str, Part]:
         f"constants are class values. {IN_KIND}"
     )
     table = [{**asdict(row), "met": {method: row.met(method) for method in row.ratios}} for row in rows]
-    studied = {one.study.name: Part("", study_sections(one), study_figures(one)) for one in found}
-    return {"expectations": Part(lead, [section], {"seeds": seeds, "rows": table}), **studied}
+    studied = {one.study.name: ReportPart("", study_sections(one), study_figures(one)) for one in found}
+    return {"expectations": ReportPart(lead, [section], {"seeds": seeds, "rows": table}), **studied}
 
 
 def print_reproduction(found: Reproduction) -> None:

@@ -106,7 +106,6 @@ class Columns(BaseModel):
         """Name of a signal's column in the file."""
         return getattr(self, field).column or field
 
-
     def line(self, field: str, other: str, what: str) -> str:
         """The line of a column file that gives a field another ``sign`` or ``unit``, or the column of another field."""
         entry = getattr(self, other)

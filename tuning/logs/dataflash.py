@@ -70,7 +70,7 @@ def record_dataflash(path: Path) -> Recording:
     TuningError
         When the file is damaged.
     """
-    log = _Log(open_dataflash(path))
+    log = _DataflashLog(open_dataflash(path))
     if SDLOG2_MESSAGES.issubset(log.file.names()):
         raise TuningError(f"{path}: {SDLOG2}")
     old = log.in_old_units()
@@ -114,7 +114,7 @@ def record_dataflash(path: Path) -> Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class _Log:
+class _DataflashLog:
     file: DataflashFile
 
     def timed(self, message: str, names: Sequence[str]) -> list[NDArray[Any]] | None:
@@ -175,7 +175,7 @@ def _unrounded(time: NDArray[np.float64]) -> NDArray[np.float64]:
     return smooth
 
 
-def _wanted(log: _Log, message: str, fields: Sequence[str]) -> str:
+def _wanted(log: _DataflashLog, message: str, fields: Sequence[str]) -> str:
     """Where a signal should be, and what is there where the message has other fields."""
     wanted = f"message {message} ({', '.join(fields)})"
     return (
@@ -183,7 +183,7 @@ def _wanted(log: _Log, message: str, fields: Sequence[str]) -> str:
     )
 
 
-def _advice(log: _Log, parameters: dict[str, float], texts: Sequence[str]) -> str:
+def _advice(log: _DataflashLog, parameters: dict[str, float], texts: Sequence[str]) -> str:
     """What to change so that RATE and the angles are logged in every loop: nothing that is so already."""
     bits, limit = parameters.get("LOG_BITMASK"), parameters.get("LOG_FILE_RATEMAX", 0)
     release = next((found for text in texts if (found := _RELEASE.match(text))), None)
@@ -209,7 +209,7 @@ def _advice(log: _Log, parameters: dict[str, float], texts: Sequence[str]) -> st
     return advice
 
 
-def _excitation(log: _Log) -> Series | None:
+def _excitation(log: _DataflashLog) -> Series | None:
     """The waveform that the system identification mode added to the moment; zero where that mode was off."""
     waveform = log.series("SIDD", ("Targ",), 1.0)
     runs = log.timed("SIDS", ("Ax",))
@@ -234,7 +234,7 @@ def _excitation(log: _Log) -> Series | None:
     return Series(time[order], values, "SIDD") if values.any() else None
 
 
-def _airborne(log: _Log) -> tuple[Interval, ...] | None:
+def _airborne(log: _DataflashLog) -> tuple[Interval, ...] | None:
     events = log.timed("EV", ("Id",))
     if events is None:
         return None
@@ -249,7 +249,7 @@ def _airborne(log: _Log) -> tuple[Interval, ...] | None:
     return intervals(np.append(time[0] - 1.0, time), np.append(not flying[0], flying))
 
 
-def _parameters(log: _Log) -> tuple[dict[str, float], list[tuple[float, str, float]]]:
+def _parameters(log: _DataflashLog) -> tuple[dict[str, float], list[tuple[float, str, float]]]:
     """The first value of each parameter, and (time s, name, value) of what was set later."""
     columns = log.timed("PARM", ("Name", "Value"))
     if columns is None:
@@ -267,7 +267,7 @@ def _parameters(log: _Log) -> tuple[dict[str, float], list[tuple[float, str, flo
     return first, changes
 
 
-def _span(log: _Log) -> Interval | None:
+def _span(log: _DataflashLog) -> Interval | None:
     """First and last time (s) of the message that there are most of."""
     most = max(log.file.offsets, key=lambda name: len(log.file.offsets[name]), default="")
     columns = log.timed(most, ())

@@ -16,7 +16,7 @@ HEAD = b"\xa3\x95"
 FMT, FMT_LENGTH = 0x80, 89  # the message that defines the others, itself as AP_Logger's LogStructure.h defines it
 PADDING = b"\x00\xff"  # what block devices leave behind the last message
 
-#: Format letter of AP_Logger -> type in the file, and what the value is multiplied by.
+#: DataflashFormat letter of AP_Logger -> type in the file, and what the value is multiplied by.
 LETTERS = dict(
     zip("bBhHiIqQfdgM", ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f4", "<f8", "<f2", "u1"), strict=True)
 )
@@ -25,7 +25,7 @@ FACTORS = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
 
 
 @dataclass(frozen=True, eq=False)
-class Format:
+class DataflashFormat:
     """How a message is laid out: its length in bytes, head included, and the letter of each field."""
 
     name: str
@@ -59,7 +59,7 @@ class DataflashFile:
     """
 
     content: bytes
-    formats: dict[str, Format]
+    formats: dict[str, DataflashFormat]
     offsets: dict[str, NDArray[np.int64]]
     damage: str
 
@@ -95,7 +95,7 @@ def open_dataflash(path: Path) -> DataflashFile:
     content = path.read_bytes()
     lengths = [0] * 256
     lengths[FMT] = FMT_LENGTH
-    names: dict[int, Format] = {}
+    names: dict[int, DataflashFormat] = {}
     places: dict[int, list[int]] = {FMT: []}
     at, end, lost, gaps = 0, len(content), 0, 0
     solid = len(content.rstrip(PADDING))
@@ -170,13 +170,13 @@ def _resume(content: bytes, lengths: list[int], solid: int, start: int) -> int:
     return len(content)
 
 
-def _format(payload: bytes) -> tuple[int, Format]:
+def _format(payload: bytes) -> tuple[int, DataflashFormat]:
     """Type and layout that an FMT message defines."""
     number, length, name, letters, columns = struct.unpack("<BB4s16s64s", payload)
     name, letters, columns = (_text(text) for text in (name, letters, columns))
     fields = columns.split(",") if columns else []
     whole = len(fields) == len(letters) == len(set(fields))
-    return number, Format(name, length, dict(zip(fields, letters, strict=True)) if whole else {})
+    return number, DataflashFormat(name, length, dict(zip(fields, letters, strict=True)) if whole else {})
 
 
 def _text(field: bytes) -> str:

@@ -18,7 +18,7 @@ from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.logs.columns import SIGNALS
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.plant.frequency_response import measured_plant
-from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
 from numpy.typing import NDArray
 
 #: Angles are compared with integrated rates over this time, s: noise of the angles divided by it is small.

@@ -55,7 +55,7 @@ def record_ulog(path: Path) -> Recording:
     TuningError
         When the file is damaged.
     """
-    log = _Log(open_ulog(path))
+    log = _UlogLog(open_ulog(path))
     signals: dict[str, Series] = {}
     for signal, layouts in LAYOUTS.items():
         for topic, fields in layouts:
@@ -103,7 +103,7 @@ def record_ulog(path: Path) -> Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class _Log:
+class _UlogLog:
     file: UlogFile
 
     def fields(self, topic: str) -> dict[str, NDArray[Any]]:
@@ -154,7 +154,7 @@ def _angles(series: Series) -> Series:
     return Series(series.time, np.where(unit[:, None], np.column_stack([roll, pitch]), np.nan), series.topic)
 
 
-def _excitation(log: _Log) -> Series | None:
+def _excitation(log: _UlogLog) -> Series | None:
     """The injected moment, where one was logged."""
     series = log.series(EXCITATION_TOPIC, ("x", "y", *(f"name[{i}]" for i in range(len(EXCITATION_NAME)))))
     if series is None:
@@ -164,7 +164,7 @@ def _excitation(log: _Log) -> Series | None:
     return Series(series.time[ours], values, series.topic) if values.any() else None
 
 
-def _commands(log: _Log) -> Series | None:
+def _commands(log: _UlogLog) -> Series | None:
     """The commands of the motors that there are, at the gyro sample that they were made of."""
     fields = log.fields(MOTORS_TOPIC)
     logged = tuple(name for name in MOTORS if name in fields)
@@ -194,7 +194,7 @@ def _at_cycle(series: Series, torque: tuple[NDArray[np.float64], NDArray[np.floa
     return Series(np.where(used, sampled[near], series.time - lag), series.values, series.topic)
 
 
-def _airborne(log: _Log) -> tuple[tuple[Interval, ...] | None, str]:
+def _airborne(log: _UlogLog) -> tuple[tuple[Interval, ...] | None, str]:
     """When the vehicle was armed and not landed, as far as the log says, and what says so."""
     states: list[tuple[str, NDArray[np.float64], NDArray[np.bool_]]] = []
     landed = log.fields("vehicle_land_detected")

@@ -36,7 +36,7 @@ Fields = list[tuple[str, int, str]]
 
 
 @dataclass(frozen=True, eq=False)
-class Topic:
+class UlogTopic:
     """One subscription: instance 0, 1, ... of a topic, and where its messages begin."""
 
     name: str
@@ -74,7 +74,7 @@ class UlogFile:
     path: Path
     content: bytes
     formats: dict[str, Fields] = field(default_factory=dict)
-    topics: dict[int, Topic] = field(default_factory=dict)
+    topics: dict[int, UlogTopic] = field(default_factory=dict)
     information: dict[str, str | int] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)
     changes: list[tuple[float, str, float]] = field(default_factory=list)
@@ -82,7 +82,7 @@ class UlogFile:
     _sizes: dict[str, int] = field(default_factory=dict)
     _unread: set[str] = field(default_factory=set)
     _started: bool = False
-    _stamp: tuple[Topic, int] | None = None
+    _stamp: tuple[UlogTopic, int] | None = None
 
     def names(self) -> list[str]:
         """The topics that were logged."""
@@ -198,7 +198,7 @@ class UlogFile:
             fields = self.formats[name]
             largest, smallest = self._sum(fields), self._sum(_unpadded(fields))
             if largest <= MAX_MESSAGE and len({label for _, _, label in fields}) == len(fields):
-                self.topics[number] = Topic(name, instance, fields, smallest, largest)
+                self.topics[number] = UlogTopic(name, instance, fields, smallest, largest)
             elif largest < UNKNOWN:
                 raise TuningError(
                     f"{self.path}: damaged ULog file: messages of {name} would have more than {MAX_MESSAGE} bytes or a "

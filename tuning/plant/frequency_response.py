@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, external_signal
-from mimopilot.tuning.plant.body_shape import fit_shape, shape_response
 from mimopilot.tuning.plant.local_polynomial import local_response
+from mimopilot.tuning.plant.response_shape import fit_shape, shape_response
 from numpy.typing import NDArray
 
 #: Frequencies count where the excitation explains more than this share of a rate's power.

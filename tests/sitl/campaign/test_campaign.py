@@ -17,13 +17,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mimopilot.sitl.autopilot.autopilot import Autopilot
-from mimopilot.sitl.campaign.draws import Variator
+from mimopilot.sitl.campaign.campaign_figures import choose_map, parse_map
+from mimopilot.sitl.campaign.draws import RunSampler
 from mimopilot.sitl.campaign.execution import run_campaign
-from mimopilot.sitl.campaign.figures import choose_map, parse_map
-from mimopilot.sitl.campaign.flights import CHUNK, Stand
+from mimopilot.sitl.campaign.flights import CHUNK, FlightRunner
 from mimopilot.sitl.campaign.plan import make_plan
 from mimopilot.sitl.campaign.replay import fly_again
-from mimopilot.sitl.campaign.summary import Results
+from mimopilot.sitl.campaign.summary import CampaignResults
 from mimopilot.sitl.campaign.variation import variation_from_toml
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import doublet
@@ -78,16 +78,16 @@ def unstable(gains):
 
 
 def drawn(vehicle, vary, runs=2000):
-    variator = Variator(vehicle.airframe, variation_from_toml(vary, "spec"), doublet("roll", 0.4, 0.42, 0.004))
-    return [variator.draw(5, run) for run in range(runs)]
+    sampler = RunSampler(vehicle.airframe, variation_from_toml(vary, "spec"), doublet("roll", 0.4, 0.42, 0.004))
+    return [sampler.draw(5, run) for run in range(runs)]
 
 
 def test_a_run_is_that_flight_whatever_the_stand_flew_before(vehicle):
     plan = plan_of(vehicle, vary="")
-    stand = Stand(plan)
+    runner = FlightRunner(plan)
     for run in (4, 0, 2):
         for index, scenario in enumerate(plan.scenarios):
-            flight = stand.fly(stand.draw(run), "default", index)
+            flight = runner.fly(runner.draw(run), "default", index)
             alone = fly(vehicle.airframe, Autopilot(vehicle.airframe, vehicle.default_gains()), scenario, [3, run, 1])
             assert flight.record.tobytes() == alone.record.tobytes()
             assert flight.truth.tobytes() == alone.truth.tobytes()
@@ -176,14 +176,14 @@ size = 0.9
 at = 1.2
 """
     plan = plan_of(vehicle, vary=vary, faults=["gyro-stuck:roll@1.1+0.02", "loss=0.2@0.5"], axes=["roll"])
-    stand = Stand(plan)
+    runner = FlightRunner(plan)
     motors = set()
     for run in (5, *range(30)):
-        draw = stand.draw(run)
+        draw = runner.draw(run)
         assert [fault.kind for fault in draw.faults] == ["gyro-stuck", "loss", "motor", "gain"]
         assert draw.faults[2].size == draw.values["fault.1.size"]
         motors.add(draw.faults[2].motor)
-        flight = stand.fly(draw, "default", 0)
+        flight = runner.fly(draw, "default", 0)
         scenario = replace(plan.scenarios[0], faults=draw.faults)
         alone = fly(vehicle.airframe, Autopilot(vehicle.airframe, vehicle.default_gains()), scenario, [3, run, 1])
         assert flight.record.tobytes() == alone.record.tobytes()
@@ -202,17 +202,18 @@ def test_every_gain_set_flies_the_same_vehicles_and_an_unstable_one_survives_nev
     for name in table.column_names[table.column_names.index("rejected_draws") :]:
         assert good_rows[name].equals(bad_rows[name]), name
     survived = {
-        group.gains: (group.survived, group.survived_share) for group in Results(plan, results).summarise().groups
+        group.gains: (group.survived, group.survived_share)
+        for group in CampaignResults(plan, results).summarise().groups
     }
     assert survived == {"good": (n, wilson(n, n)), "bad": (0, wilson(0, n))}
-    worst = Results(plan, results).summarise().groups[1].worst[0]
+    worst = CampaignResults(plan, results).summarise().groups[1].worst[0]
     assert worst.lost_at_s == min(bad_rows["lost_at_s"].to_pylist())
 
 
 def test_the_summary_is_that_of_the_table(vehicle, tmp_path):
     plan = plan_of(vehicle, axes=["roll"])
     results = run_campaign(plan, tmp_path, 1)
-    (group,) = Results(plan, results).summarise().groups
+    (group,) = CampaignResults(plan, results).summarise().groups
     figures = np.sort(pq.read_table(results)["J_M_o"].to_numpy())
     value, low, high = group.quantiles["J_M_o"]["0.5"]
     assert value == figures[(len(figures) - 1) // 2]
@@ -334,7 +335,7 @@ size = { uniform = [0.5, 5.0] }
 at = 1.1
 """
     plan = plan_of(vehicle, vary=vary, axes=["roll"])
-    results = Results(plan, run_campaign(plan, tmp_path, 1))
+    results = CampaignResults(plan, run_campaign(plan, tmp_path, 1))
     survived = results.column("survived", "default", "roll")
     assert 0.1 < survived.mean() < 0.9
     assert set(choose_map(results)) == {"motors.time_constant", "fault.1.size"}

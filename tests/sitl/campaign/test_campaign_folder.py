@@ -6,8 +6,8 @@ import sys
 import pytest
 from mimopilot.sitl.campaign.execution import run_campaign
 from mimopilot.sitl.campaign.flights import CHUNK, fly_chunk
-from mimopilot.sitl.campaign.plan import LOCK, PARTS, RESULTS, make_plan, settle
-from mimopilot.sitl.campaign.summary import Results
+from mimopilot.sitl.campaign.plan import LOCK, PARTS, RESULTS, make_plan, write_plan_files
+from mimopilot.sitl.campaign.summary import CampaignResults
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.airframe import load_airframe
 
@@ -31,7 +31,7 @@ def flown(tmp_path_factory):
 
 def begin(plan, folder, parts):
     """The folder of a campaign that was interrupted with these parts."""
-    settle(plan, folder)
+    write_plan_files(plan, folder)
     (folder / PARTS).mkdir()
     for chunk, part in parts.items():
         (folder / PARTS / f"{chunk:07d}.part").write_bytes(part)
@@ -78,8 +78,8 @@ def test_sound_parts_are_not_flown_again(flown, tmp_path, capsys, monkeypatch):
 HOLDER = """
 import sys
 from pathlib import Path
-from mimopilot.sitl.campaign.execution import _alone
-with _alone(Path(sys.argv[1])):
+from mimopilot.sitl.campaign.execution import _folder_lock
+with _folder_lock(Path(sys.argv[1])):
     print("alone", flush=True)
     sys.stdin.read()
 """
@@ -113,11 +113,11 @@ def test_a_damaged_table_of_results_is_told_or_does_no_harm(flown, tmp_path):
     plan, results, _ = flown
     path = tmp_path / RESULTS
     path.write_bytes(results)
-    sound, told = Results(plan, path).summarise(), 0
+    sound, told = CampaignResults(plan, path).summarise(), 0
     for place in range(0, len(results), len(results) // 60):
         path.write_bytes(results[:place] + bytes([results[place] ^ 8]) + results[place + 1 :])
         try:
-            assert Results(plan, path).summarise() == sound
+            assert CampaignResults(plan, path).summarise() == sound
         except SitlError as error:
             assert f"{path}: damaged; remove it" in str(error)
             told += 1

@@ -14,7 +14,7 @@ from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.sitl.studies.expectations import EFFORT, expectations
 from mimopilot.sitl.studies.reproduce import ALL, STUDIES, reproduce
 
-from mimopilot.cli.studies import Study as Choice
+from mimopilot.cli.studies import AttitudeStudy as Choice
 from mimopilot.common.parallel import processes
 
 PRINTED = json.loads(TABLES.read_text())

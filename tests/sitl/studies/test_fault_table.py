@@ -13,13 +13,13 @@ from mimopilot.sitl.flight.fault_recovery import recovery
 from mimopilot.sitl.flight.scenario import hover
 from mimopilot.sitl.flight.simulator import TRUTH, Flight
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.sitl.studies.faults import Request, fault_table, standard_faults
+from mimopilot.sitl.studies.fault_table import FaultTableRequest, fault_table, standard_faults
 from scipy.stats import binomtest
 
 from tests.conftest import assert_one_clear_line
 
 TS = 0.004
-ADAM0 = Request("adam0", (), "roll", 15.0, 0.42)
+ADAM0 = FaultTableRequest("adam0", (), "roll", 15.0, 0.42)
 
 
 def quiet(*faults):

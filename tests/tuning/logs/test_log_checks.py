@@ -10,7 +10,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import SIGNALS, Columns
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.plant.frequency_response import measured_plant
-from mimopilot.tuning.plant.inertia import rigid_body
+from mimopilot.tuning.plant.rigid_body_fit import rigid_body
 
 from tests.tuning.truth import experiment
 

@@ -10,7 +10,7 @@ from mimopilot.common.html_report import Section, Table
 
 
 @dataclass(frozen=True)
-class Part:
+class ReportPart:
     """One study's share.
 
     Attributes

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.plant.body_shape import fit_shape
 from mimopilot.tuning.plant.frequency_response import PlantResponse
+from mimopilot.tuning.plant.response_shape import fit_shape
 from numpy.typing import NDArray
 
 #: Above this a frame bends and filters act, rad/s: it is not the body that is measured.

@@ -8,13 +8,13 @@ from functools import cached_property
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.plant.frequency_response import PlantResponse, measured_plant
-from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
 from mimopilot.tuning.plant.pbsid import RatesModel, identify_rates
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
 from mimopilot.tuning.statespace import StateSpace
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class PlantEstimates:
     """The vehicle of an experiment.
 
     Attributes
@@ -31,7 +31,7 @@ class Measured:
 
     @cached_property
     def body(self) -> RigidBody:
-        """The rigid body in it; see `tuning.plant.inertia.rigid_body`."""
+        """The rigid body in it; see `tuning.plant.rigid_body_fit.rigid_body`."""
         return rigid_body(self.response)
 
     @cached_property

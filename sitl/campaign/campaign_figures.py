@@ -8,19 +8,18 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from mimopilot.sitl.campaign.draws import Variator
-from mimopilot.sitl.campaign.flights import Stand
-from mimopilot.sitl.campaign.plan import Plan
-from mimopilot.sitl.campaign.summary import Results
+from mimopilot.sitl.campaign.draws import RunSampler
+from mimopilot.sitl.campaign.flights import FlightRunner
+from mimopilot.sitl.campaign.plan import CampaignPlan
+from mimopilot.sitl.campaign.summary import CampaignResults
 from mimopilot.sitl.campaign.variation import UNITS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import KINDS
 from mimopilot.sitl.flight.figures import SETPOINT, STYLES
+from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from mimopilot.sitl.flight.scenario import AXES
 from numpy.typing import NDArray
 from scipy.stats import rankdata
-
-from mimopilot.cli.bench import UNITS as FIGURES
 
 ENVELOPE_RUNS = 400  # flown again for the envelopes: the first ones, which are as random as any
 CELLS, A_CELL = 16, 8  # of the map: at most so many on each side, with so many flights in each on average
@@ -31,7 +30,7 @@ VERMILLION = "#D55E00"
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
+class EnvelopeSample:
     """The first runs of a campaign, flown again; memory does not grow with the campaign.
 
     Attributes
@@ -46,36 +45,36 @@ class Sample:
     survived: dict[tuple[str, int], NDArray[np.bool_]]
 
 
-def fly_sample(stand: Stand) -> Sample:
+def fly_sample(runner: FlightRunner) -> EnvelopeSample:
     """Fly the runs of the envelopes."""
-    plan, runs = stand.plan, min(stand.plan.description.runs, ENVELOPE_RUNS)
+    plan, runs = runner.plan, min(runner.plan.description.runs, ENVELOPE_RUNS)
     keys = [(name, index) for name in plan.gains for index in range(len(plan.scenarios))]
-    angles = {key: np.empty((runs, len(stand.truth), 2), np.float32) for key in keys}
+    angles = {key: np.empty((runs, len(runner.truth), 2), np.float32) for key in keys}
     survived = {key: np.empty(runs, np.bool_) for key in keys}
     for run in range(runs):
-        draw = stand.draw(run)
+        draw = runner.draw(run)
         for key in keys:
-            flight = stand.fly(draw, *key)
+            flight = runner.fly(draw, *key)
             angles[key][run] = np.degrees(flight.truth["attitude"][:, :2])
             survived[key][run] = flight.crashed_at is None
-    return Sample(angles, survived)
+    return EnvelopeSample(angles, survived)
 
 
-def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) -> Figure:
+def envelope_figure(runner: FlightRunner, sample: EnvelopeSample, results: CampaignResults, index: int) -> Figure:
     """Responses of all gain sets on one axis: median, 5 to 95 %, and the worst flight; rows are gain sets.
 
     Parameters
     ----------
-    stand : Stand
+    runner : FlightRunner
         Flies the worst again.
-    sample : Sample
+    sample : EnvelopeSample
         From `fly_sample`.
-    results : Results
+    results : CampaignResults
         Knows the worst flights.
     index : int
         Of the scenario.
     """
-    plan = stand.plan
+    plan = runner.plan
     scenario, axis = plan.scenarios[index], plan.scenarios[index].axis
     time = (np.arange(len(scenario.setpoint)) - scenario.window[0]) * scenario.Ts
     figure = Figure(figsize=(9, 0.9 + 2.6 * len(plan.gains)), layout="constrained")
@@ -83,7 +82,7 @@ def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) 
     for row, name, (colour, _) in zip(panels, plan.gains, cycle(STYLES), strict=False):
         angles, survived = sample.angles[name, index], sample.survived[name, index]
         bad = results.worst(name, AXES[axis], 1)[0].run
-        worst = np.degrees(stand.fly(stand.draw(bad), name, index).truth["attitude"][:, :2])
+        worst = np.degrees(runner.fly(runner.draw(bad), name, index).truth["attitude"][:, :2])
         for panel, shown in zip(row, (axis, 1 - axis), strict=True):
             if shown == axis:
                 panel.step(time, np.degrees(scenario.setpoint[:, axis]), where="post", label="set-point", **SETPOINT)
@@ -109,7 +108,7 @@ def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) 
     return figure
 
 
-def distribution_figure(results: Results, axis: str) -> Figure:
+def distribution_figure(results: CampaignResults, axis: str) -> Figure:
     """Share of the flights whose figure is at most x, one curve a gain set; lost flights never are."""
     plan, names = results.plan, ("J_M_o", "offaxis_peak_deg", "peak_deg", "effort_rms")
     figure = Figure(figsize=(9, 6), layout="constrained")
@@ -125,7 +124,7 @@ def distribution_figure(results: Results, axis: str) -> Figure:
             panel.step(ordered[at], share, where="post", color=colour, linestyle=style, linewidth=1.8, label=gains)
         if name == "J_M_o":
             panel.set_xscale("log")
-        panel.set_xlabel(FIGURES[name])
+        panel.set_xlabel(FIGURE_LABELS[name])
         panel.set_ylim(0, 1.02)
         panel.grid(alpha=0.3, which="both")
     for row in panels:
@@ -136,13 +135,13 @@ def distribution_figure(results: Results, axis: str) -> Figure:
     return figure
 
 
-def varied(plan: Plan) -> list[str]:
+def varied(plan: CampaignPlan) -> list[str]:
     """Columns of the results that are drawn, in their order."""
-    variator = Variator(plan.airframe, plan.description.vary, plan.scenarios[0])
-    return [quantity.name for quantity in variator.quantities]
+    sampler = RunSampler(plan.airframe, plan.description.vary, plan.scenarios[0])
+    return [quantity.name for quantity in sampler.quantities]
 
 
-def parse_map(plan: Plan, text: str) -> tuple[str, str]:
+def parse_map(plan: CampaignPlan, text: str) -> tuple[str, str]:
     """The two quantities of a survival map, from NAME,NAME.
 
     Raises
@@ -157,7 +156,7 @@ def parse_map(plan: Plan, text: str) -> tuple[str, str]:
     return first, second
 
 
-def choose_map(results: Results) -> tuple[str, str] | None:
+def choose_map(results: CampaignResults) -> tuple[str, str] | None:
     """The two quantities that have most to do with survival, or with J_M,o where all survive, by rank.
 
     None when fewer than two vary.
@@ -184,7 +183,7 @@ def _correlation(value: NDArray[Any], other: NDArray[Any]) -> float:
     return max(abs(float(np.corrcoef(one, other)[0, 1])) for one in both)
 
 
-def survival_figure(results: Results, axis: str, names: tuple[str, str]) -> Figure:
+def survival_figure(results: CampaignResults, axis: str, names: tuple[str, str]) -> Figure:
     """Share of the flights that survived, over two varied quantities; one panel a gain set."""
     plan = results.plan
     columns = min(len(plan.gains), 3)
@@ -225,7 +224,7 @@ def _edges(value: NDArray[Any], cells: int) -> NDArray[np.float64]:
     return np.linspace(value.min(), value.max(), cells + 1)
 
 
-def label(plan: Plan, name: str) -> str:
+def label(plan: CampaignPlan, name: str) -> str:
     """A varied quantity with its unit."""
     if name.startswith("fault."):
         _, number, field = name.split(".")

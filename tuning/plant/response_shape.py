@@ -12,14 +12,14 @@ DELAYS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06)
 LAGS = (0.0, 0.015, 0.025, 0.035, 0.05, 0.07, 0.1)
 DAMPINGS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
-Shape = tuple[float, float, float]
+ResponseShape = tuple[float, float, float]
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
-SHAPES: tuple[Shape, ...] = tuple(itertools.product(DELAYS, LAGS, DAMPINGS))
+SHAPES: tuple[ResponseShape, ...] = tuple(itertools.product(DELAYS, LAGS, DAMPINGS))
 
 
-def shape_response(omega: Signal, shape: Shape) -> Complex:
+def shape_response(omega: Signal, shape: ResponseShape) -> Complex:
     """exp(-j w delay) / ((1 + j w lag) (j w + damping)) at omega (K,), rad/s."""
     delay, lag, damping = shape
     s = 1j * omega
@@ -27,7 +27,7 @@ def shape_response(omega: Signal, shape: Shape) -> Complex:
     return response
 
 
-def fit_shape(omega: Signal, G: Complex, weight: Signal) -> tuple[Shape, Signal, Signal, float]:
+def fit_shape(omega: Signal, G: Complex, weight: Signal) -> tuple[ResponseShape, Signal, Signal, float]:
     """Least squares of G = B times a shape, with a real B.
 
     Parameters
@@ -40,7 +40,7 @@ def fit_shape(omega: Signal, G: Complex, weight: Signal) -> tuple[Shape, Signal,
 
     Returns
     -------
-    shape : Shape
+    shape : ResponseShape
         The best of `SHAPES`: delay and lag (s), damping (1/s).
     B : (2, 2) array, rad/s^2
     power : (2, 2) array

@@ -31,7 +31,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Request:
+class FaultTableRequest:
     """What is asked: everything that a worker process needs to know.
 
     Attributes
@@ -56,7 +56,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Row:
+class FaultTableRow:
     """One fault under one gain set, over all seeds; medians unless the name says otherwise.
 
     Attributes
@@ -105,20 +105,20 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Table:
+class FaultTable:
     """What was found.
 
     Attributes
     ----------
     title : str
-    rows : tuple of Row
+    rows : tuple of FaultTableRow
         By fault, then by gain set.
     lost_without, alarms_without : dict of int
         Gain set -> of the flights without faults, those that were lost, and those in which something was detected.
     """
 
     title: str
-    rows: tuple[Row, ...]
+    rows: tuple[FaultTableRow, ...]
     lost_without: dict[str, int]
     alarms_without: dict[str, int]
 
@@ -159,10 +159,10 @@ def standard_faults(airframe: Airframe) -> tuple[Fault, ...]:
     return tuple(map(parse_fault, texts))
 
 
-class Bench:
+class FaultFlights:
     """A vehicle, its gain sets and what is flown with them: made once in each process."""
 
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: FaultTableRequest) -> None:
         vehicle = load_airframe(request.airframe)
         self.airframe: Airframe = vehicle.airframe
         self.gains = vehicle.gain_sets(request.gains)
@@ -190,20 +190,20 @@ class Bench:
 
 
 @lru_cache(maxsize=1)
-def _bench(request: Request) -> Bench:
-    return Bench(request)
+def _flights_of(request: FaultTableRequest) -> FaultFlights:
+    return FaultFlights(request)
 
 
-def _fly_all(request: Request, seed: int) -> dict[str, list[Recovery]]:
-    return _bench(request).fly_all(seed)
+def _fly_all(request: FaultTableRequest, seed: int) -> dict[str, list[Recovery]]:
+    return _flights_of(request).fly_all(seed)
 
 
-def fault_table(request: Request, seeds: Sequence[int], workers: int) -> Table:
+def fault_table(request: FaultTableRequest, seeds: Sequence[int], workers: int) -> FaultTable:
     """Fly every fault with every seed under every gain set.
 
     Parameters
     ----------
-    request : Request
+    request : FaultTableRequest
         What to fly.
     seeds : sequence of int
         Of the measurement noise and of what is random in a fault.
@@ -217,8 +217,9 @@ def fault_table(request: Request, seeds: Sequence[int], workers: int) -> Table:
     """
     from rich.progress import Progress
 
-    bench = _bench(request)
-    found: dict[int, dict[str, list[Recovery]]] = {seeds[0]: bench.fly_all(seeds[0])}  # compiles; finds what is wrong
+    flown_by = _flights_of(request)
+    # The first seed compiles and finds wrong input before processes are started.
+    found: dict[int, dict[str, list[Recovery]]] = {seeds[0]: flown_by.fly_all(seeds[0])}
     with Progress(console=progress_console(), transient=True) as bar:
         task = bar.add_task("flying", total=len(seeds), completed=1)
 
@@ -228,32 +229,33 @@ def fault_table(request: Request, seeds: Sequence[int], workers: int) -> Table:
 
         if workers == 1:
             for seed in seeds[1:]:
-                keep(seed, bench.fly_all(seed))
+                keep(seed, flown_by.fly_all(seed))
         else:
             with processes(workers) as executor:
                 run_all(executor, 2 * workers, partial(_fly_all, request), seeds[1:], keep)
-    flown = {name: [found[seed][name] for seed in seeds] for name in bench.gains}
-    paths = dict(zip(bench.gains, request.gains or (None,), strict=True))
+    flown = {name: [found[seed][name] for seed in seeds] for name in flown_by.gains}
+    paths = dict(zip(flown_by.gains, request.gains or (None,), strict=True))
     rows = tuple(
         _row(request, fault, name, paths[name], seeds, [flights[i + 1] for flights in flown[name]])
-        for i, fault in enumerate(bench.faults)
-        for name in bench.gains
+        for i, fault in enumerate(flown_by.faults)
+        for name in flown_by.gains
     )
-    title = f"{bench.airframe.name}, doublet on {request.axis}, {request.amplitude_deg:g} deg, {request.period_s:g} s"
-    return Table(
+    doublet = f"doublet on {request.axis}, {request.amplitude_deg:g} deg, {request.period_s:g} s"
+    title = f"{flown_by.airframe.name}, {doublet}"
+    return FaultTable(
         f"{title}, {len(seeds)} seeds from {seeds[0]}",
         rows,
-        {name: sum(flights[0].lost_at_s is not None for flights in flown[name]) for name in bench.gains},
-        {name: sum(flights[0].detected_s is not None for flights in flown[name]) for name in bench.gains},
+        {name: sum(flights[0].lost_at_s is not None for flights in flown[name]) for name in flown_by.gains},
+        {name: sum(flights[0].detected_s is not None for flights in flown[name]) for name in flown_by.gains},
     )
 
 
 def _row(
-    request: Request, fault: Fault, name: str, path: Path | None, seeds: Sequence[int], found: list[Recovery]
-) -> Row:
+    request: FaultTableRequest, fault: Fault, name: str, path: Path | None, seeds: Sequence[int], found: list[Recovery]
+) -> FaultTableRow:
     survived = sum(one.lost_at_s is None for one in found)
     worst = max(range(len(found)), key=lambda i: _badness(found[i]))
-    return Row(
+    return FaultTableRow(
         fault=str(fault),
         gains=name,
         runs=len(found),
@@ -284,7 +286,7 @@ def _median(values: list[float | None]) -> float | None:
     return float(np.median(there)) if there else None
 
 
-def _replay(request: Request, fault: Fault, path: Path | None, seed: int) -> str:
+def _replay(request: FaultTableRequest, fault: Fault, path: Path | None, seed: int) -> str:
     """The command line that flies one flight of the table again."""
     words = ["mimopilot", "fly", request.airframe, *(() if path is None else ("--gains", str(path)))]
     words += ["--axis", request.axis, "--amplitude-deg", repr(request.amplitude_deg)]
@@ -293,7 +295,7 @@ def _replay(request: Request, fault: Fault, path: Path | None, seed: int) -> str
     return shlex.join(words)
 
 
-def print_fault_table(table: Table) -> None:
+def print_fault_table(table: FaultTable) -> None:
     """The table, what happened without faults, and how to fly each worst case again."""
     print_table(table.title, COLUMNS, [_cells(row) for row in table.rows])
     for name, lost in table.lost_without.items():
@@ -304,7 +306,7 @@ def print_fault_table(table: Table) -> None:
         print(f"  {row.replay}")
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: FaultTableRow) -> list[str]:
     low, high = row.survival_interval
 
     def some(value: float | None, count: int) -> str:
