@@ -287,7 +287,7 @@ def identify(
     from mimopilot.common.console import print_json, print_table
     from mimopilot.common.files import write_atomically
     from mimopilot.tuning.plant.frequency_response import measured_plant
-    from mimopilot.tuning.plant.pbsid import identify_rates, model_toml
+    from mimopilot.tuning.plant.rates_model import identify_rates, model_toml
 
     experiment = read_warned(log, columns)
     found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)

@@ -30,11 +30,11 @@ from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY, checked_inertia
-from mimopilot.tuning.errors import TuningError
 from pyulog import ULog
 from scipy.special import ndtri
 from scipy.stats import binom
 
+from mimopilot.common.errors import InputFileError
 from mimopilot.common.intervals import quantile, wilson
 from tests.conftest import assert_one_clear_line
 from tests.paths import TOP
@@ -157,7 +157,7 @@ def test_draws_of_no_vehicle_are_replaced_and_counted_and_a_hopeless_specificati
     ],
 )
 def test_a_wrong_specification_is_refused_by_the_name_of_its_entry(text, words):
-    with pytest.raises(TuningError) as error:
+    with pytest.raises(InputFileError) as error:
         variation_from_toml(text, "spec.toml")
     assert words in str(error.value)
 

@@ -10,6 +10,7 @@ from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.spec import load_spec
 from scipy.io import savemat
 
+from mimopilot.common.errors import Error
 from tests.paths import TOP
 from tests.tuning.logs.flights import COLUMNS, make_flight, table, write_csv
 
@@ -93,7 +94,7 @@ def test_foreign_names_units_and_signs_are_mapped(tmp_path, flight):
     ],
 )
 def test_a_mapping_with_an_unknown_or_impossible_entry_is_refused(tmp_path, text, words):
-    with pytest.raises(TuningError, match=words):
+    with pytest.raises(Error, match=words):
         columns(tmp_path, text)
 
 

@@ -7,7 +7,8 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.loop import LoopController, closed_loop
 from mimopilot.tuning.plant.frequency_response import measured_plant
-from mimopilot.tuning.plant.pbsid import fit, identify_rates, pbsid, pbsid_by_response
+from mimopilot.tuning.plant.pbsid import pbsid
+from mimopilot.tuning.plant.rates_model import fit, identify_rates, pbsid_by_response
 from mimopilot.tuning.statespace import StateSpace
 
 from tests.paths import DATA
