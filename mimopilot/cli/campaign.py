@@ -129,11 +129,11 @@ def replay(
 ) -> None:
     """Fly one run of a campaign again: the same flight, bit for bit. Exit code 1: it is another one here."""
     from mimopilot.common.console import print_json, print_table
-    from mimopilot.sitl.campaign.replay import fly_again
+    from mimopilot.sitl.campaign.replay import replay_flight
     from mimopilot.sitl.flight.flight_log import save_flight
     from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 
-    again = fly_again(folder, run, gains, axis)
+    again = replay_flight(folder, run, gains, axis)
     if out is not None:
         save_flight(out, again.flight, again.plan.airframe, again.plan.gains[again.row["gains"]])
     if as_json:

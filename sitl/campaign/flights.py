@@ -1,4 +1,4 @@
-"""The flights of a campaign, chunk by chunk: what every worker does, on this machine or another."""
+"""The flights of a campaign, chunk by chunk: the work of every worker process, on any machine."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, first_loss
 
 from mimopilot.common.files import seal
 
-CHUNK = 64  # runs: what is lost of a worker that dies
+CHUNK = 64  # runs per chunk: at most these are lost when a worker dies
 FIGURES = tuple(field.name for field in fields(Performance))
-_one_at_a_time = Lock()
+_runner_lock = Lock()
 
 
 class FlightRunner:
-    """A vehicle, its gain sets and buffers for one flight, used again and again.
+    """Flies the runs of a campaign one after the other; reuses its buffers for every flight.
 
     Parameters
     ----------
     plan : CampaignPlan
-        What is flown.
+        The campaign.
     """
 
     def __init__(self, plan: CampaignPlan) -> None:
@@ -56,13 +56,13 @@ class FlightRunner:
         self.sampler = RunSampler(plan.airframe, plan.description.vary, plan.scenarios[0])
 
     def draw(self, run: int) -> Draw:
-        """Everything random of a run: what varies, and the noise, which is the same for all its flights."""
+        """Draw a run and its noise, which is the same for all flights of the run."""
         seed = self.plan.description.seed
         np.random.default_rng([seed, run, 1]).standard_normal(out=self.noise)
         return self.sampler.draw(seed, run)
 
     def fly(self, draw: Draw, gains: str, index: int) -> Flight:
-        """One flight of the run that was drawn last, on the axis of the scenario `index`; the next overwrites it."""
+        """Fly scenario `index` with the run that was drawn last; the next flight overwrites the result."""
         simulator, autopilot, record = self.simulator, self.autopilots[gains], self.record
         scenario = self.plan.scenarios[index]
         simulator.plant, simulator.delay = draw.plant, draw.delay
@@ -82,7 +82,7 @@ class FlightRunner:
         return Flight(scenario, record, self.truth, self.runs)
 
     def flights(self, run: int) -> Iterator[tuple[dict[str, Any], Flight]]:
-        """All flights of a run, each with its row of the results."""
+        """Fly a run with every gain set on every axis; yields each flight with its row of the results."""
         draw = self.draw(run)
         for name in self.plan.gains:
             for index, axis in enumerate(self.plan.description.axes):
@@ -90,7 +90,7 @@ class FlightRunner:
                 yield self.row(run, draw, name, axis, flight), flight
 
     def row(self, run: int, draw: Draw, name: str, axis: str, flight: Flight) -> dict[str, Any]:
-        """What the results say of a flight."""
+        """The row of a flight in the results."""
         lost = first_loss(flight.truth, flight.record, flight.scenario.Ts)
         figures = performance(flight, *self.models[name, flight.scenario.axis])
         return {
@@ -105,8 +105,8 @@ class FlightRunner:
         }
 
 
-def chunks(plan: CampaignPlan) -> int:
-    """In how many chunks a campaign is flown."""
+def chunk_count(plan: CampaignPlan) -> int:
+    """Number of chunk_count of a campaign."""
     return -(-plan.description.runs // CHUNK)
 
 
@@ -116,7 +116,7 @@ def runs_of(plan: CampaignPlan, chunk: int) -> range:
 
 
 def label(plan: CampaignPlan, chunk: int) -> str:
-    """What a part is: of which campaign, and of which of its runs."""
+    """Label of a part file: digest of the campaign, and its runs."""
     runs = runs_of(plan, chunk)
     return f"{plan.digest} runs {runs[0]} to {runs[-1]}"
 
@@ -127,25 +127,27 @@ def fly_chunk(files: dict[str, str], chunk: int) -> bytes:
     Parameters
     ----------
     files : dict
-        Of the `CampaignPlan`.
+        Files of the `CampaignPlan`.
     chunk : int
-        From 0.
+        Number of the chunk, from 0.
 
     Returns
     -------
     bytes
-        A Parquet file, a row for each flight, by run, gain set and axis; sealed under `label`.
+        A Parquet file with one row per flight, ordered by run, gain set and axis; sealed with `label`.
 
     Raises
     ------
     SitlError
-        When this machine has another version of mimopilot than the one that leads.
+        When this worker has another version of mimopilot than the campaign.
     """
-    with _one_at_a_time:  # a cluster's worker may have several threads, the runner is one
+    with _runner_lock:  # a cluster worker may have several threads, but there is one runner
         runner = flight_runner(tuple(files.items()))
         version = runner.plan.description.mimopilot
         if version != generator_version():
-            raise SitlError(f"a worker has mimopilot {generator_version()}, the campaign is one of {version}")
+            raise SitlError(
+                f"a worker has mimopilot {generator_version()}, the campaign has {version}; install the same version"
+            )
         rows = [row for run in runs_of(runner.plan, chunk) for row, _ in runner.flights(run)]
     stream = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(rows, schema(rows[0])), stream)
@@ -160,5 +162,5 @@ def schema(row: dict[str, Any]) -> pa.Schema:
 
 @lru_cache(maxsize=1)
 def flight_runner(files: tuple[tuple[str, str], ...]) -> FlightRunner:
-    """The runner of a plan, kept for the next chunk of the same."""
+    """The runner of a plan's files; cached for the next chunk."""
     return FlightRunner(plan_from_files(dict(files)))

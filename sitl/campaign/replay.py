@@ -1,4 +1,4 @@
-"""One flight of a campaign, flown again from what lies in its folder."""
+"""Replay of one flight of a campaign from the files in its folder."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from mimopilot.sitl.campaign.flights import FlightRunner
-from mimopilot.sitl.campaign.plan import RESULTS, SPEC, CampaignPlan, damage_explained, plan_from_files, read_files
+from mimopilot.sitl.campaign.plan import RESULTS, SPEC, CampaignPlan, plan_from_files, read_files, reading_results
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.simulator import Flight
 
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """The flight, its row of figures, and the row that the results have for it (None before they are merged)."""
+    """A repeated flight, its row of figures, and its row in the results (None before the parts are merged)."""
 
     plan: CampaignPlan
     flight: Flight
@@ -25,41 +25,42 @@ class Replay:
     flown: dict[str, Any] | None
 
     def compare(self) -> None:
-        """Check that it was the same flight, bit for bit.
+        """Check that the flight equals the one in the results, bit for bit.
 
         Raises
         ------
         SitlError
-            When a figure differs from that in the results.
+            When a figure differs from the results.
         """
         for name, value in (self.flown or {}).items():
             if not _same(value, self.row.get(name)):
                 raise SitlError(
-                    f"{name} is {self.row.get(name)!r}, in the results {value!r}: the campaign was flown by another "
-                    "version, compiler or processor",
+                    f"{name} is {self.row.get(name)!r}, in the results {value!r}: the campaign was flown with another "
+                    "version, compiler or processor; replay it with the same",
                     exit_code=1,
                 )
 
 
-def fly_again(folder: Path, run: int, gains: str | None, axis: str | None) -> Replay:
-    """Fly a run again.
+def replay_flight(folder: Path, run: int, gains: str | None, axis: str | None) -> Replay:
+    """Repeat one flight of a campaign.
 
     Parameters
     ----------
     folder : Path
-        Of the campaign.
+        Folder of the campaign.
     run : int
+        Number of the run, from 0.
     gains, axis : str or None
-        The first of the campaign when not given.
+        Gain set and axis; None: the first of the campaign.
 
     Raises
     ------
     SitlError
-        When the campaign has no such run, or the folder no campaign.
+        When the folder holds no campaign, or the campaign no such flight.
     """
     files = read_files(folder)
     if not files:
-        raise SitlError(f"{folder}: no campaign is here, {SPEC} is missing")
+        raise SitlError(f"{folder}: not the folder of a campaign: {SPEC} is missing")
     plan = plan_from_files(files, str(folder))
     d = plan.description
     gains, axis = gains or d.gains[0], axis or d.axes[0]
@@ -71,14 +72,16 @@ def fly_again(folder: Path, run: int, gains: str | None, axis: str | None) -> Re
     runner = FlightRunner(plan)
     draw = runner.draw(run)
     flight = runner.fly(draw, gains, d.axes.index(axis))
-    return Replay(plan, flight, runner.row(run, draw, gains, axis, flight), _flown(folder / RESULTS, run, gains, axis))
+    return Replay(
+        plan, flight, runner.row(run, draw, gains, axis, flight), _row_in_results(folder / RESULTS, run, gains, axis)
+    )
 
 
-def _flown(results: Path, run: int, gains: str, axis: str) -> dict[str, Any] | None:
+def _row_in_results(results: Path, run: int, gains: str, axis: str) -> dict[str, Any] | None:
     if not results.is_file():
         return None
     chosen = (pc.field("run") == run) & (pc.field("gains") == gains) & (pc.field("axis") == axis)
-    with damage_explained(results):
+    with reading_results(results):
         (row,) = pq.read_table(results, filters=chosen, page_checksum_verification=True).to_pylist()
     return dict(row)
 

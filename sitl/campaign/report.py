@@ -1,4 +1,4 @@
-"""The report of a campaign: tables and figures in one page."""
+"""The HTML report of a campaign: tables and plots on one page."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mimopilot.common.html_report import Section, Table, write_report
 
 INTERVALS = (
     "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "
-    "counts as worse than every other."
+    "counts as worse than any surviving one."
 )
 
 
@@ -36,24 +36,24 @@ def write_campaign_report(
     Parameters
     ----------
     results : CampaignResults
-        What was flown, and the table.
+        Plan and results.
     summary : CampaignSummary
-        Of it.
+        Summary of the results.
     over : (str, str), optional
-        The quantities of the survival map; by default `sitl.campaign.campaign_figures.choose_map`.
+        Quantities of the survival map; by default those of `sitl.campaign.campaign_figures.choose_map`.
     """
     plan = results.plan
     d, runner = plan.description, flight_runner(tuple(plan.files.items()))
     what = [f"{d.amplitude_deg:g} degrees", f"{d.period_s:g} s", *d.faults]
     lead = (
         f"{plan.airframe.name}: {d.runs} runs, seed {d.seed}, each a {d.manoeuvre} on {' and '.join(d.axes)} "
-        f"({', '.join(what)}) under {', '.join(plan.gains)}. All fly the same vehicles with the same noise. "
-        f"{summary.rejected} draws of no vehicle that flies were drawn again."
+        f"({', '.join(what)}) under {', '.join(plan.gains)}. All gain sets fly the same vehicles with the same noise. "
+        f"{summary.rejected} impossible draws were repeated."
     )
     tables = [
         Table("Survived", SURVIVAL_COLUMNS, survival_rows(summary)),
         Table("Figures", FIGURE_COLUMNS, figure_rows(summary)),
-        Table("Worst flights; the commands are for this folder", WORST_COLUMNS, worst_rows(summary, ".")),
+        Table("Worst flights; run the commands in this folder", WORST_COLUMNS, worst_rows(summary, ".")),
     ]
     sample = campaign_figures.fly_sample(runner)
     envelopes = [
@@ -70,8 +70,8 @@ def write_campaign_report(
         ),
         Section(
             "Distributions",
-            "Share of all flights whose figure is at most that of the abscissa: left is better, and a curve that ends "
-            "below 1 has lost the rest.",
+            "Fraction of all flights whose figure is at most the abscissa. Further left is better. A curve that ends "
+            "below 1 has lost the rest of the flights.",
             figures=[
                 svg(campaign_figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes
             ],
@@ -80,7 +80,7 @@ def write_campaign_report(
     names = over or campaign_figures.choose_map(results)
     if names:
         maps = [svg(campaign_figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
-        sections.append(Section("Survival", "Over two of the quantities that vary.", figures=maps))
+        sections.append(Section("Survival", "Over two varied quantities.", figures=maps))
     sections.append(
         Section("What was flown", "", tables=[Table(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])])
     )

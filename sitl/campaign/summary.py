@@ -1,4 +1,4 @@
-"""What a campaign shows: survival and figures with their intervals, and the worst flights."""
+"""Summary of a campaign: survival and figures with confidence intervals, and the worst flights."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from mimopilot.sitl.campaign.plan import CampaignPlan, damage_explained
+from mimopilot.sitl.campaign.plan import CampaignPlan, reading_results
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from numpy.typing import NDArray
 
 from mimopilot.common.intervals import quantile, wilson
 
-#: Figures that are summed up.
+#: Figures in the summary.
 SHOWN = ("J_M_o", "peak_deg", "offaxis_peak_deg", "effort_rms", "saturated")
 QUANTILES = (0.5, 0.95)
-WORST = 3
-BATCH = 1 << 14  # rows
+WORST = 3  # worst flights listed per group
+BATCH = 1 << 14  # rows read at a time
 
 
 @dataclass(frozen=True)
 class WorstFlight:
-    """A bad flight and what became of it."""
+    """One of the worst flights: when the vehicle was lost (s; None: never), and its J_M,o (rad^2)."""
 
     run: int
     lost_at_s: float | None
@@ -33,19 +33,19 @@ class WorstFlight:
 
 @dataclass(frozen=True)
 class GroupSummary:
-    """All flights of one gain set on one axis.
+    """Summary of all flights of one gain set on one axis.
 
     Attributes
     ----------
     gains, axis : str
     flights, survived : int
     survived_share : (low, high)
-        Wilson's 95 % interval of the probability to survive.
+        Wilson's 95 % interval of the probability of survival.
     quantiles : dict
-        Figure -> {"0.5": (value, low, high), ...}, 95 % intervals; a lost flight counts as worse than all others:
-        infinity.
+        Figure -> {"0.5": (value, low, high), ...}, 95 % intervals. A lost flight counts as
+        infinite.
     worst : tuple of WorstFlight
-        Lost ones first, by time; then by J_M,o.
+        Lost flights first, by time; then by J_M,o.
     """
 
     gains: str
@@ -59,14 +59,14 @@ class GroupSummary:
 
 @dataclass(frozen=True)
 class CampaignSummary:
-    """Of a whole campaign; `rejected` impossible draws were replaced."""
+    """Summary of a whole campaign; `rejected` is the number of repeated draws."""
 
     runs: int
     rejected: int
     groups: tuple[GroupSummary, ...]
 
     def as_json(self, folder: str) -> dict[str, Any]:
-        """The object that ``--json`` prints and `summary.json` holds; commands are for a campaign in `folder`."""
+        """The object that ``--json`` prints and `summary.json` holds; replay commands refer to `folder`."""
         table = asdict(self)
         for group in table["groups"]:
             for one in group["worst"]:
@@ -75,17 +75,17 @@ class CampaignSummary:
 
 
 def replay_command(folder: str, run: int, gains: str, axis: str) -> str:
-    """What flies a run again."""
+    """The command that repeats a flight."""
     return shlex.join(["mimopilot", "replay", folder, "--run", str(run), "--gains", gains, "--axis", axis])
 
 
 class CampaignResults:
-    """The table of a campaign, column by column: 8 bytes a flight are in memory at a time.
+    """The results of a campaign, read column by column: 8 bytes per flight are in memory at a time.
 
     Parameters
     ----------
     plan : CampaignPlan
-        What was flown: rows runner by run, gain set and axis.
+        The campaign. Rows are ordered by run, gain set and axis.
     path : Path
         Parquet file.
     """
@@ -94,12 +94,12 @@ class CampaignResults:
         self.plan, self.path = plan, path
 
     def column(self, name: str, gains: str, axis: str) -> NDArray[Any]:
-        """One column of the flights of a gain set on an axis, (runs,)."""
+        """One column for the flights of a gain set on an axis, (runs,)."""
         axes = self.plan.description.axes
         stride = len(self.plan.gains) * len(axes)
         offset = list(self.plan.gains).index(gains) * len(axes) + axes.index(axis)
         parts, start = [], 0
-        with damage_explained(self.path), pq.ParquetFile(self.path, page_checksum_verification=True) as table:
+        with reading_results(self.path), pq.ParquetFile(self.path, page_checksum_verification=True) as table:
             for batch in table.iter_batches(BATCH, columns=[name]):
                 values = batch.column(0).to_numpy(zero_copy_only=False)
                 parts.append(values[(offset - start) % stride :: stride].copy())
@@ -107,14 +107,14 @@ class CampaignResults:
         return np.concatenate(parts)
 
     def worst(self, gains: str, axis: str, count: int) -> list[WorstFlight]:
-        """The worst flights of a group: lost ones first, by time; then by J_M,o."""
+        """The worst flights of a group: lost flights first, by time; then by J_M,o."""
         badness, lost_at = self.column("J_M_o", gains, axis), self.column("lost_at_s", gains, axis)
         lost = np.isfinite(lost_at)
         order = np.lexsort((-np.where(lost, 0.0, badness), np.where(lost, lost_at, np.inf)))[:count]
         return [WorstFlight(int(i), float(lost_at[i]) if lost[i] else None, float(badness[i])) for i in order]
 
     def summarise(self) -> CampaignSummary:
-        """Sum up all groups."""
+        """Summarise all groups."""
         d = self.plan.description
         groups = tuple(self._group(gains, axis) for gains in d.gains for axis in d.axes)
         return CampaignSummary(d.runs, int(self.column("rejected_draws", d.gains[0], d.axes[0]).sum()), groups)
@@ -131,11 +131,11 @@ class CampaignResults:
 
 SURVIVAL_COLUMNS = ("gains, axis", "survived", "95 % interval")
 FIGURE_COLUMNS = ("figure", "gains, axis", "median", "95 % interval", "95 % quantile", "95 % interval")
-WORST_COLUMNS = ("gains, axis", "run", "lost at [s]", "J_M,o [rad^2]", "flown again by")
+WORST_COLUMNS = ("gains, axis", "run", "lost at [s]", "J_M,o [rad^2]", "replay command")
 
 
 def survival_rows(summary: CampaignSummary) -> list[list[str]]:
-    """A row for each gain set and axis."""
+    """One row per gain set and axis."""
     return [
         [f"{g.gains}, {g.axis}", f"{g.survived}/{g.flights}", "{:.2%} to {:.2%}".format(*g.survived_share)]
         for g in summary.groups
@@ -143,7 +143,7 @@ def survival_rows(summary: CampaignSummary) -> list[list[str]]:
 
 
 def figure_rows(summary: CampaignSummary) -> list[list[str]]:
-    """A row for each figure of each gain set and axis: quantiles with their intervals."""
+    """One row per figure, gain set and axis: quantiles with their intervals."""
     return [
         [
             FIGURE_LABELS[name],
@@ -156,14 +156,14 @@ def figure_rows(summary: CampaignSummary) -> list[list[str]]:
 
 
 def _cells(group: GroupSummary, name: str, p: float) -> tuple[str, str]:
-    """A quantile and its interval; a bound that the sample is too small for is a dash."""
+    """A quantile and its interval; a dash for a bound that needs more flights."""
     found = group.quantiles[name][f"{p:g}"]
     value, low, high = ("lost" if v == np.inf else "-" if np.isnan(v) else f"{v:.3g}" for v in found)
     return value, f"{low} to {high}"
 
 
 def worst_rows(summary: CampaignSummary, folder: str) -> list[list[str]]:
-    """A row for each of the worst flights."""
+    """One row per worst flight."""
     return [
         [
             f"{group.gains}, {group.axis}",

@@ -1,4 +1,4 @@
-"""Chapter 6 of the thesis on the bench: each vehicle flies its experiment, is tuned from it, and flies doublets."""
+"""Chapter 6 of the thesis in simulation: each vehicle flies an experiment, is tuned from it, and flies doublets."""
 
 from __future__ import annotations
 
@@ -34,14 +34,13 @@ from mimopilot.tuning.thresholds import DEFAULT_THRESHOLDS
 
 DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, perturbed log"
 MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same with any effort"
-#: Effort over SISO's that is asked of the refined gains, as predicted: the 10 % of the expectation less what a
-#: prediction may miss.
-EFFORT = 1.04
-#: Seeds whose logs say what refined gains spend and how far a log leaves Ms open.
+#: Predicted effort of the refined gains over SISO's. The expectation allows 1.10; the rest is for prediction error.
+EFFORT_RATIO = 1.04
+#: Seeds whose logs give the typical effort of the refined gains and the typical error of Ms.
 TYPICAL = (0, 1, 2)
-#: Figures of a flight in which the vehicle was lost.
+#: Figures of a lost flight.
 LOST = Performance(**dict.fromkeys((field.name for field in fields(Performance)), np.inf))  # type: ignore[arg-type]
-#: Hover before a doublet; a mass at one motor takes longer to be trimmed out.
+#: s of hover before a doublet; with a mass at one motor the integrators need longer to trim.
 LEAD_S, TRIM_S = 1.0, 6.0
 
 Model = tuple[float, float, int]
@@ -49,7 +48,7 @@ Model = tuple[float, float, int]
 
 @dataclass(frozen=True)
 class AttitudeStudy:
-    """One vehicle and what is asked of it.
+    """One vehicle, its experiment, reference models and doublets.
 
     Attributes
     ----------
@@ -58,21 +57,21 @@ class AttitudeStudy:
     inner, outer : (rad/s, damping, delay in samples)
         Reference models of the rate and the attitude loop.
     siso_models : (inner, outer)
-        Those that SISO was tuned for.
+        Reference models of SISO.
     siso_airframe : str
-        Whose log SISO is tuned on.
+        Vehicle on whose log SISO is tuned.
     amplitude_deg, period_s : float
-        Of the doublet.
+        Amplitude (deg) and length (s) of the doublet.
     lead_s : float
-        Hover before it.
-    excitation : (s an axis, amplitude, rad/s)
-        PRBS of the experiment.
+        Hover before the doublet, s.
+    excitation : (float, float, float)
+        PRBS of the experiment: duration per axis (s), amplitude (normalised torque), bandwidth (rad/s).
     gains_table : (str, mapping)
-        Name of the thesis' table of gains and what it prints.
+        Name of the thesis' table of gains, and its values.
     costs_table : (str, axis, mapping)
-        The same for J.
+        The same for the costs J.
     offaxis : float or None
-        What MIMO's off-axis peak may be, over SISO's; None: nothing is coupled.
+        Largest off-axis peak of MIMO over SISO's; None: the axes are not coupled.
     """
 
     name: str
@@ -91,23 +90,23 @@ class AttitudeStudy:
     offaxis: float | None
 
     def models(self, method: str, Ts: float) -> tuple[ReferenceModel, ReferenceModel]:
-        """Rate-loop and attitude-loop model that a method's flights are compared with: those it was tuned for."""
+        """Reference models of rate and attitude loop for the costs of a method: those it was tuned for."""
         inner, outer = self.siso_models if method in (SISO, SISO_OWN) else (self.inner, self.outer)
         return second_order(*inner, Ts), second_order(*outer, Ts)
 
     def doublets(self, Ts: float, **lengths: float) -> list[Scenario]:
-        """Roll, pitch; `lengths` are those of `doublet`."""
+        """The roll and the pitch doublet; `lengths` are passed to `doublet`."""
         height = float(np.radians(self.amplitude_deg))
         return [doublet(axis, height, self.period_s, Ts, **({"lead": self.lead_s} | lengths)) for axis in AXES]
 
     def methods(self) -> list[str]:
-        """Names of all gain sets, in the order of the tables."""
+        """Names of all methods, in the order of the tables."""
         own = [SISO_OWN] if self.siso_airframe != self.airframe else []
         return [DEFAULT, AUTOTUNE, SISO, *own, MIMO, REFINED, BEST, BOUND]
 
 
 def studies() -> dict[str, AttitudeStudy]:
-    """The studies by name, from the thesis' tables; the strongly coupled one is our own."""
+    """The studies by name. All are from the thesis' tables but adam0-small and coupled."""
     printed = json.loads(TABLES.read_text())
 
     def model(entry: dict[str, Any]) -> Model:
@@ -168,7 +167,7 @@ def studies() -> dict[str, AttitudeStudy]:
                 simulation,
                 name="adam0-small",
                 title="ADAM-0, 10 % coupling, small doublet",
-                amplitude_deg=8.0,  # far from the motors' limits, where the vehicle is linear
+                amplitude_deg=8.0,  # no motor saturates: the vehicle is linear
                 gains_table=("", {}),
             ),
             replace(
@@ -177,7 +176,7 @@ def studies() -> dict[str, AttitudeStudy]:
                 title="ADAM-0 with a boom, 40 % coupling",
                 airframe="adam0_boom",
                 siso_airframe="adam0_boom",
-                amplitude_deg=15.0,  # at 22.5 its motors saturate
+                amplitude_deg=15.0,  # at 22.5 the motors saturate
                 gains_table=("", {}),
                 offaxis=1 / 5,
             ),
@@ -187,17 +186,17 @@ def studies() -> dict[str, AttitudeStudy]:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeRun:
-    """One experiment and what came of it.
+    """One experiment, the gains tuned from it, and their flights.
 
     Attributes
     ----------
     experiment : Flight
     gains : dict
-        Method -> set, certified from the experiment.
+        Method -> gains with the certificate from the experiment.
     flights : dict
-        Method -> roll and pitch doublet.
+        Method -> flights of the roll and the pitch doublet.
     figures : dict
-        Method -> `Performance` of both.
+        Method -> `Performance` of both flights.
     """
 
     experiment: Flight
@@ -207,7 +206,7 @@ class AttitudeRun:
 
 
 @cache
-def _bench(airframe: str) -> tuple[Vehicle, Gains, NativeLibrary]:
+def _vehicle_and_library(airframe: str) -> tuple[Vehicle, Gains, NativeLibrary]:
     vehicle = load_airframe(airframe)
     default = vehicle.default_gains()
     return vehicle, default, load_native(default)
@@ -215,23 +214,25 @@ def _bench(airframe: str) -> tuple[Vehicle, Gains, NativeLibrary]:
 
 def fly_set(airframe: str, gains: Gains, scenario: Scenario, seed: int, noise: bool = True) -> Flight:
     """One flight of a vehicle under a gain set."""
-    vehicle, _, library = _bench(airframe)
+    vehicle, _, library = _vehicle_and_library(airframe)
     autopilot = Autopilot(vehicle.airframe, gains, NativeController(library, gains))
     return fly(vehicle.airframe, autopilot, scenario, seed, noise)
 
 
-def _safe(flight: Flight, airframe: str, scenario: Scenario) -> Flight:
-    """A flight that must not be lost."""
+def _require_survival(flight: Flight, airframe: str, scenario: Scenario) -> Flight:
+    """Return the flight; raises when the vehicle was lost."""
     if flight.crashed_at is not None:
-        raise SitlError(f"{airframe}: lost at {flight.crashed_at:.2f} s of the {scenario.name}", exit_code=1)
+        raise SitlError(
+            f"{airframe}: the vehicle was lost at {flight.crashed_at:.2f} s of the {scenario.name}", exit_code=1
+        )
     return flight
 
 
 def experiment(study: AttitudeStudy, airframe: str, seed: int, noise: bool = True) -> tuple[Flight, Experiment]:
-    """The excitation flight of a study on a vehicle, and its signals as they are logged; with or without noise."""
-    vehicle, default, _ = _bench(airframe)
+    """Fly the excitation of a study on a vehicle; returns the flight and its logged signals."""
+    vehicle, default, _ = _vehicle_and_library(airframe)
     scenario = excitation_flight(*study.excitation, default.Ts, np.random.default_rng(seed))
-    flight = _safe(fly_set(airframe, default, scenario, seed, noise), airframe, scenario)
+    flight = _require_survival(fly_set(airframe, default, scenario, seed, noise), airframe, scenario)
     names = {"u": "moment", "y_i": "rates", "y_o": "attitude", "u_bar": "excitation", "r_o": "setpoint"}
     signals: Any = {name: flight.record[field][:, :2].astype(np.float64) for name, field in names.items()}
     motors = fit_motors(signals["u"], flight.record["commands"][:, : len(vehicle.airframe.rotors)].astype(np.float64))
@@ -239,9 +240,9 @@ def experiment(study: AttitudeStudy, airframe: str, seed: int, noise: bool = Tru
 
 
 def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experiment) -> dict[str, Gains]:
-    """Every data-driven method, each from one log."""
+    """Tune by every data-driven method, each from one log."""
     log = measured.experiment
-    default = _bench(study.airframe)[1]
+    default = _vehicle_and_library(study.airframe)[1]
     inner, outer = study.siso_models
     siso = TuningSpec(method="siso", inner=(inner, inner), outer=(outer, outer))
     mimo = TuningSpec(inner=(study.inner, study.inner), outer=(study.outer, study.outer))
@@ -250,22 +251,26 @@ def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experimen
         found[SISO_OWN] = tune(log, siso)
     task = Manoeuvre(amplitude_deg=study.amplitude_deg, period_s=study.period_s)
     roll, pitch = effort(found[SISO], doublet_model(measured, task))
-    task = task.model_copy(update={"effort": (EFFORT * roll, EFFORT * pitch)})
+    task = task.model_copy(update={"effort": (EFFORT_RATIO * roll, EFFORT_RATIO * pitch)})
     found[MIMO] = tune(log, mimo, measured)
     found[REFINED] = tune(log, mimo.model_copy(update={"manoeuvre": task}), measured)
     return found
 
 
 def logs(study: AttitudeStudy, seed: int) -> tuple[Flight, Experiment, Experiment]:
-    """The study's excitation flight, its log, and the log that SISO is tuned on."""
+    """Fly the experiment; returns the flight, its log, and the log that SISO is tuned on."""
     flight, log = experiment(study, study.airframe, seed)
     other = log if study.siso_airframe == study.airframe else experiment(study, study.siso_airframe, seed)[1]
     return flight, log, other
 
 
 def optimum(study: AttitudeStudy) -> dict[str, Gains]:
-    """The best gains on the true plant: with the effort of the refined ones and the certificate's margins, and with
-    those margins and as much effort as it takes.
+    """The best gains on the true plant, within the certificate's margins.
+
+    Returns
+    -------
+    dict
+        BEST: with the effort of the refined gains. BOUND: with any effort.
     """
     found, errors, bands = [], [], []
     for seed in TYPICAL:
@@ -275,19 +280,19 @@ def optimum(study: AttitudeStudy) -> dict[str, Gains]:
         found.append(tune_all(study, measured, siso_log))
         errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
         bands.append(plant.omega[plant.coherent_run()[[0, -1]]])
-    # Without noise a vehicle in balance needs no hover, and what comes after the doublet does not count.
+    # Without noise a balanced vehicle needs no hover before, and the flight after the doublet does not count.
     doublets = study.doublets(log.Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
     spent = [
         [flown_effort(fly_set(study.airframe, gains[REFINED], task, 0, noise=False)) for task in doublets]
         for gains in found
     ]
-    # The margins are those of the true plant, as a log without noise shows it, in the band of a log with noise and less
-    # what that leaves open.
+    # Margins of the true plant: its response from a log without noise, in the band of a log with noise; the limit on Ms
+    # is reduced by the error of Ms from a log with noise.
     plant = measured_plant(experiment(study, study.airframe, TYPICAL[0], noise=False)[1])
     body = rigid_body(plant)
     low, high = np.median(bands, axis=0)
     plant = plant.at((low <= plant.omega) & (plant.omega <= high)).interpolated(DENSE)
-    vehicle, _, library = _bench(study.airframe)
+    vehicle, _, library = _vehicle_and_library(study.airframe)
     task = OptimumTask(
         vehicle.airframe,
         library,
@@ -304,7 +309,7 @@ def optimum(study: AttitudeStudy) -> dict[str, Gains]:
 
 
 def run(study: AttitudeStudy, seed: int, best: dict[str, Gains]) -> AttitudeRun:
-    """Fly the experiment, tune, certify, and fly both doublets with every set."""
+    """Fly the experiment, tune, certify, and fly both doublets with every gain set."""
     flight, log, siso_log = logs(study, seed)
     measured = PlantEstimates(log)
     inner, outer = ([model] * 2 for model in study.models(MIMO, log.Ts))
@@ -324,7 +329,7 @@ def run(study: AttitudeStudy, seed: int, best: dict[str, Gains]) -> AttitudeRun:
 
 
 def numbers(found: AttitudeRun) -> dict[str, Any]:
-    """What of a run goes into statistics: figures, verdicts and gains by method."""
+    """The part of a run that goes into the statistics: figures, verdicts and gains by method."""
     return {
         method: {
             "verdict": gains.verdict()[0],

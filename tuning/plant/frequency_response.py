@@ -196,9 +196,7 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
     found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper, GROWTH)
     T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
     if np.any(np.linalg.matrix_rank(T_u) < 2):
-        raise TuningError(
-            "not excited: the external signal does not move roll and pitch torque independently; inject on each axis"
-        )
+        raise TuningError("not excited: the external signal does not move both torques independently; excite each axis")
     for name, T in (("rates", T_i), ("angles", T_o)):
         if np.any(np.linalg.matrix_rank(T) < 2):
             raise TuningError(

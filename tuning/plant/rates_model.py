@@ -69,7 +69,7 @@ def identify_rates(
     known = plant.at(plant.known_run())
     if not len(known.omega):
         raise TuningError(
-            f"{experiment.source}: not excited: the response of the rates is known at no frequency; excite both axes"
+            f"{experiment.source}: not excited: the rate response is known at no frequency; excite both axes"
         )
     if order is None:
         model, response = pbsid_by_response(

@@ -130,7 +130,7 @@ def test_without_excitation_at_a_mode_its_neighbourhood_is_needed_and_noise_is_n
 def test_a_log_with_roll_in_place_of_pitch_is_refused(flights, name):
     log = flights["adam0"][0]
     twice = dataclasses.replace(log, **{name: np.repeat(getattr(log, name)[:, :1], 2, axis=1)})
-    with pytest.raises(TuningError, match="are one signal"):
+    with pytest.raises(TuningError, match="are the same signal"):
         certify_from_log(twice, log.flown)
 
 

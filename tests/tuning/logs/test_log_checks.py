@@ -56,14 +56,14 @@ def mended(path, message, acceleration):
     return log
 
 
-def test_a_true_log_is_read(good, acceleration, tmp_path):
+def test_a_correct_log_is_read(good, acceleration, tmp_path):
     log = read_log(write(tmp_path / "x.csv", good))
     assert log.warnings == ()
     assert pytest.approx(acceleration, rel=0.05, abs=5) == rigid_body(measured_plant(log)).B
 
 
 @pytest.mark.parametrize("name", NAMES[1:])
-def test_a_wrong_sign_names_its_column_and_the_line_mends_it(good, acceleration, tmp_path, name):
+def test_a_wrong_sign_names_its_column_and_the_given_line_corrects_it(good, acceleration, tmp_path, name):
     table = good.copy()
     table[:, NAMES.index(name)] *= -1
     path = write(tmp_path / "x.csv", table)
@@ -74,7 +74,7 @@ def test_a_wrong_sign_names_its_column_and_the_line_mends_it(good, acceleration,
 
 
 @pytest.mark.parametrize("names", [("u_roll", "u_bar_roll"), ("q", "pitch"), ("u_pitch", "u_bar_pitch")])
-def test_two_explanations_that_look_the_same_are_both_told(good, tmp_path, names):
+def test_two_equivalent_explanations_are_both_reported(good, tmp_path, names):
     table = good.copy()
     table[:, [NAMES.index(name) for name in names]] *= -1
     path = write(tmp_path / "x.csv", table)
@@ -89,7 +89,7 @@ SOME = [signals for n in (1, 2, 3) for signals in itertools.combinations(PLACES,
 
 
 @pytest.mark.parametrize("swapped", SOME, ids="+".join)
-def test_exchanged_columns_are_named_and_the_lines_mend_them(good, acceleration, tmp_path, swapped):
+def test_exchanged_columns_are_named_and_the_given_lines_correct_them(good, acceleration, tmp_path, swapped):
     table = good.copy()
     for signal in swapped:
         table[:, PLACES[signal]] = table[:, PLACES[signal][::-1]]
@@ -106,7 +106,7 @@ def test_exchanged_columns_are_named_and_the_lines_mend_them(good, acceleration,
 @pytest.mark.parametrize(
     "names", [("p",), ("q",), ("p", "q"), ("roll",), ("roll", "pitch"), ("p", "roll"), ("p", "q", "roll", "pitch")]
 )
-def test_degrees_for_radians_are_refused_with_their_line(good, tmp_path, names, gentle):
+def test_degrees_for_radians_are_refused_with_the_correcting_line(good, tmp_path, names, gentle):
     table = good.copy()
     table[:, 1:] *= gentle
     table[:, [NAMES.index(name) for name in names]] *= DEGREE
@@ -118,17 +118,17 @@ def test_degrees_for_radians_are_refused_with_their_line(good, tmp_path, names, 
     assert set(named) <= set(names)
 
 
-def test_radians_that_are_told_in_degrees_are_refused(good, tmp_path):
+def test_radians_declared_as_degrees_are_refused(good, tmp_path):
     path = write(tmp_path / "x.csv", good)
     columns = Columns.model_validate({name: {"unit": "deg/s"} for name in ("p", "q")})
-    with pytest.raises(TuningError, match=r"57\.3 times what its rate makes of it"):
+    with pytest.raises(TuningError, match=r"57\.3 times the integral of its rate"):
         read_log(path, columns)
 
 
 def test_torque_without_the_injection_rates_of_another_time_and_noise_are_refused(good, tmp_path):
     table = good.copy()
     table[:, PLACES["u"]] -= table[:, PLACES["u_bar"]]
-    assert "does not contain what was injected on" in refusal(write(tmp_path / "x.csv", table))
+    assert "does not contain the torque injected on" in refusal(write(tmp_path / "x.csv", table))
     table = good.copy()
     table[:, PLACES["y_i"]] = np.roll(table[:, PLACES["y_i"]], 125, axis=0)
     assert "not of one time" in refusal(write(tmp_path / "x.csv", table))
@@ -145,14 +145,14 @@ def tumble(table, begin, seconds=1.0):
     return table
 
 
-def test_what_comes_before_a_tumble_is_used_and_it_is_told(good, tmp_path):
+def test_the_log_before_a_tumble_is_used_and_a_warning_is_given(good, tmp_path):
     log = read_log(write(tmp_path / "x.csv", tumble(good, 10.5)))
     assert log.seconds == pytest.approx(10.5 + 75 / 360 - 1.0, abs=0.1)
-    assert "tumbled at 10.7 s (tilt beyond 75 degrees): only what is 1 s or more before" in log.warnings[0]
+    assert "tumbled at 10.7 s (tilt beyond 75 degrees): only the log until 1 s before" in log.warnings[0]
 
 
 @pytest.mark.parametrize(("name", "begin"), [("q", 10.5), ("p", 10.5), ("pitch", 7.0)])
-def test_a_tumble_hides_no_wrong_sign(good, tmp_path, name, begin):
+def test_a_wrong_sign_is_found_despite_a_tumble(good, tmp_path, name, begin):
     table = tumble(good, begin)
     table[:, NAMES.index(name)] *= -1
     message = refusal(write(tmp_path / "x.csv", table))
@@ -161,7 +161,7 @@ def test_a_tumble_hides_no_wrong_sign(good, tmp_path, name, begin):
     assert f"({axis})" in message
 
 
-def test_every_command_says_the_same(good, tmp_path, mimopilot):
+def test_every_command_gives_the_same_message(good, tmp_path, mimopilot):
     table = good.copy()
     table[:, PLACES["u"]] = table[:, PLACES["u"][::-1]]
     path = write(tmp_path / "x.csv", table)

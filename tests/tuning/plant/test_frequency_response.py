@@ -31,7 +31,7 @@ def test_the_measured_response_is_that_of_the_airframe(name):
 
 
 @pytest.mark.parametrize(("hz", "gain"), [(12.0, 0.4), (25.0, 0.4), (25.0, 0.8), (30.0, 0.4)])
-def test_a_mode_of_the_frame_is_seen_where_it_is(hz, gain):
+def test_a_frame_mode_is_found_at_its_frequency(hz, gain):
     body = load_airframe("adam0").airframe.model_copy(update={"frame": Frame(frequency_hz=hz, damping=0.02, gain=gain)})
     plant = measured_plant(experiment("adam0", airframe=body))
     exact = linear_plant(body).frequency_response(plant.omega)
@@ -74,7 +74,7 @@ def synthetic(omega, error=0.0, coherence=1.0, K=100.0):
     return PlantResponse(omega, G, G / s, root, reach, coherences, TS)
 
 
-def test_the_deviation_is_that_of_draws():
+def test_the_deviation_is_that_of_drawn_plants():
     omega = np.linspace(2, 20, 10)
     plant = synthetic(omega, 0.1)
     rng = np.random.default_rng(0)
@@ -107,7 +107,7 @@ def test_one_axis_without_coherence_is_not_known():
     assert np.flatnonzero(~plant.known()).tolist() == [3]
 
 
-def test_a_small_hole_does_not_end_the_run_and_a_large_one_does():
+def test_a_small_gap_does_not_end_the_known_band_and_a_large_one_does():
     omega = np.arange(1.0, 60.0)
     for lacking, last in (((19, 22), 59.0), ((19, 30), 19.0), ((40, 56), 40.0)):
         plant = synthetic(omega)
@@ -129,7 +129,7 @@ def test_a_small_hole_does_not_end_the_run_and_a_large_one_does():
     assert nothing.band(0) is None
 
 
-def test_the_response_between_its_frequencies_is_that_of_a_body():
+def test_interpolation_is_exact_for_a_damped_body():
     """Exact for a body with damping, and near for a vehicle with motors."""
     omega = np.arange(1.3, 100.0, 1.3)
     K = np.array([[80.0, -8.0], [-7.0, 90.0]])
@@ -147,7 +147,7 @@ def test_the_response_between_its_frequencies_is_that_of_a_body():
     assert relative(between.G_i, truth.frequency_response(between.omega)[:, :2]).max() < 0.02
 
 
-def test_the_response_is_carried_on_downwards_as_a_body_that_integrates():
+def test_the_response_is_extended_downwards_as_an_integrating_body():
     plant = synthetic(np.arange(3.0, 30.0), 0.1).extended()
     s = 1j * plant.omega[:, None, None]
     assert plant.omega[0] == pytest.approx(1.0)
@@ -160,11 +160,11 @@ def test_the_response_is_carried_on_downwards_as_a_body_that_integrates():
 def test_a_log_with_roll_in_place_of_pitch_is_refused(name, said):
     log = experiment("adam0", seconds=10.0)
     twice = replace(log, **{name: np.repeat(getattr(log, name)[:, :1], 2, axis=1)})
-    with pytest.raises(TuningError, match=f"roll and pitch {said} are one signal"):
+    with pytest.raises(TuningError, match=f"roll and pitch {said} are the same signal"):
         measured_plant(twice)
 
 
 def test_a_torque_that_does_not_move_both_axes_is_refused():
     log = experiment("adam0", seconds=10.0)
-    with pytest.raises(TuningError, match="not excited: the external signal does not move both moments"):
+    with pytest.raises(TuningError, match="not excited: the external signal does not move both torques"):
         plant_response(replace(log, u=np.repeat(log.u[:, :1], 2, axis=1)), log.u_bar)

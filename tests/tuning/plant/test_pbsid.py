@@ -126,7 +126,7 @@ def genuine(request):
     return log, measured_plant(log)
 
 
-def test_a_genuine_flight_gets_an_order_that_fits_its_response(genuine):
+def test_a_px4_flight_gets_an_order_that_fits_its_response(genuine):
     log, plant = genuine
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -140,7 +140,7 @@ def test_a_genuine_flight_gets_an_order_that_fits_its_response(genuine):
     assert (found.one_step_percent > 50).all()
 
 
-def test_a_diverging_order_that_is_asked_for_is_refused(genuine):
+def test_a_given_order_that_diverges_is_refused(genuine):
     """Whatever the order: its predictor is stable, or it is refused, and nothing overflows."""
     log, plant = genuine
     refused = 0
@@ -165,15 +165,15 @@ def test_the_order_by_response_is_that_of_the_plant():
     assert response_error(model.plant) < 0.02
 
 
-def test_a_model_that_is_not_near_the_response_is_refused():
+def test_a_model_that_does_not_fit_the_response_is_refused():
     u, y, _ = closed_loop_data(4000)
     omega = np.linspace(0.3, np.pi / TS, 100)
-    with pytest.raises(TuningError, match=r"no model of order 1 to 12 is near .* \(the best fits by -\d+ %"):
+    with pytest.raises(TuningError, match=r"no model of order 1 to 12 fits .* \(best fit -\d+ %"):
         pbsid_by_response(u, y, TS, omega, -PLANT.frequency_response(omega), np.full((len(omega), 2, 2), 1e-3))
 
 
 def test_a_log_without_any_known_frequency_is_refused(genuine):
     log, plant = genuine
     unknown = replace(plant, root=plant.root * 1e6, coherence=0 * plant.coherence)
-    with pytest.raises(TuningError, match="not excited: the response of the rates is known at no frequency"):
+    with pytest.raises(TuningError, match="not excited: the rate response is known at no frequency"):
         identify_rates(log, unknown)

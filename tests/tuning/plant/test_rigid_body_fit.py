@@ -30,19 +30,19 @@ def exact(airframe, omega=OMEGA):
 
 
 @pytest.mark.parametrize("name", AIRFRAMES)
-def test_a_flight_shows_the_inertia_of_its_airframe(name):
+def test_the_fit_finds_the_inertia_of_the_airframe(name):
     """ANT-R hovers at 14 % of its thrust: a larger torque than 5 % is no longer linear."""
     B = inertia(load_airframe(name).airframe)
     found = rigid_body(measured_plant(experiment(name, amplitude=0.05 if name == "antr" else 0.15)))
     assert pytest.approx(B, abs=0.03 * np.abs(B).max()) == found.B
 
 
-def test_a_genuine_px4_shows_the_inertia_that_its_simulator_was_given():
+def test_the_fit_of_a_px4_log_finds_the_inertia_of_its_simulator():
     found = rigid_body(measured_plant(read_log(DATA / "px4_sih_coupled.mat")))
     assert pytest.approx(np.array([[148.1, -39.3], [-39.3, 130.6]]), abs=0.04 * 148.1) == found.B
 
 
-def test_a_wrong_sign_or_an_exchange_shows_in_the_body():
+def test_a_wrong_sign_or_exchanged_axes_show_in_the_fit():
     plant = exact(load_airframe("adam0_boom").airframe)
     B = rigid_body(plant).B
     for turned, expected in (
@@ -76,7 +76,7 @@ def test_the_deviation_is_that_of_repeated_noise():
     assert determinants[0, 1] == pytest.approx(np.std(drawn), rel=0.05)
 
 
-def test_the_least_is_the_least_in_any_direction():
+def test_the_smallest_action_is_the_minimum_over_directions():
     body = RigidBody(np.array([[10.0, 4.0], [0.0, 5.0]]), np.ones((2, 2)))
     Ki = np.array([[1.0, -0.5], [0.8, 0.6]])
     turns = np.linspace(0, np.pi, 20001)
