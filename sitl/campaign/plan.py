@@ -185,9 +185,8 @@ def write_plan_files(plan: CampaignPlan, folder: Path) -> None:
             f"{folder}: holds another campaign ({_difference(there, plan.files)}); give another --out, or the same "
             "arguments to resume it"
         )
-    for name, text in sorted(
-        plan.files.items(), key=lambda item: item[0] == SPEC
-    ):  # the specification last: with it the folder counts as a campaign
+    # The specification is last: with it the folder counts as a campaign.
+    for name, text in sorted(plan.files.items(), key=lambda item: item[0] == SPEC):
         write_atomically(inside(folder, name), text)
 
 

@@ -1,4 +1,4 @@
-"""Many experiments of the attitude studies on all cores: run k is the same whatever the number of processes."""
+"""Many runs of the attitude studies on all cores; the results do not depend on the number of processes."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from mimopilot.common.parallel import cores, processes, run_all
 
 @dataclass(frozen=True, eq=False)
 class StudyStatistics:
-    """What the runs of a study say.
+    """The runs of a study and their statistics.
 
     Attributes
     ----------
     study : AttitudeStudy
     shown : AttitudeRun
-        That of seed 0, for the figures.
+        Run with seed 0, for the plots.
     runs : list of dict
         `numbers` of every seed, in order.
     """
@@ -51,27 +51,27 @@ class StudyStatistics:
 
 
 def run_once(task: tuple[AttitudeStudy, int, dict[str, Gains]]) -> tuple[AttitudeRun, dict[str, Any]]:
-    """One run of a study with a seed, beside the best sets, and its `numbers`."""
+    """One run of a study with a seed and the best gain sets, and its `numbers`."""
     found = run(*task)
     return found, numbers(found)
 
 
 def _counted(task: tuple[AttitudeStudy, int, dict[str, Gains]]) -> tuple[AttitudeRun | None, dict[str, Any]]:
-    """`run_once`; flights take long to hand over, and only those of seed 0 are shown."""
+    """`run_once`, which returns flights for seed 0 only: other flights are not shown and slow to transfer."""
     found, counted = run_once(task)
     return (found if task[1] == 0 else None), counted
 
 
 def run_studies(chosen: Sequence[AttitudeStudy], seeds: int, workers: int | None = None) -> list[StudyStatistics]:
-    """Every study with every seed.
+    """Run every study with every seed.
 
     Parameters
     ----------
     chosen : sequence of AttitudeStudy
     seeds : int
-        Experiments a study.
+        Experiments per study.
     workers : int, optional
-        Processes; by default one a core.
+        Processes; by default one per core.
     """
     from rich.progress import Progress
 

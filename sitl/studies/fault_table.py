@@ -1,4 +1,4 @@
-"""The table of faults: every standard fault, many seeds, several gain sets side by side."""
+"""The fault table: every standard fault with many seeds, several gain sets side by side."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from mimopilot.common.console import print_table, progress_console
 from mimopilot.common.intervals import wilson
 from mimopilot.common.parallel import processes, run_all
 
-AT = 1.1  # s: a tenth of a second into the manoeuvre
-TAIL_S = 5.0  # of level flight after it: what is lost in the end shall be lost in the flight
+AT = 1.1  # s: time of the faults, 0.1 s after the start of the manoeuvre
+TAIL_S = 5.0  # s of level flight after the manoeuvre: long enough to lose an unstable vehicle in the flight
 COLUMNS = (
     *("fault", "gains", "survived", "95 %", "peak [deg]", "worst", "RMS", "recovered [s]"),
     *("saturated", "detected [s]", "non-finite"),
@@ -32,7 +32,7 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class FaultTableRequest:
-    """What is asked: everything that a worker process needs to know.
+    """What to fly: the complete input of a worker process.
 
     Attributes
     ----------
@@ -42,9 +42,9 @@ class FaultTableRequest:
         See `sitl.physics.airframe.Vehicle.gain_sets`.
     axis : str
     amplitude_deg, period_s : float
-        Of the doublet.
+        Amplitude (deg) and length (s) of the doublet.
     faults : tuple of Fault
-        Each is flown by itself; empty: `standard_faults`.
+        Flown one at a time; empty: `standard_faults`.
     """
 
     airframe: str
@@ -57,7 +57,7 @@ class FaultTableRequest:
 
 @dataclass(frozen=True)
 class FaultTableRow:
-    """One fault under one gain set, over all seeds; medians unless the name says otherwise.
+    """One fault with one gain set over all seeds; medians unless stated otherwise.
 
     Attributes
     ----------
@@ -66,23 +66,26 @@ class FaultTableRow:
     survival_interval : (low, high)
         Wilson's, 95 %.
     peak_deg, worst_peak_deg, rms_deg : float, deg
-        From the flight without faults, see `sitl.flight.fault_recovery.Recovery`; the worst is that of `worst_seed`.
+        Deviation from the flight without faults, see `sitl.flight.fault_recovery.Recovery`; the worst peak is
+        that of `worst_seed`.
     recovered : int
+        Number of flights that recovered.
     recovery_s : float or None, s
-        Of those that recovered.
+        Of these.
     saturated : float
-        Samples.
+        Samples with saturation since the fault.
     detected : int
+        Number of flights in which the fault was detected.
     detected_s : float or None, s
-        Of those that were detected.
+        Of these.
     detected_by : str
-        What told it, by commas.
+        Detectors, separated by commas.
     nonfinite : int
-        Of all seeds together.
+        Non-finite outputs of all seeds together.
     worst_seed : int
-        The one that was lost first, else the one with the largest peak.
+        Seed of the first lost flight, else of the largest peak.
     replay : str
-        The command that flies it again.
+        Command that repeats the worst flight.
     """
 
     fault: str
@@ -106,7 +109,7 @@ class FaultTableRow:
 
 @dataclass(frozen=True)
 class FaultTable:
-    """What was found.
+    """The result: one row per fault and gain set.
 
     Attributes
     ----------
@@ -114,7 +117,7 @@ class FaultTable:
     rows : tuple of FaultTableRow
         By fault, then by gain set.
     lost_without, alarms_without : dict of int
-        Gain set -> of the flights without faults, those that were lost, and those in which something was detected.
+        Gain set -> number of lost flights, and of false alarms, among the flights without faults.
     """
 
     title: str
@@ -128,15 +131,15 @@ class FaultTable:
 
     @property
     def nonfinite(self) -> int:
-        """Outputs of all flights that were not finite numbers."""
+        """Number of non-finite outputs in all flights."""
         return sum(row.nonfinite for row in self.rows)
 
 
 def standard_faults(airframe: Airframe) -> tuple[Fault, ...]:
-    """The faults that every vehicle is asked to survive, or to notice, with their sizes."""
+    """The standard faults with their sizes: a vehicle should survive or detect each."""
     x, y, z = (0.8 * place for place in airframe.rotors[2].position)
     load = round(0.11 * airframe.mass, 3)
-    tick = "0.001"  # shorter than a period: one sample
+    tick = "0.001"  # s, shorter than a period: one sample
     texts = (
         *(f"motor:3={share}@{AT}" for share in (0.9, 0.7, 0.5, 0)),
         f"battery=0.8@{AT}+0.5",
@@ -160,7 +163,7 @@ def standard_faults(airframe: Airframe) -> tuple[Fault, ...]:
 
 
 class FaultFlights:
-    """A vehicle, its gain sets and what is flown with them: made once in each process."""
+    """Flies a vehicle with its gain sets and faults; made once per process."""
 
     def __init__(self, request: FaultTableRequest) -> None:
         vehicle = load_airframe(request.airframe)
@@ -174,13 +177,13 @@ class FaultFlights:
         self.faults = request.faults or standard_faults(self.airframe)
 
     def fly(self, name: str, faults: tuple[Fault, ...], seed: int) -> Flight:
-        """One flight under a gain set."""
+        """One flight with a gain set."""
         gains = self.gains[name]
         autopilot = Autopilot(self.airframe, gains, NativeController(self.libraries[name], gains))
         return fly(self.airframe, autopilot, replace(self.tasks[name], faults=faults), seed)
 
     def fly_all(self, seed: int) -> dict[str, list[Recovery]]:
-        """Gain set -> the flight without faults, then one with each fault."""
+        """Gain set -> recovery in the flight without faults, then in one flight per fault."""
         found = {}
         for name in self.gains:
             sound = self.fly(name, (), seed)
@@ -199,16 +202,16 @@ def _fly_all(request: FaultTableRequest, seed: int) -> dict[str, list[Recovery]]
 
 
 def fault_table(request: FaultTableRequest, seeds: Sequence[int], workers: int) -> FaultTable:
-    """Fly every fault with every seed under every gain set.
+    """Fly every fault with every seed and gain set.
 
     Parameters
     ----------
     request : FaultTableRequest
-        What to fly.
+        Vehicle, gain sets, manoeuvre and faults.
     seeds : sequence of int
-        Of the measurement noise and of what is random in a fault.
+        Seeds of the measurement noise and of random faults.
     workers : int
-        Processes; the table is the same whatever their number.
+        Number of processes; it does not change the table.
 
     Raises
     ------
@@ -277,7 +280,7 @@ def _row(
 
 
 def _badness(one: Recovery) -> tuple[float, float]:
-    """Sorts what was lost first to the end, then the larger peaks."""
+    """Sort key: earlier loss is worse, then a larger peak."""
     return -np.inf if one.lost_at_s is None else -one.lost_at_s, one.deviation_peak_deg
 
 
@@ -287,7 +290,7 @@ def _median(values: list[float | None]) -> float | None:
 
 
 def _replay(request: FaultTableRequest, fault: Fault, path: Path | None, seed: int) -> str:
-    """The command line that flies one flight of the table again."""
+    """The command that repeats one flight of the table."""
     words = ["mimopilot", "fly", request.airframe, *(() if path is None else ("--gains", str(path)))]
     words += ["--axis", request.axis, "--amplitude-deg", repr(request.amplitude_deg)]
     words += ["--period-s", repr(request.period_s), "--tail-s", repr(TAIL_S)]
@@ -296,12 +299,12 @@ def _replay(request: FaultTableRequest, fault: Fault, path: Path | None, seed: i
 
 
 def print_fault_table(table: FaultTable) -> None:
-    """The table, what happened without faults, and how to fly each worst case again."""
+    """Print the table, the flights without faults, and the commands that repeat the worst flights."""
     print_table(table.title, COLUMNS, [_cells(row) for row in table.rows])
     for name, lost in table.lost_without.items():
         runs = next(row.runs for row in table.rows if row.gains == name)
         print(f"without faults, {name}: {lost} of {runs} lost, {table.alarms_without[name]} with a false alarm")
-    print("worst seeds again:")
+    print("commands to repeat the worst flights:")
     for row in table.rows:
         print(f"  {row.replay}")
 

@@ -342,7 +342,7 @@ at = 1.1
     assert parse_map(plan, "wind.north,wind.east") == ("wind.north", "wind.east")
     for wrong in ("mass,drag", "wind.north", "wind.north,wind.north"):
         with pytest.raises(
-            SitlError, match=f"--map: got '{wrong}', expected two of those that vary: motors.time_constant"
+            SitlError, match=f"--map: got '{wrong}', expected two varied quantities: motors.time_constant"
         ):
             parse_map(plan, wrong)
 
@@ -352,7 +352,7 @@ def test_another_campaign_in_the_same_folder_is_refused_by_what_differs(vehicle,
     run_campaign(plan_of(vehicle, runs=2, axes=["roll"]), tmp_path, 1)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     others = {
-        "seed: 3 there, 4 here": plan_of(vehicle, runs=2, axes=["roll"], seed=4),
+        "seed: 3 in the folder, 4 now": plan_of(vehicle, runs=2, axes=["roll"], seed=4),
         "vary: ": plan_of(vehicle, runs=2, axes=["roll"], vary=""),
         "gains/default.gains.toml differs": plan_of(vehicle, {"default": unstable(good)}, runs=2, axes=["roll"]),
         "airframe.toml differs": plan_of(load_airframe("adam0_nominal"), runs=2, axes=["roll"]),

@@ -47,7 +47,7 @@ def test_a_damaged_a_doubled_and_a_foreign_part_are_flown_again_and_told(flown, 
     assert run_campaign(plan, folder, 1).read_bytes() == results
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(
-        "parts: flown again: 0000001.part is damaged; 0000002.part is of runs 0 to 63; "
+        "parts: unusable parts are flown again: 0000001.part is damaged; 0000002.part is of runs 0 to 63; "
         "0000003.part is of another campaign"
     )
 
@@ -92,7 +92,7 @@ def test_a_second_campaign_in_a_folder_is_told_until_the_first_has_ended_even_by
         assert first.stdout.readline() == "alone\n"
         with pytest.raises(
             SitlError,
-            match="c: another process is flying a campaign into it; wait until it ends, or give another --out",
+            match="c: another process writes a campaign into this folder; wait for it, or give another --out",
         ):
             run_campaign(plan, tmp_path / "c", 1)
         assert [path.name for path in (tmp_path / "c").iterdir()] == [LOCK]

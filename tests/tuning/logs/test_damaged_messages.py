@@ -190,7 +190,7 @@ def test_a_message_with_a_damaged_format_is_named_beside_the_missing_signals(tmp
     data = bytearray(dataflash_bytes(ardupilot_messages(flight)))
     data[data.index(b"Qffff\0")] = ord("X")
     (tmp_path / "x.bin").write_bytes(data)
-    with pytest.raises(TuningError, match=r"lacks message RATE .*the format of RATE is not known or damaged"):
+    with pytest.raises(TuningError, match=r"lacks message RATE .*the format of RATE is unknown or damaged"):
         read_log(tmp_path / "x.bin")
 
 

@@ -143,7 +143,7 @@ def test_flown_gains_are_not_read_and_the_reason_is_given(tmp_path, flight):
     path = write(tmp_path / "x.bin", [*ardupilot_messages(flight), parameters(ATC_RAT_RLL_P=0.135)])
     recording = open_log(path)
     assert recording.parameters["ATC_RAT_RLL_P"] == pytest.approx(0.135)
-    assert "D acts on the filtered error" in recording.notes[0]
+    assert "ArduPilot filters the error for D" in recording.notes[0]
     assert read_log(path).flown is None
 
 

@@ -131,7 +131,7 @@ def test_torque_without_the_injection_rates_of_another_time_and_noise_are_refuse
     assert "does not contain the torque injected on" in refusal(write(tmp_path / "x.csv", table))
     table = good.copy()
     table[:, PLACES["y_i"]] = np.roll(table[:, PLACES["y_i"]], 125, axis=0)
-    assert "not of one time" in refusal(write(tmp_path / "x.csv", table))
+    assert "from different vehicles or times" in refusal(write(tmp_path / "x.csv", table))
 
 
 def tumble(table, begin, seconds=1.0):

@@ -76,7 +76,7 @@ def test_repeated_parm_messages_are_changes(tmp_path, flight):
 def test_commands_report_what_is_wrong_with_a_log(mimopilot, tmp_path, flight):
     still = replace(flight, u=np.column_stack([flight.u[:, 0], np.zeros(len(flight.t))]))  # refused, and so at once
     px4(tmp_path, still, [(17.0, "MC_ROLL_P", 5.0)])
-    for command, begin in (("inspect", "warning: x.ulg: parameters were changed"), ("advise", "x.ulg: ")):
+    for command, begin in (("inspect", "warning: x.ulg: parameters changed"), ("advise", "x.ulg: ")):
         result = mimopilot(command, "x.ulg")
         told = [line for line in result.stderr.splitlines() if "MC_ROLL_P from 6.5 to 5" in line]
         assert len(told) == 1, result.stderr

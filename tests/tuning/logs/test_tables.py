@@ -266,7 +266,7 @@ def test_columns_of_matlab_matrices_are_picked_by_an_index_from_one(tmp_path, fl
     lines[1] = 'q = { column = "gyro" }'
     with pytest.raises(TuningError, match=r'pick its column: q = \{ column = "gyro", index = 1 \} \(the first is 1\)'):
         read_log(tmp_path / "x.mat", columns(tmp_path, "\n".join(lines)))
-    with pytest.raises(TuningError, match="p: index is for the columns of a MATLAB matrix"):
+    with pytest.raises(TuningError, match="p: index picks a column of a MATLAB matrix"):
         read_log(write_csv(tmp_path / "x.csv", table(flight)), columns(tmp_path, "p = { index = 1 }"))
 
 
