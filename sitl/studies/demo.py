@@ -261,8 +261,8 @@ def _write_report(
             "Gains",
             "Beside the thesis' values for its own simulator, whose inertia is not printed. In brackets: the spread to "
             "expect if the flight were repeated with fresh noise (standard deviation). Kp_o in 1/s, Kp_i in s, Ki_i "
-            "dimensionless, Kd_i in s^2; a small negative Kd_i means that these models need no damping beyond the vehicle's own. SISO tunes each axis "
-            "by itself with the same instruments.",
+            "dimensionless, Kd_i in s^2; a small negative Kd_i means that these models need no damping beyond the "
+            "vehicle's own. SISO tunes each axis by itself with the same instruments.",
             tables=[Table("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
         ),
         Section(

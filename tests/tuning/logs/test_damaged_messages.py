@@ -1,4 +1,4 @@
-"""A damaged byte costs the message that it is in, in both formats, and how much was lost is told."""
+"""A damaged byte costs only its own message, in both formats, and the loss is reported."""
 
 import struct
 import tracemalloc
@@ -69,7 +69,7 @@ def test_skipped_bytes_are_counted_and_reported_by_every_reader_of_the_log(tmp_p
     assert read_log(path).warnings == (told,)
     assert inspect_log(path).warnings == (told,)
     assert read_log(path).segments == ((0, len(flight.t)),)
-    # Where the log is refused all the same, the damage is told beside the reason.
+    # If the log is refused, the damage is reported beside the reason.
     path.write_bytes(data[: first[750]])
     with pytest.raises(TuningError, match=f"damaged: {size} of"):
         read_log(path)

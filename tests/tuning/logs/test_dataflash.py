@@ -1,4 +1,4 @@
-"""ArduPilot logs, written here byte by byte."""
+"""ArduPilot logs, written by the test byte by byte."""
 
 import numpy as np
 import pytest
@@ -155,7 +155,7 @@ def test_logs_of_arducopter_3_are_read_in_their_own_units_and_milliseconds(tmp_p
     assert len(log.segments) == 1
     assert len(log.u) == pytest.approx(len(flight.t), abs=1)
     assert log.u == pytest.approx(flight.u[: len(log.u)], abs=1e-6)
-    # Stamps are cut to whole milliseconds, those of all messages alike.
+    # The stamps of all messages are truncated to milliseconds.
     assert log.y_i == pytest.approx(flight.y_i[: len(log.u)], abs=2e-3)
     assert log.y_o == pytest.approx(flight.y_o[: len(log.u)], abs=5e-4)
     assert "3.3 and older" in open_log(tmp_path / "x.bin").format

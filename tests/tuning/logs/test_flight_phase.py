@@ -1,4 +1,4 @@
-"""Which part of a log is flight, and the refusal of logs that hold none."""
+"""The part of a log in flight, and the refusal of logs without flight."""
 
 import numpy as np
 import pytest
@@ -89,7 +89,7 @@ def test_sensor_noise_on_the_ground_is_not_motion(tmp_path):
 
 def test_rest_before_and_after_the_flight_is_cut_off_when_no_state_is_logged(tmp_path):
     log = read_log(write_csv(tmp_path / "x.csv", table(make_flight(30.0, still=(10.0, 8.0)))))
-    # One second stays on either side.
+    # One second remains on either side.
     assert 12.0 < log.seconds < 14.5
 
 

@@ -128,7 +128,7 @@ def test_the_column_file_is_used_by_inspect_and_by_tune(mimopilot, tmp_path, fli
     assert_one_clear_line(mimopilot("tune", "x.csv", "--out", "x.toml"), "lacks column p and q")
     found = json.loads(mimopilot("inspect", "x.csv", "--columns", "c.toml", "--json").stdout)
     assert found["signals"]["y_i"]["maximum"] == pytest.approx(flight.y_i.max(axis=0).tolist(), rel=1e-6)
-    # With the columns known, the next thing that the log does not say is asked for.
+    # With known columns, the next missing item is requested.
     result = mimopilot("tune", "x.csv", "--columns", "c.toml", "--out", "x.toml")
     assert_one_clear_line(result, "which yaw gains flew", "derivative_cutoff_hz", "--spec")
 

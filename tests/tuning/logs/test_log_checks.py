@@ -1,4 +1,4 @@
-"""Columns with a wrong sign or unit, or in each other's place: refused with the line that mends them."""
+"""Wrong signs and units and exchanged columns are refused with the correcting line."""
 
 import itertools
 import tomllib
@@ -44,12 +44,12 @@ def refusal(path):
 
 
 def told(message):
-    """The lines of a column file in a refusal."""
+    """The column-file lines in a refusal."""
     return message.split("put into the --columns file: ")[1].split("; ")[0].replace(" }, ", " }\n")
 
 
 def mended(path, message, acceleration):
-    """The log under the lines of its refusal is that of the vehicle."""
+    """Check that the log read with the lines of its refusal is that of the vehicle."""
     lines = message.split("put into the --columns file: ")[1].split("; ")[0].replace(" }, ", " }\n")
     log = read_log(path, Columns.model_validate(tomllib.loads(lines)))
     assert pytest.approx(acceleration, rel=0.15, abs=10) == rigid_body(measured_plant(log)).B
@@ -97,7 +97,7 @@ def test_exchanged_columns_are_named_and_the_given_lines_correct_them(good, acce
     message = refusal(path)
     assert "roll and pitch are exchanged in" in message
     B = rigid_body(measured_plant(read_log(path, Columns.model_validate(tomllib.loads(told(message)))))).B
-    # Whether all that is left is roll for pitch cannot be told: the vehicle is the same with its axes renamed.
+    # An exchange of roll and pitch in all signals cannot be detected: it only renames the axes.
     renamed = acceleration[::-1, ::-1]
     assert any(np.allclose(B, true, rtol=0.15, atol=10) for true in (acceleration, renamed))
 
@@ -111,7 +111,7 @@ def test_degrees_for_radians_are_refused_with_the_correcting_line(good, tmp_path
     table[:, 1:] *= gentle
     table[:, [NAMES.index(name) for name in names]] *= DEGREE
     message = refusal(write(tmp_path / "x.csv", table))
-    # One line at least is right, and none is wrong: more come when it is told.
+    # At least one line is right and none is wrong; further ones follow in the next refusal.
     units = {"p": "deg/s", "q": "deg/s", "roll": "deg", "pitch": "deg"}
     named = [name for name in units if f'{name} = {{ column = "{name}", unit = "{units[name]}" }}' in message]
     assert named

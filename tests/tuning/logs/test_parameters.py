@@ -1,4 +1,4 @@
-"""Which parameters are the flown ones: those in force when the part that is used begins."""
+"""The flown parameters are those at the beginning of the part that is used."""
 
 from dataclasses import replace
 
@@ -74,7 +74,7 @@ def test_repeated_parm_messages_are_changes(tmp_path, flight):
 
 
 def test_commands_report_what_is_wrong_with_a_log(mimopilot, tmp_path, flight):
-    still = replace(flight, u=np.column_stack([flight.u[:, 0], np.zeros(len(flight.t))]))  # refused, and so at once
+    still = replace(flight, u=np.column_stack([flight.u[:, 0], np.zeros(len(flight.t))]))
     px4(tmp_path, still, [(17.0, "MC_ROLL_P", 5.0)])
     for command, begin in (("inspect", "warning: x.ulg: parameters changed"), ("advise", "x.ulg: ")):
         result = mimopilot(command, "x.ulg")

@@ -113,7 +113,7 @@ def test_a_value_repeated_over_rows_is_recognised_as_held(rows):
 def test_a_coarsely_quantised_signal_does_not_count_as_held():
     noise = np.round(np.random.default_rng(0).standard_normal((5000, 2)) * 0.7)
     assert held_samples(noise) == 1
-    # At rest for half of the time it is still fresh in every row.
+    # At rest for half of the time every row is still a new value.
     noise[2500:] = 0
     assert held_samples(np.random.default_rng(1).standard_normal((5000, 2)) * (noise != 0)) == 1
 
@@ -137,7 +137,7 @@ def test_slower_angles_decimate_every_signal_to_their_rate_by_the_same_filter(sl
     out = grid(u=both, y_i=fast, y_o=tone(uniform(20, slow), 5))
     assert out.Ts == pytest.approx(slow, rel=0.01)
     inner = slice(100, -100)
-    # What the slow rate cannot carry is gone from the fast signal, what it can is untouched and not delayed.
+    # Frequencies above the slow rate are removed from the fast signal; those below are neither changed nor delayed.
     time = 1.0 + out.Ts * np.arange(len(out.signals["u"]))
     assert out.signals["u"][inner] == pytest.approx(tone(time, 5).values[inner], abs=0.02)
     assert out.signals["y_i"][inner] == pytest.approx(tone(time, 5).values[inner], abs=0.01)

@@ -53,7 +53,7 @@ def test_content_decides_not_the_name(tmp_path, flight):
     assert_is(read_log(write_csv(tmp_path / "x.ulg", table(flight))), flight)
 
 
-FOREIGN = """
+OTHER_NAMES = """
 t = { column = "time", unit = "us" }
 u_pitch = { sign = -1 }
 p = { column = "gyro x", unit = "deg/s" }
@@ -76,7 +76,7 @@ def test_other_names_units_and_signs_are_converted(tmp_path, flight):
         **{name: np.degrees(own[name]) for name in ("roll", "roll_sp")},
         **{name: -np.degrees(own[name]) for name in ("pitch", "pitch_sp")},
     }
-    log = read_log(write_csv(tmp_path / "x.csv", foreign), columns(tmp_path, FOREIGN))
+    log = read_log(write_csv(tmp_path / "x.csv", foreign), columns(tmp_path, OTHER_NAMES))
     assert_is(log, flight, 1e-5)
 
 
@@ -279,7 +279,7 @@ def test_very_many_columns_give_a_short_message(tmp_path):
 
 
 def matlab(kind, shape, contents=b"", packed=False):
-    """A MATLAB file with one array of a class that claims a shape."""
+    """A MATLAB file with one array of a class with a declared shape."""
     flags = struct.pack("<IIII", 6, 8, kind, 0)
     sizes = struct.pack("<IIii", 5, 8, *shape)
     body = flags + sizes + struct.pack("<HHI", 1, 1, ord("u")) + contents

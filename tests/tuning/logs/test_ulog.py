@@ -1,4 +1,4 @@
-"""PX4 logs of every layout, written here; genuine ones are other people's data."""
+"""PX4 logs of every layout, written by the tests; recorded logs are other people's data."""
 
 import struct
 
@@ -120,7 +120,7 @@ def test_a_setpoint_published_between_two_cycles_is_used_by_the_second(tmp_path,
         "pitch": flight.t.astype(np.float32),
     }
     log = read_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight, vehicle_rates_setpoint=rates)))
-    # Torque is published 0.4 ms after its sample: the value of 2.5 ms is there for the next one.
+    # Torque is published 0.4 ms after its sample, so the setpoint at 2.5 ms is used by the next one.
     assert log.r_i[1:, 0] == pytest.approx(flight.t[:-1], abs=1e-5)
 
 

@@ -1,4 +1,4 @@
-"""Logs of what is not a multirotor are refused by name; a VTOL counts while it hovers."""
+"""Logs of other vehicles are refused with the vehicle type; of a VTOL the hover is used."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The measured response of an airframe, and its error, against the exact one."""
+"""The measured response of an airframe and its error beside the exact response."""
 
 from dataclasses import replace
 
@@ -42,7 +42,7 @@ def test_a_frame_mode_is_found_at_its_frequency(hz, gain):
     assert np.median(relative(plant.G_i, exact[:, :2])[top]) < 0.2
     size = np.linalg.norm(plant.G_i, axis=(1, 2))
     assert plant.omega[near][np.argmax(size[near])] == pytest.approx(w, rel=0.02)
-    # A rigid frame's response is a fraction of that there.
+    # The response of a rigid frame is much smaller there.
     rigid = linear_plant(load_airframe("adam0").airframe).frequency_response(np.array([w]))[:, :2]
     assert size[near].max() > 4 * np.linalg.norm(rigid)
 
@@ -61,7 +61,7 @@ def test_the_error_is_that_of_repeated_flights():
             draws = [plant.draw(np.random.default_rng(k)).G_o[band] for plant in plants[:4] for k in range(32)]
             means = np.repeat([plant.G_o[band] for plant in plants[:4]], 32, axis=0)
             claimed = np.sqrt(np.mean(np.abs(np.array(draws) - means) ** 2, axis=0))
-        # Smoothing counts overlapping windows as half as many: it claims a little more than the spread.
+        # Smoothing counts overlapping windows as half as many: the error is slightly above the spread.
         assert 0.6 < np.median(spread / claimed) < 1.25
 
 
@@ -130,7 +130,7 @@ def test_a_small_gap_does_not_end_the_known_band_and_a_large_one_does():
 
 
 def test_interpolation_is_exact_for_a_damped_body():
-    """Exact for a body with damping, and near for a vehicle with motors."""
+    """Exact for a damped body, close for a vehicle with motors."""
     omega = np.arange(1.3, 100.0, 1.3)
     K = np.array([[80.0, -8.0], [-7.0, 90.0]])
     s = 1j * omega[:, None, None]

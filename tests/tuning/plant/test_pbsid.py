@@ -96,7 +96,7 @@ def test_the_prediction_leaves_the_innovation_and_the_simulation_the_noise():
 
 def test_segments_are_not_joined_across_a_gap():
     u, y, _ = closed_loop_data(6000, noise=1e-5)
-    y[3000:3100] = 1e3  # what is between segments must not matter
+    y[3000:3100] = 1e3  # samples between segments must not matter
     model = pbsid(u, y, TS, order=3, past=6, segments=[(0, 3000), (3100, 6000)])
     assert response_error(model.plant) < 1e-4
 
@@ -121,7 +121,7 @@ def test_windows_orders_and_data_that_cannot_work_are_refused():
 
 @pytest.fixture(scope="module", params=["coupled", "symmetric"])
 def genuine(request):
-    """A flight of the genuine PX4 and its response."""
+    """A PX4 flight and its response."""
     log = read_log(DATA / f"px4_sih_{request.param}.mat")
     return log, measured_plant(log)
 
@@ -141,7 +141,7 @@ def test_a_px4_flight_gets_an_order_that_fits_its_response(genuine):
 
 
 def test_a_given_order_that_diverges_is_refused(genuine):
-    """Whatever the order: its predictor is stable, or it is refused, and nothing overflows."""
+    """Any order has a stable predictor or is refused, and nothing overflows."""
     log, plant = genuine
     refused = 0
     for order in (1, 2, 3, 30):

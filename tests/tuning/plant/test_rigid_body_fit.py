@@ -1,4 +1,4 @@
-"""The rigid body in a measured response against inertias that are known."""
+"""Rigid-body fit of measured responses beside known inertias."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ OMEGA = np.arange(1.3, 90.0, 1.3)
 
 
 def exact(airframe, omega=OMEGA):
-    """The response of an airframe as a flight without any noise would show it."""
+    """The noise-free response of an airframe."""
     G, K = linear_plant(airframe).frequency_response(omega), len(omega)
     nothing = np.zeros((K, 6, 6)), np.zeros((K, 2, 2))
     return PlantResponse(omega, G[:, :2], G[:, 2:], *nothing, np.ones((K, 2)), TS)
@@ -56,7 +56,7 @@ def test_a_wrong_sign_or_exchanged_axes_show_in_the_fit():
 
 
 def test_the_deviation_is_that_of_repeated_noise():
-    """Errors of a tenth at every frequency, much above what the shape may be off by; 40 repetitions."""
+    """Errors of 10 % at every frequency, much above the shape error; 40 repetitions."""
     plant = exact(load_airframe("adam0").airframe)
     size = np.linalg.norm(plant.G_i, axis=(1, 2))
     root = np.zeros((len(size), 6, 6))
@@ -65,7 +65,7 @@ def test_the_deviation_is_that_of_repeated_noise():
     rng = np.random.default_rng(0)
     found = [rigid_body(noisy.draw(rng)) for _ in range(40)]
     claimed = np.mean([body.deviation for body in found], axis=0)
-    # Elements that are nearly zero have no shape to be mistaken in: their spread is that of the noise alone.
+    # Nearly zero elements have no shape error: their spread is that of the noise alone.
     spread = np.std([body.B for body in found], axis=0)
     assert spread[[0, 1], [1, 0]] == pytest.approx(claimed[[0, 1], [1, 0]], rel=0.4)
     determinants = np.array([body.determinant() for body in found])
