@@ -177,7 +177,18 @@ class RunSampler:
             factor = amplitude / self.amplitude_deg
         drawn = (self._fault(i, fault, values) for i, fault in enumerate(self.variation.fault))
         faults = (*self.scenario.faults, *drawn)
-        return Draw(run, values, plant, _initial_state(plant, values), delay, angle, rate, factor, faults, attempt)
+        return Draw(
+            run=run,
+            values=values,
+            plant=plant,
+            state=_initial_state(plant, values),
+            delay=delay,
+            angle_deviation=angle,
+            rate_deviation=rate,
+            factor=factor,
+            faults=faults,
+            rejected=attempt,
+        )
 
     def _plant(self, values: dict[str, float]) -> PlantParameters:
         changes: dict[str, Any] = {field: values[name] for name, field in PLANT.items() if name in values}

@@ -294,15 +294,15 @@ def optimum(study: AttitudeStudy) -> dict[str, Gains]:
     plant = plant.at((low <= plant.omega) & (plant.omega <= high)).interpolated(DENSE)
     vehicle, _, library = _vehicle_and_library(study.airframe)
     task = OptimumTask(
-        vehicle.airframe,
-        library,
-        doublets,
-        study.models(BEST, log.Ts)[1],
-        plant,
-        body,
-        DEFAULT_THRESHOLDS.thin_Ms - float(np.median(errors)),
-        [float(rms) for rms in np.median(spent, axis=0)],
-        INTEGRAL * float(body.least(found[0][MIMO].Ki_i)),
+        airframe=vehicle.airframe,
+        library=library,
+        doublets=doublets,
+        outer=study.models(BEST, log.Ts)[1],
+        plant=plant,
+        body=body,
+        peak=DEFAULT_THRESHOLDS.thin_Ms - float(np.median(errors)),
+        effort=[float(rms) for rms in np.median(spent, axis=0)],
+        integral=INTEGRAL * float(body.least(found[0][MIMO].Ki_i)),
     )
     best = best_gains(task, [found[0][AUTOTUNE], *(gains[REFINED] for gains in found)])
     return {BEST: best, BOUND: best_gains(replace(task, effort=None), [best])}

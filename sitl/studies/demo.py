@@ -139,7 +139,16 @@ def run_demo(out: Path, seed: int) -> DemoSummary:
     with _stage("report"):
         _write_report(report, gains, figures, flights, flight)
     samples = len(flights["roll"]["mimo"].record)
-    return DemoSummary(paths, gains, figures, report, log, samples, speed, time.monotonic() - begin)
+    return DemoSummary(
+        paths=paths,
+        gains=gains,
+        figures=figures,
+        report=report,
+        log=log,
+        mavlink_samples=samples,
+        mavlink_speed=speed,
+        seconds=time.monotonic() - begin,
+    )
 
 
 def _controller(gains: Gains, folder: Path) -> NativeController:

@@ -121,7 +121,7 @@ class _DataflashLog:
     def timed(self, message: str, names: Sequence[str]) -> list[NDArray[Any]] | None:
         """Time (s) and fields of a message, one row a message; None when it is not logged with them.
 
-        Events of ArduCopter 3.3 and older have no time: that of the last RATE or ATT before them stands in.
+        Events of ArduCopter 3.3 and older have no time: the time of the last RATE or ATT before them is used.
         """
         values = self.file.fields(message, names)
         time = self._clock(message)

@@ -192,7 +192,13 @@ class StateSequence:
         plant = StateSpace(ABK[:, :order], ABK[:, order : order + n_u], CD[:, :order], D, self.Ts)
         covariance = e.T @ e / (len(x) - self.needed)
         return IdentifiedModel(
-            plant, ABK[:, order + n_u :], self.singular_values, covariance, self.past, self.future, len(x)
+            plant=plant,
+            K=ABK[:, order + n_u :],
+            singular_values=self.singular_values,
+            covariance=covariance,
+            past=self.past,
+            future=self.future,
+            samples=len(x),
         )
 
 
@@ -238,7 +244,20 @@ def state_sequence(
     ends = np.cumsum([b - a - past for a, b in parts]) - 1
     followed = np.setdiff1d(np.arange(count), ends)
     full_u = np.vstack([u[a + past : b] for a, b in parts])
-    return StateSequence(Q, U, s, now_u, now_y, w, full_u, followed, past, f, needed, Ts)
+    return StateSequence(
+        Q=Q,
+        U=U,
+        singular_values=s,
+        now_u=now_u,
+        now_y=now_y,
+        w=w,
+        full_u=full_u,
+        followed=followed,
+        past=past,
+        future=f,
+        needed=needed,
+        Ts=Ts,
+    )
 
 
 def _past(u: Signal, y: Signal, past: int) -> Signal:

@@ -181,7 +181,7 @@ def model_toml(model: IdentifiedModel, log_sha256: str) -> str:
     """The model as TOML text: Ts (s), A, B, C, D, K, windows, and the hash of the log."""
     rows = {name: getattr(model.plant, name).tolist() for name in "ABCD"} | {"K": model.K.tolist()}
     lines = [
-        "# x(k+1) = A x + B u + K e, y = C x + D u + e; u dimensionless moment, y body rates in rad/s",
+        "# x(k+1) = A x + B u + K e, y = C x + D u + e; u torque (normalised), y body rates in rad/s",
         "version = 1",
         f"Ts = {model.plant.Ts!r}",
         f"past = {model.past}",
