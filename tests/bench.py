@@ -28,7 +28,7 @@ from mimopilot.sitl.mavlink.wire.fast_codec import SENSOR, LeanCodec
 from mimopilot.sitl.mavlink.wire.link import Codec
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY
-from mimopilot.sitl.studies.fault_table import standard_faults
+from mimopilot.sitl.studies.standard_faults import standard_faults
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.logs.reader import read_log
 

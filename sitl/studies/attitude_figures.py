@@ -12,8 +12,9 @@ from mimopilot.sitl.flight.figures import STYLES
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS, reference_responses
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.flight.simulator import Flight
-from mimopilot.sitl.studies.attitude import MIMO, REFINED, SISO, AttitudeRun, AttitudeStudy
-from mimopilot.sitl.studies.attitude_runs import StudyStatistics
+from mimopilot.sitl.studies.attitude_run import AttitudeRun
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
+from mimopilot.sitl.studies.attitude_study import MIMO, REFINED, SISO, AttitudeStudy
 from numpy.typing import NDArray
 
 #: Method -> (colour, line style) and marker.

@@ -9,18 +9,6 @@ import numpy as np
 from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.sitl.studies.attitude import (
-    AUTOTUNE,
-    BEST,
-    BOUND,
-    DEFAULT,
-    EFFORT_RATIO,
-    MIMO,
-    REFINED,
-    SISO,
-    SISO_OWN,
-    AttitudeStudy,
-)
 from mimopilot.sitl.studies.attitude_figures import (
     COSTS,
     ELEMENTS,
@@ -32,7 +20,19 @@ from mimopilot.sitl.studies.attitude_figures import (
     motors_figure,
     tracking_figure,
 )
-from mimopilot.sitl.studies.attitude_runs import StudyStatistics
+from mimopilot.sitl.studies.attitude_run import EFFORT_RATIO
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
+from mimopilot.sitl.studies.attitude_study import (
+    AUTOTUNE,
+    BEST,
+    BOUND,
+    DEFAULT,
+    MIMO,
+    REFINED,
+    SISO,
+    SISO_OWN,
+    AttitudeStudy,
+)
 
 from mimopilot.common.html_report import Section, Table
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mimopilot.sitl.flight.scenario import AXES
-from mimopilot.sitl.studies.attitude import BEST, MIMO, REFINED, SISO
-from mimopilot.sitl.studies.attitude_runs import StudyStatistics
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
+from mimopilot.sitl.studies.attitude_study import BEST, MIMO, REFINED, SISO
 
 from mimopilot.common.html_report import Table
 

@@ -12,22 +12,18 @@ from typing import Any
 import numpy as np
 from mimopilot.codegen.native import NativeController, NativeLibrary, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
-from mimopilot.sitl.faults.kinds import Fault, parse_fault
+from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.sitl.flight.fault_recovery import Recovery, recovery
 from mimopilot.sitl.flight.scenario import Scenario, make_scenario
 from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
+from mimopilot.sitl.studies.standard_faults import standard_faults
 
-from mimopilot.common.console import print_table, progress_console
+from mimopilot.common.console import progress_console
 from mimopilot.common.intervals import wilson
 from mimopilot.common.parallel import processes, run_all
 
-AT = 1.1  # s: time of the faults, 0.1 s after the start of the manoeuvre
 TAIL_S = 5.0  # s of level flight after the manoeuvre: long enough to lose an unstable vehicle in the flight
-COLUMNS = (
-    *("fault", "gains", "survived", "95 %", "peak [deg]", "worst", "RMS", "recovered [s]"),
-    *("saturated", "detected [s]", "non-finite"),
-)
 
 
 @dataclass(frozen=True)
@@ -133,33 +129,6 @@ class FaultTable:
     def nonfinite(self) -> int:
         """Number of non-finite outputs in all flights."""
         return sum(row.nonfinite for row in self.rows)
-
-
-def standard_faults(airframe: Airframe) -> tuple[Fault, ...]:
-    """The standard faults with their sizes: a vehicle should survive or detect each."""
-    x, y, z = (0.8 * place for place in airframe.rotors[2].position)
-    load = round(0.11 * airframe.mass, 3)
-    tick = "0.001"  # s, shorter than a period: one sample
-    texts = (
-        *(f"motor:3={share}@{AT}" for share in (0.9, 0.7, 0.5, 0)),
-        f"battery=0.8@{AT}+0.5",
-        f"mass:{x:.4g},{y:.4g},{z:.4g}={load}@{AT}",
-        *(f"delay={size}@{AT}" for size in (0.02, 0.028, 0.036)),
-        f"jitter=0.02@{AT}",
-        f"loss=0.5@{AT}",
-        f"duplicate=0.5@{AT}",
-        f"skip=5@{AT}",
-        f"clock=0.1@{AT}",
-        f"link@{AT}+0.2",
-        f"stale@{AT}+1",
-        *(f"gyro-stuck@{AT}+{length}" for length in (0.1, 0.2, 0.4)),
-        f"gyro-bias:roll=0.2@{AT}",
-        f"gyro-noise=0.1@{AT}",
-        f"gyro-nan@{AT}+{tick}",
-        f"gyro-nan@{AT}+0.2",
-        *(f"gain:Kp_i={factor}@{AT}" for factor in (0.25, 0.5, 2, 4)),
-    )
-    return tuple(map(parse_fault, texts))
 
 
 class FaultFlights:
@@ -296,35 +265,3 @@ def _replay(request: FaultTableRequest, fault: Fault, path: Path | None, seed: i
     words += ["--period-s", repr(request.period_s), "--tail-s", repr(TAIL_S)]
     words += ["--fault", str(fault), "--seed", str(seed)]
     return shlex.join(words)
-
-
-def print_fault_table(table: FaultTable) -> None:
-    """Print the table, the flights without faults, and the commands that repeat the worst flights."""
-    print_table(table.title, COLUMNS, [_cells(row) for row in table.rows])
-    for name, lost in table.lost_without.items():
-        runs = next(row.runs for row in table.rows if row.gains == name)
-        print(f"without faults, {name}: {lost} of {runs} lost, {table.alarms_without[name]} with a false alarm")
-    print("commands to repeat the worst flights:")
-    for row in table.rows:
-        print(f"  {row.replay}")
-
-
-def _cells(row: FaultTableRow) -> list[str]:
-    low, high = row.survival_interval
-
-    def some(value: float | None, count: int) -> str:
-        return "-" if value is None else f"{value:.3f}" + ("" if count == row.runs else f" ({count})")
-
-    return [
-        row.fault,
-        row.gains,
-        f"{row.survived}/{row.runs}",
-        f"{low:.2f}-{high:.2f}",
-        f"{row.peak_deg:.2f}",
-        f"{row.worst_peak_deg:.2f}",
-        f"{row.rms_deg:.2f}",
-        some(row.recovery_s, row.recovered),
-        f"{row.saturated:g}",
-        some(row.detected_s, row.detected) + f" {row.detected_by}".rstrip(),
-        str(row.nonfinite),
-    ]

@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mimopilot.sitl.studies.attitude import studies
 from mimopilot.sitl.studies.attitude_report import COMPARABILITY, study_figures, study_sections
-from mimopilot.sitl.studies.attitude_runs import StudyStatistics, run_studies
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics, run_studies
+from mimopilot.sitl.studies.attitude_study import studies
 from mimopilot.sitl.studies.benchmark_studies import study_lv100, study_numerical_example
 from mimopilot.sitl.studies.expectations import expectations, expectations_table
 from mimopilot.sitl.studies.report_part import ReportPart

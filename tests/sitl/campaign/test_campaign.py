@@ -363,7 +363,7 @@ def test_another_campaign_in_the_same_folder_is_refused_with_the_difference(vehi
         assert words in str(error.value)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     (tmp_path / "spec.toml").unlink()
-    with pytest.raises(SitlError, match="holds results, but no spec"):
+    with pytest.raises(SitlError, match="holds results but no spec"):
         run_campaign(plan_of(vehicle, runs=2, axes=["roll"]), tmp_path, 1)
 
 

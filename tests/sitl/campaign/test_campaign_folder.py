@@ -70,7 +70,7 @@ def test_any_damage_of_a_part_leaves_the_results_the_same(flown, tmp_path, capsy
 
 def test_undamaged_parts_are_not_flown_again(flown, tmp_path, capsys, monkeypatch):
     plan, results, parts = flown
-    monkeypatch.setattr("mimopilot.sitl.campaign.execution._fly", None)
+    monkeypatch.setattr("mimopilot.sitl.campaign.execution._fly_chunks", None)
     assert run_campaign(plan, begin(plan, tmp_path, dict(enumerate(parts))), 1).read_bytes() == results
     assert capsys.readouterr().err == ""
 
@@ -104,7 +104,7 @@ def test_damage_between_flight_and_merge_is_reported(flown, tmp_path, monkeypatc
     plan, _, parts = flown
     folder = begin(plan, tmp_path, dict(enumerate(parts)))
     (folder / PARTS / "0000002.part").write_bytes(parts[2][:-1])
-    monkeypatch.setattr("mimopilot.sitl.campaign.execution._missing", lambda *_: [])
+    monkeypatch.setattr("mimopilot.sitl.campaign.execution._find_missing_chunks", lambda *_: ([], []))
     with pytest.raises(SitlError, match=r"0000002\.part is damaged; give the same command again"):
         run_campaign(plan, folder, 1)
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.sitl.studies.attitude import AUTOTUNE, BEST, BOUND, MIMO, REFINED, SISO, SISO_OWN, experiment, studies
 from mimopilot.sitl.studies.attitude_report import study_sections
-from mimopilot.sitl.studies.attitude_runs import run_once, run_studies
+from mimopilot.sitl.studies.attitude_run import experiment
+from mimopilot.sitl.studies.attitude_statistics import run_once, run_studies
+from mimopilot.sitl.studies.attitude_study import AUTOTUNE, BEST, BOUND, MIMO, REFINED, SISO, SISO_OWN, studies
 from mimopilot.sitl.studies.autotune import autotune, identify_arx, minimum_variance_pid
 from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.sitl.studies.expectations import EFFORT, expectations

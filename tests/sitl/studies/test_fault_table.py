@@ -13,7 +13,8 @@ from mimopilot.sitl.flight.fault_recovery import recovery
 from mimopilot.sitl.flight.scenario import hover
 from mimopilot.sitl.flight.simulator import TRUTH, Flight
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.sitl.studies.fault_table import FaultTableRequest, fault_table, standard_faults
+from mimopilot.sitl.studies.fault_table import FaultTableRequest, fault_table
+from mimopilot.sitl.studies.standard_faults import standard_faults
 from scipy.stats import binomtest
 
 from tests.conftest import assert_one_clear_line

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mimopilot.sitl.studies.attitude import AttitudeRun, AttitudeStudy, numbers, optimum, run
+from mimopilot.sitl.studies.attitude_run import AttitudeRun, numbers, optimum, run
+from mimopilot.sitl.studies.attitude_study import AttitudeStudy
 from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
