@@ -1,4 +1,4 @@
-"""`make bench`: what is measured rather than tested, each figure beside what it is compared with, in one run."""
+"""`make bench`: measured speeds, each beside its reference, in one run."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from mimopilot.sitl.mavlink.wire.fast_codec import ARMED, SENSOR, FastCodec
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY
-from mimopilot.sitl.studies.faults import standard_faults
+from mimopilot.sitl.studies.standard_faults import standard_faults
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.logs.reader import read_log
 
@@ -48,7 +48,7 @@ def command(*arguments: str) -> Callable[[], object]:
 
 
 def upload_seconds(round_trip: float) -> float:
-    """A 25-parameter upload to a scripted vehicle over loopback, from its first HEARTBEAT to its stored set, s."""
+    """A 25-parameter upload to a scripted vehicle over loopback, from its first HEARTBEAT to the stored set, s."""
     new = {f"MIMO_X_{i:02d}": single(0.1 * i + 0.05) for i in range(25)}
     vehicle = ScriptedVehicle(dict.fromkeys(new, 0.0))
     with UdpVehicle(vehicle, delay=round_trip) as link:
@@ -66,7 +66,7 @@ def upload_seconds(round_trip: float) -> float:
 
 
 def fault_rows() -> list[list[str]]:
-    """How long the table of faults takes, by its command."""
+    """Duration of the `faults` command."""
     runs, faults = 40, len(standard_faults(load_airframe("adam0").airframe))
     seconds = best(command("faults", "adam0", "--runs", str(runs)), 2)
     title = f"mimopilot faults, {runs * faults} flights with faults and {runs} without, start included"
@@ -74,10 +74,10 @@ def fault_rows() -> list[list[str]]:
 
 
 def plant_rows(airframe: Airframe) -> list[list[str]]:
-    """What one period costs the plant process, its body and its messages apart, and what lean messages save."""
+    """Time of one period in the plant process: vehicle and messages separately, and what the fast codec saves."""
     vehicle = SimulatedVehicle(airframe, TS, 0, 10.0, print)
     hover = [vehicle.simulator.plant.mass * GRAVITY / (4 * airframe.motors.thrust_max)] * 16
-    lean, generic, periods = FastCodec(1, 1), Codec(), 2000
+    codec, generic, periods = FastCodec(1, 1), Codec(), 2000
 
     def repeat(work: Callable[[], object]) -> Callable[[], object]:
         return lambda: [work() for _ in range(periods)]
@@ -87,13 +87,13 @@ def plant_rows(airframe: Airframe) -> list[list[str]]:
     vehicle.periods = 1  # neither the first nor every 25th
     messages = best(repeat(vehicle.messages)) / periods
     fields = (1, *[0.5] * 13, 63, 0)
-    data = lean.pack(SENSOR, *fields)
-    fast = best(repeat(lambda: lean.parse(lean.pack(SENSOR, *fields)))) / periods
+    data = codec.pack(SENSOR, *fields)
+    fast = best(repeat(lambda: codec.parse(codec.pack(SENSOR, *fields)))) / periods
     slow = best(repeat(lambda: [list(generic.parse(data)), generic.pack(SENSOR(*fields))])) / periods
     return [
         ["one period of the plant process: body, ground, estimate", f"{body * 1e6:.0f} us", ""],
         ["its messages: instruments read, HIL_SENSOR and HIL_STATE_QUATERNION packed", f"{messages * 1e6:.0f} us", ""],
-        ["HIL_SENSOR packed and parsed, lean", f"{fast * 1e6:.1f} us", f"pymavlink {slow * 1e6:.0f} us"],
+        ["HIL_SENSOR packed and parsed, fast codec", f"{fast * 1e6:.1f} us", f"pymavlink {slow * 1e6:.0f} us"],
     ]
 
 

@@ -1,4 +1,4 @@
-"""Speed and memory of campaigns, and another simulator beside them, in one run; part of `make bench`."""
+"""Speed and memory of campaigns beside another simulator; part of `make bench`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from mimopilot.sitl.campaign.flights import Stand
+from mimopilot.sitl.campaign.flights import FlightRunner
 from mimopilot.sitl.campaign.plan import plan_from_files, read_files
 
 from mimopilot.common.parallel import cores
@@ -31,7 +31,7 @@ attitude_deg.roll = { normal = [0.0, 5.0] }
 
 
 def campaign_rows(folder: Path) -> list[list[str]]:
-    """Rows (what, figure, beside): a campaign by its command, and its memory beside that of a small one."""
+    """Rows (what, figure, beside): a campaign by its command, and its memory beside that of a smaller one."""
     spec = folder / "vary.toml"
     spec.write_text(VARY)
     seconds, large = _campaign(folder, spec, RUNS)
@@ -47,7 +47,7 @@ def campaign_rows(folder: Path) -> list[list[str]]:
 
 
 def _campaign(folder: Path, spec: Path, runs: int) -> tuple[float, float]:
-    """Seconds that the command takes, and the memory of its largest process, MB."""
+    """Duration of the command, s, and memory of its largest process, MB."""
     line = [sys.executable, "-m", "mimopilot", "campaign", "adam0", "--runs", str(runs), "--axis", "roll"]
     line += ["--period-s", "1.5", "--vary", str(spec), "--out", str(folder / f"campaign-{runs}")]
     begin = time.perf_counter()
@@ -59,22 +59,22 @@ def _campaign(folder: Path, spec: Path, runs: int) -> tuple[float, float]:
 
 
 def _parts(folder: Path) -> tuple[str, str]:
-    """Where the time of one flight of a campaign goes, and what it is in all."""
-    stand = Stand(plan_from_files(read_files(folder)))
-    seed, noise = stand.plan.description.seed, stand.noise
-    draw = stand.draw(0)
-    flight = stand.fly(draw, "default", 0)
+    """Duration of one flight of a campaign, by parts and in total."""
+    runner = FlightRunner(plan_from_files(read_files(folder)))
+    seed, noise = runner.plan.description.seed, runner.noise
+    draw = runner.draw(0)
+    flight = runner.fly(draw, "default", 0)
     seconds = (
-        best(lambda: stand.variator.draw(seed, 0), 50),
+        best(lambda: runner.sampler.draw(seed, 0), 50),
         best(lambda: np.random.default_rng([seed, 0, 1]).standard_normal(out=noise), 50),
-        best(lambda: stand.fly(draw, "default", 0), 50),
-        best(lambda: stand.row(0, draw, "default", "roll", flight), 50),
+        best(lambda: runner.fly(draw, "default", 0), 50),
+        best(lambda: runner.row(0, draw, "default", "roll", flight), 50),
     )
     return " + ".join(f"{part * 1e6:.0f}" for part in seconds) + " us", f"{sum(seconds) * 1e6:.0f} us"
 
 
 def rotorpy_rows(speed: float) -> list[list[str]]:
-    """A row for rotorpy, where it is installed: one Runge-Kutta step of 1 ms as here, without any controller.
+    """A row for rotorpy if it is installed: one Runge-Kutta step of 1 ms as here, without a controller.
 
     Parameters
     ----------

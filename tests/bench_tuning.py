@@ -1,4 +1,4 @@
-"""Speed of the estimators, each beside what it is compared with, in one run; part of `make bench`."""
+"""Speed of the estimators, each beside its reference; part of `make bench`."""
 
 from __future__ import annotations
 
@@ -45,15 +45,15 @@ def tuning_rows(experiment: Experiment) -> list[list[str]]:
 
 def _cascade(experiment: Experiment) -> list[list[str]]:
     N, Ts = len(experiment.u), experiment.Ts
-    lean = load_spec(weight="identity", instrument="u", trim=False, window=50)
+    plain = load_spec(weight="identity", instrument="u", trim=False, window=50)
     spec = load_spec()
-    inner, outer = (lean.models(loop, Ts) for loop in ("inner", "outer"))
+    inner, outer = (plain.models(loop, Ts) for loop in ("inner", "outer"))
     cutoff = experiment.flown.derivative_cutoff_hz
     begin = time.perf_counter()
     oracle = literal_cascade(experiment.u, experiment.y_i, experiment.y_o, inner[0], outer[0], Ts, cutoff, 50)
     literal = time.perf_counter() - begin
-    fast = best(lambda: estimate(experiment, lean), 20)
-    found = estimate(experiment, lean).gains
+    fast = best(lambda: estimate(experiment, plain), 20)
+    found = estimate(experiment, plain).gains
     apart = max(
         np.abs(getattr(found, name) - matrix).max() / np.abs(matrix).max()
         for name, matrix in zip(("Kp_i", "Ki_i", "Kd_i", "Kp_o"), oracle, strict=True)
@@ -76,14 +76,14 @@ def _cascade(experiment: Experiment) -> list[list[str]]:
 
 
 def _long(experiment: Experiment) -> list[list[str]]:
-    lean = load_spec(weight="identity", instrument="u", trim=False, window=50)
+    plain = load_spec(weight="identity", instrument="u", trim=False, window=50)
     times = {}
     for N in (100_000, 1_000_000):
         repeats = N // len(experiment.u)
         names = ("u", "u_bar", "y_i", "y_o")
         signals = {name: np.tile(getattr(experiment, name), (repeats, 1)) for name in names}
         log = replace(experiment, **signals, r_o=None, r_i=None, segments=((0, repeats * len(experiment.u)),))
-        times[N] = best(lambda log=log: estimate(log, lean), 3)
+        times[N] = best(lambda log=log: estimate(log, plain), 3)
     default = best(lambda: estimate(log, load_spec()), 2)
     tracemalloc.start()
     estimate(log, load_spec())
@@ -118,7 +118,7 @@ def _against_pyvrft() -> list[list[str]]:
 
     slow, fast = best(theirs, 1), best(ours, 20)
     P = ours()["P"]
-    # Their order: row by row, P and I of each element.
+    # pyvrft orders row by row, P and I of each element.
     apart = np.abs(np.ravel(theirs()).reshape(2, 2, 2)[:, :, 0] - P).max() / np.abs(P).max()
     name = "2x2 PI of the numerical example, N = 10^4"
     return [

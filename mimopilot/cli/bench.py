@@ -31,28 +31,6 @@ SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
-#: Figure -> how it is called in tables.
-UNITS = {
-    "J_M_o": "J_M,o [rad^2]",
-    "J_M_i": "J_M,i [rad^2/s^2]",
-    "J_r_o": "J_r,o [rad^2]",
-    "J_r_i": "J_r,i [rad^2/s^2]",
-    "peak_deg": "peak [deg]",
-    "offaxis_peak_deg": "off-axis peak [deg]",
-    "offaxis_rms_deg": "off-axis RMS [deg]",
-    "effort_rms": "effort, RMS of u [-]",
-    "saturated": "saturated samples",
-    "crashed_at_s": "lost at [s]",
-    "deviation_peak_deg": "peak, from the flight without faults [deg]",
-    "deviation_rms_deg": "RMS, from the same [deg]",
-    "saturated_since": "saturated samples since the fault",
-    "recovery_s": "recovered after [s]",
-    "detected_s": "detected after [s]",
-    "detected_by": "detected by",
-    "nonfinite": "non-finite outputs",
-}
-
-
 def register(app: typer.Typer) -> None:
     """Add this room's commands to the front door."""
     app.command(epilog="Example: mimopilot experiment adam0 --seed 1 --out flight.ulg")(experiment)
@@ -255,7 +233,7 @@ def fly(
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.flight.fault_recovery import recovery
     from mimopilot.sitl.flight.flight_log import save_flight
-    from mimopilot.sitl.flight.metrics import performance
+    from mimopilot.sitl.flight.metrics import FIGURE_LABELS, performance
     from mimopilot.sitl.flight.scenario import AXES
     from mimopilot.sitl.flight.simulator import fly as fly_scenario
 
@@ -275,7 +253,7 @@ def fly(
     if as_json:
         print_json({"airframe": body.name, "scenario": task.name, "axis": AXES[task.axis], "seed": seed, **figures})
     else:
-        rows = [[UNITS[name], _text(value)] for name, value in figures.items() if name in UNITS]
+        rows = [[FIGURE_LABELS[name], _text(value)] for name, value in figures.items() if name in FIGURE_LABELS]
         title = (
             f"{body.name}, {task.name} on {AXES[task.axis]}, against {inner.label} (inner) and {outer.label} (outer)"
         )

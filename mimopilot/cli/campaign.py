@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 
 from mimopilot.cli.bench import (
-    UNITS,
     AirframeArgument,
     AmplitudeOption,
     FaultOption,
@@ -57,15 +56,15 @@ def campaign(
     from mimopilot.common.console import json_text, print_json, print_table
     from mimopilot.common.files import inside, write_atomically
     from mimopilot.common.parallel import cores
+    from mimopilot.sitl.campaign.campaign_figures import parse_map
     from mimopilot.sitl.campaign.execution import run_campaign
-    from mimopilot.sitl.campaign.figures import parse_map
     from mimopilot.sitl.campaign.plan import SUMMARY, make_plan
     from mimopilot.sitl.campaign.report import INTERVALS, write_campaign_report
     from mimopilot.sitl.campaign.summary import (
         FIGURE_COLUMNS,
         SURVIVAL_COLUMNS,
         WORST_COLUMNS,
-        Results,
+        CampaignResults,
         figure_rows,
         survival_rows,
         worst_rows,
@@ -83,7 +82,7 @@ def campaign(
         vary=read_variation(vary) if vary else {},
     )
     over = parse_map(plan, survival_map) if survival_map else None
-    results = Results(plan, run_campaign(plan, out, workers or cores(), scheduler))
+    results = CampaignResults(plan, run_campaign(plan, out, workers or cores(), scheduler))
     summary = results.summarise()
     write_atomically(inside(out, SUMMARY), json_text(summary.as_json(".")))
     report = write_campaign_report(results, summary, over)
@@ -130,16 +129,17 @@ def replay(
 ) -> None:
     """Fly one run of a campaign again: the same flight, bit for bit. Exit code 1: it is another one here."""
     from mimopilot.common.console import print_json, print_table
-    from mimopilot.sitl.campaign.replay import fly_again
+    from mimopilot.sitl.campaign.replay import replay_flight
     from mimopilot.sitl.flight.flight_log import save_flight
+    from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 
-    again = fly_again(folder, run, gains, axis)
+    again = replay_flight(folder, run, gains, axis)
     if out is not None:
         save_flight(out, again.flight, again.plan.airframe, again.plan.gains[again.row["gains"]])
     if as_json:
         print_json(again.row)
     else:
-        rows = [[UNITS.get(name, name), _shown(value)] for name, value in again.row.items()]
+        rows = [[FIGURE_LABELS.get(name, name), _shown(value)] for name, value in again.row.items()]
         print_table(f"{again.plan.airframe.name}, run {run} of {folder}", ["figure", "value"], rows)
     again.compare()
 

@@ -80,10 +80,11 @@ def faults(
     from mimopilot.common.parallel import cores
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.faults.kinds import parse_fault
-    from mimopilot.sitl.studies.faults import Request, fault_table, print_fault_table
+    from mimopilot.sitl.studies.fault_table import FaultTableRequest, fault_table
+    from mimopilot.sitl.studies.fault_table_report import print_fault_table
 
     wanted = tuple(map(parse_fault, fault or ()))
-    request = Request(airframe, tuple(gains or ()), axis or "roll", amplitude_deg, period_s, wanted)
+    request = FaultTableRequest(airframe, tuple(gains or ()), axis or "roll", amplitude_deg, period_s, wanted)
     table = fault_table(request, range(seed, seed + runs), workers or cores())
     if as_json:
         print_json(table.as_json())

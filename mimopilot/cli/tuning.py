@@ -286,7 +286,7 @@ def identify(
     """Identify the plant from control moment to body rates (PBSID, closed loop)."""
     from mimopilot.common.files import write_atomically
     from mimopilot.tuning.plant.frequency_response import measured_plant
-    from mimopilot.tuning.plant.pbsid import identify_rates, model_toml
+    from mimopilot.tuning.plant.rates_model import identify_rates, model_toml
 
     experiment = read_warned(log, columns)
     found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)

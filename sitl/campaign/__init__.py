@@ -1,1 +1,1 @@
-"""Campaigns: many flights of a vehicle that varies, under several gain sets, on all cores or many machines."""
+"""Campaigns: Monte Carlo flights of a varied vehicle with several gain sets, on all cores or many machines."""

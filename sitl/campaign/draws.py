@@ -1,4 +1,4 @@
-"""Drawing the vehicle of a run: reproducible, and never one that could not exist."""
+"""Random draw of the vehicle of each run: reproducible, and only physically possible vehicles."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mimopilot.sitl.physics.airframe import MAX_HOVER, Airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, hover_state, is_physical_inertia
 from numpy.typing import NDArray
 
-ATTEMPTS = 1000  # draws for one run before the specification is refused
-MAX_DELAY = 100  # samples
+ATTEMPTS = 1000  # impossible draws for one run before the specification is refused
+MAX_DELAY = 100  # samples: 0.4 s at 250 Hz, beyond any flyable delay
 AXES = ("roll", "pitch", "yaw")
 MOMENTS, PRODUCTS, WIND = ("xx", "yy", "zz"), ("xy", "xz", "yz"), ("north", "east", "down")
-#: Drawn quantity -> field of the plant.
+#: Drawn quantity -> field of `PlantParameters`.
 PLANT = {
     "mass": "mass",
     "motors.thrust_max": "thrust_max",
@@ -33,12 +33,12 @@ PLANT = {
 }
 
 
-class ImpossibleError(Exception):
-    """A draw that no vehicle has, or that cannot hover: another is drawn."""
+class ImpossibleDrawError(Exception):
+    """A draw that no vehicle can have, or that cannot hover; it is repeated."""
 
 
-class Quantity(NamedTuple):
-    """One number that is drawn: its column, distribution, the airframe's own value, and whether it is a whole one."""
+class VariedQuantity(NamedTuple):
+    """One drawn number: column, distribution, the airframe's own value, and whether it is rounded to an integer."""
 
     name: str
     distribution: Distribution
@@ -48,25 +48,26 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """What one run flies.
+    """The vehicle and the conditions of one run.
 
     Attributes
     ----------
     run : int
     values : dict
-        Column -> what was drawn, in the specification's unit.
+        Column -> drawn value, in the unit of the specification.
     plant : PlantParameters
     state : (13 + n,) array
-        At the start, see `sitl.physics.rigid_body`.
+        Initial state, see `sitl.physics.rigid_body`.
     delay : int, samples
+        From measurement to motor command.
     angle_deviation, rate_deviation : float, rad, rad/s
-        Of the noise.
+        Standard deviations of the state estimate.
     factor : float
-        On the set-points.
+        On the setpoints.
     faults : tuple of Fault
-        Of the scenario and those drawn.
+        Those of the scenario and the drawn ones.
     rejected : int
-        Impossible draws before this one.
+        Number of impossible draws before this one.
     """
 
     run: int
@@ -81,22 +82,22 @@ class Draw:
     rejected: int
 
 
-class Variator:
-    """Draws runs of one airframe; run k depends on the seed and k alone.
+class RunSampler:
+    """Draws the runs of one airframe; run k depends only on the seed and k.
 
     Parameters
     ----------
     airframe : Airframe
-        What is varied.
+        The nominal vehicle.
     variation : Variation
-        How.
+        The distributions.
     scenario : Scenario
-        What is flown; its axis does not matter.
+        The flight; its axis does not matter.
 
     Raises
     ------
     SitlError
-        When the amplitude is to vary and there is none, or a fault of the scenario is not possible.
+        When the amplitude varies but the scenario has none, or a fault of the scenario is impossible.
     """
 
     def __init__(self, airframe: Airframe, variation: Variation, scenario: Scenario) -> None:
@@ -106,17 +107,17 @@ class Variator:
         self.seconds = len(scenario.setpoint) * scenario.Ts
         self.quantities = list(self._quantities())
         if variation.amplitude_deg is not None and self.amplitude_deg == 0:
-            raise SitlError("amplitude_deg: this scenario has no angle that could vary")
+            raise SitlError("amplitude_deg: this scenario has no amplitude; remove the entry, or fly a doublet or step")
         for fault in scenario.faults:
             check_fault(fault, airframe, scenario.Ts, self.seconds)
 
     def draw(self, seed: int, run: int) -> Draw:
-        """The vehicle of a run: the first possible one of a stream of draws.
+        """Draw the vehicle of a run: the first possible one of a stream of draws.
 
         Raises
         ------
         SitlError
-            When a thousand in a row are impossible: with the reason.
+            When `ATTEMPTS` draws in a row are impossible; gives the last reason.
         """
         generator = np.random.default_rng([seed, run, 0])
         for attempt in range(ATTEMPTS):
@@ -125,15 +126,17 @@ class Variator:
                 value = distribution.draw(generator, own)
                 values[name] = float(round(value)) if whole else value
             try:
-                return self._make(run, values, attempt)
-            except ImpossibleError as reason:
+                return self._run_of(run, values, attempt)
+            except ImpossibleDrawError as reason:
                 last = reason
-        raise SitlError(f"run {run}: {ATTEMPTS} draws in a row are of no vehicle that flies, the last because {last}")
+        raise SitlError(
+            f"run {run}: {ATTEMPTS} draws in a row are impossible, the last because {last}; narrow the distributions"
+        )
 
-    def _quantities(self) -> Iterator[Quantity]:
-        """All that varies, in the order in which it is drawn."""
+    def _quantities(self) -> Iterator[VariedQuantity]:
+        """All varied quantities, in the order in which they are drawn."""
         v, base, noise = self.variation, self.base, self.airframe.noise
-        inertia = {name: float(base.inertia[_place(name)]) for name in (*MOMENTS, *PRODUCTS)}
+        inertia = {name: float(base.inertia[_indices(name)]) for name in (*MOMENTS, *PRODUCTS)}
         motors = (base.thrust_max, base.motor_time_constant, base.torque_ratio)
         own = {
             "mass": base.mass,
@@ -153,38 +156,49 @@ class Variator:
         for name, distribution in named:
             if name == "motors.effectiveness":
                 for i in range(len(base.rotors)):
-                    yield Quantity(f"{name}.{i + 1}", distribution, 1.0, False)
+                    yield VariedQuantity(f"{name}.{i + 1}", distribution, 1.0, False)
             else:
-                yield Quantity(name, distribution, own.get(name, 0.0), name == "delay" or name.endswith(".motor"))
+                yield VariedQuantity(name, distribution, own.get(name, 0.0), name == "delay" or name.endswith(".motor"))
 
-    def _make(self, run: int, values: dict[str, float], attempt: int) -> Draw:
-        """The vehicle of the values drawn."""
+    def _run_of(self, run: int, values: dict[str, float], attempt: int) -> Draw:
+        """The run with the drawn values; refuses an impossible vehicle."""
         plant = self._plant(values)
         delay = int(values.get("delay", self.airframe.computing_delay))
         if not 0 <= delay <= MAX_DELAY:
-            raise ImpossibleError(f"the delay is {delay} samples, expected 0 to {MAX_DELAY}")
+            raise ImpossibleDrawError(f"the delay is {delay} samples, expected 0 to {MAX_DELAY}")
         angle = values.get("noise.angle", self.airframe.noise.angle)
         rate = values.get("noise.rate", self.airframe.noise.rate)
         if angle < 0 or rate < 0:
-            raise ImpossibleError("a standard deviation of the noise is negative")
+            raise ImpossibleDrawError("a standard deviation of the noise is negative")
         factor = 1.0
         if "amplitude_deg" in values:
             amplitude = values["amplitude_deg"]
             if not 0 <= amplitude <= math.degrees(MAX_TILT):
-                raise ImpossibleError(f"the amplitude is {amplitude:.4g} degrees, expected 0 to 60")
+                raise ImpossibleDrawError(f"the amplitude is {amplitude:.4g} degrees, expected 0 to 60")
             factor = amplitude / self.amplitude_deg
         drawn = (self._fault(i, fault, values) for i, fault in enumerate(self.variation.fault))
         faults = (*self.scenario.faults, *drawn)
-        return Draw(run, values, plant, _state(plant, values), delay, angle, rate, factor, faults, attempt)
+        return Draw(
+            run=run,
+            values=values,
+            plant=plant,
+            state=_initial_state(plant, values),
+            delay=delay,
+            angle_deviation=angle,
+            rate_deviation=rate,
+            factor=factor,
+            faults=faults,
+            rejected=attempt,
+        )
 
     def _plant(self, values: dict[str, float]) -> PlantParameters:
         changes: dict[str, Any] = {field: values[name] for name, field in PLANT.items() if name in values}
         for field, value in changes.items():
             if value < 0 or (value == 0 and field != "drag"):
-                raise ImpossibleError(f"{field} is {value:.4g}")
+                raise ImpossibleDrawError(f"{field} is {value:.4g}")
         if "rate_damping" in values:
             if values["rate_damping"] < 0:
-                raise ImpossibleError("the rate damping is negative")
+                raise ImpossibleDrawError("the rate damping is negative")
             changes["rate_damping"] = values["rate_damping"] * np.diag(np.array(self.airframe.inertia))
         inertia = self._inertia(values)
         if inertia is not None:
@@ -194,11 +208,11 @@ class Variator:
         plant = self.base._replace(effectiveness=np.array(effectiveness), wind=np.array(wind), **changes)
         weight, thrust = plant.mass * GRAVITY, plant.thrust_max * sum(effectiveness)
         if min(effectiveness) < 0 or weight > MAX_HOVER * thrust:
-            raise ImpossibleError(f"a weight of {weight:.4g} N against {thrust:.4g} N of thrust cannot hover")
+            raise ImpossibleDrawError(f"a weight of {weight:.4g} N against {thrust:.4g} N of thrust cannot hover")
         return plant
 
     def _inertia(self, values: dict[str, float]) -> NDArray[np.float64] | None:
-        """The tensor; None: the airframe's own."""
+        """The drawn inertia tensor, kg m^2, (3, 3); None when it does not vary."""
         own = self.base.inertia
         moments = [values.get(f"inertia.{name}") for name in MOMENTS]
         products = {name: values[f"products.{name}"] for name in PRODUCTS if f"products.{name}" in values}
@@ -206,13 +220,13 @@ class Variator:
             return None
         ratio = np.array([1.0 if m is None else m / own[i, i] for i, m in enumerate(moments)])
         if ratio.min() <= 0:
-            raise ImpossibleError("a moment of inertia is not positive")
+            raise ImpossibleDrawError("a moment of inertia is not positive")
         inertia: NDArray[np.float64] = own * np.sqrt(ratio[:, None] * ratio)
         for name, value in products.items():
-            i, j = _place(name)
+            i, j = _indices(name)
             inertia[i, j] = inertia[j, i] = value
         if not is_physical_inertia(inertia):
-            raise ImpossibleError(f"no body has the inertia {inertia.tolist()} kg m^2")
+            raise ImpossibleDrawError(f"no body has the inertia {inertia.tolist()} kg m^2")
         return inertia
 
     def _fault(self, i: int, fault: FaultVariation, values: dict[str, float]) -> Fault:
@@ -225,17 +239,17 @@ class Variator:
             made = make_fault(table, name)
             check_fault(made, self.airframe, self.scenario.Ts, self.seconds)
         except SitlError as error:
-            raise ImpossibleError(str(error)) from error
+            raise ImpossibleDrawError(str(error)) from error
         return made
 
 
-def _place(name: str) -> tuple[int, int]:
-    """Row and column of an element of the tensor."""
+def _indices(name: str) -> tuple[int, int]:
+    """Row and column of a tensor element such as "xy"."""
     return "xyz".index(name[0]), "xyz".index(name[1])
 
 
-def _state(plant: PlantParameters, values: dict[str, float]) -> NDArray[np.float64]:
-    """At the start: hovering, but for the attitude and the rates that were drawn."""
+def _initial_state(plant: PlantParameters, values: dict[str, float]) -> NDArray[np.float64]:
+    """Initial state: hover with the drawn attitude and rates."""
     state = hover_state(plant)
     angles, rates = ([values.get(f"{table}.{axis}", 0.0) for axis in AXES] for table in ("attitude_deg", "rates_deg_s"))
     if any(angles):

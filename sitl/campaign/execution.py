@@ -1,4 +1,4 @@
-"""Flying a campaign: chunks to workers, parts to disk, parts to one table; begun again where it was left."""
+"""Execution of a campaign: workers fly chunks of runs into part files, which are merged; resumes after a stop."""
 
 from __future__ import annotations
 
@@ -16,76 +16,76 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from mimopilot.sitl.campaign.flights import CHUNK, chunks, fly_chunk, label, stand_of
-from mimopilot.sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, Plan, settle
+from mimopilot.sitl.campaign.flights import CHUNK, chunk_count, flight_runner, fly_chunk, label
+from mimopilot.sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, CampaignPlan, write_plan_files
 from mimopilot.sitl.errors import SitlError
 
 from mimopilot.common.console import progress_console
 from mimopilot.common.files import inside, unseal, write_atomically
 from mimopilot.common.parallel import processes, run_all
 
-ROW_GROUP = 1 << 14  # rows: what is in memory at a time
-SHOWN = 3  # parts that one message names
-AGAIN = "give the same command again to go on"
+ROW_GROUP = 1 << 14  # rows of a Parquet row group: a few MB in memory at a time
+SHOWN = 3  # parts named in one message
+RESUME = "give the same command again to resume"
 
 
-def run_campaign(plan: Plan, folder: Path, workers: int, scheduler: str | None = None) -> Path:
-    """Fly all runs that are not flown yet, and merge them into one table.
+def run_campaign(plan: CampaignPlan, folder: Path, workers: int, scheduler: str | None = None) -> Path:
+    """Fly all missing runs, and merge all runs into one table.
 
     Parameters
     ----------
-    plan : Plan
-        What to fly.
+    plan : CampaignPlan
+        The campaign.
     folder : Path
-        Where its files and its results go; may hold a part of them from before.
+        For its files and results; may hold the parts of an earlier, unfinished execution.
     workers : int
         Processes on this machine.
     scheduler : str, optional
-        Address of a dask.distributed scheduler, whose workers are then used instead.
+        Address of a dask.distributed scheduler; its workers are used instead of local processes.
 
     Returns
     -------
     Path
-        The results: one Parquet file, the same bytes whatever the workers and however often it was begun.
+        The results: one Parquet file. Its bytes do not depend on the workers or on interruptions.
 
     Raises
     ------
     SitlError
-        When the folder holds another campaign, or one is being flown into it, when it was interrupted, or when
-        workers are lost.
+        When the folder holds another campaign or is in use, the execution was interrupted, or workers were lost.
     OSError
-        When a link lies where one of its files belongs, or a file cannot be written.
+        When a file would be written through a symbolic link, or cannot be written.
     """
     for name in (RESULTS, PARTS, SUMMARY, REPORT, *plan.files):
         inside(folder, name)
     results, parts = folder / RESULTS, folder / PARTS
-    if not results.is_file():  # compiles before workers are forked, and finds what is wrong before the folder is taken
-        list(stand_of(tuple(plan.files.items())).flights(0))
-    with _alone(folder):
-        settle(plan, folder)
+    if not results.is_file():  # compile before forking; find bad input before writing into the folder
+        list(flight_runner(tuple(plan.files.items())).flights(0))
+    with _folder_lock(folder):
+        write_plan_files(plan, folder)
         if not results.is_file():
-            missing = _missing(plan, parts)
+            missing, unusable = _find_missing_chunks(plan, parts)
+            _warn_of_unusable(parts, unusable)
             if missing:
-                _fly(plan, parts, missing, workers, scheduler)
+                _fly_chunks(plan, parts, missing, workers, scheduler)
             try:
-                _merge(plan, parts, results)
-            except _WrongPartError as error:  # whole a moment ago
-                raise SitlError(f"{parts}: {error}; {AGAIN}", exit_code=1) from error
+                _merge_parts(plan, parts, results)
+            except _UnusablePartError as error:  # changed since it was checked
+                raise SitlError(f"{parts}: {error}; {RESUME}", exit_code=1) from error
         shutil.rmtree(parts, ignore_errors=True)
     return results
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Keep other campaigns out of a folder; the lock ends with this process, however that ends."""
+def _folder_lock(folder: Path) -> Iterator[None]:
+    """Lock a folder against other campaigns; the lock ends with this process."""
     path = inside(folder, LOCK)
     folder.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as stream:
         try:
-            fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # of this process alone, not of the workers it forks
+            fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # forked workers do not inherit it
         except (BlockingIOError, PermissionError):
             raise SitlError(
-                f"{folder}: another process is flying a campaign into it; wait until it ends, or give another --out"
+                f"{folder}: another process writes a campaign into this folder; wait for it, or give another --out"
             ) from None
         yield
 
@@ -94,45 +94,49 @@ def _part(parts: Path, chunk: int) -> Path:
     return inside(parts, f"{chunk:07d}.part")
 
 
-def _missing(plan: Plan, parts: Path) -> list[int]:
-    """Chunks that are to be flown: their parts are not there, or not what they should be, which is told."""
-    missing, wrong = [], []
-    for chunk in range(chunks(plan)):
+def _find_missing_chunks(plan: CampaignPlan, parts: Path) -> tuple[list[int], list[str]]:
+    """Chunks without a usable part, and why the existing ones of them are unusable."""
+    missing, unusable = [], []
+    for chunk in range(chunk_count(plan)):
         if not _part(parts, chunk).is_file():
             missing.append(chunk)
             continue
         try:
-            _table(plan, parts, chunk)
-        except _WrongPartError as error:
+            _checked_table(plan, parts, chunk)
+        except _UnusablePartError as error:
             missing.append(chunk)
-            wrong.append(str(error))
-    if wrong:
-        more = f" and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
-        print(f"mimopilot: warning: {parts}: flown again: {'; '.join(wrong[:SHOWN])}{more}", file=sys.stderr)
-    return missing
+            unusable.append(str(error))
+    return missing, unusable
 
 
-class _WrongPartError(SitlError):
-    """A part that cannot be used."""
+def _warn_of_unusable(parts: Path, unusable: list[str]) -> None:
+    if unusable:
+        more = f" and {len(unusable) - SHOWN} more" if len(unusable) > SHOWN else ""
+        named = "; ".join(unusable[:SHOWN])
+        print(f"mimopilot: warning: {parts}: unusable parts are flown again: {named}{more}", file=sys.stderr)
 
 
-def _table(plan: Plan, parts: Path, chunk: int) -> pa.BufferReader:
-    """The Parquet file in a part, checked: whole, of this campaign, and of the runs of its chunk."""
+class _UnusablePartError(SitlError):
+    """A part file cannot be used."""
+
+
+def _checked_table(plan: CampaignPlan, parts: Path, chunk: int) -> pa.BufferReader:
+    """The table in a part file, after checking that it is complete and of this campaign and chunk."""
     path, wanted = _part(parts, chunk), label(plan, chunk)
     found = unseal(path.read_bytes())
     if found is None:
-        raise _WrongPartError(f"{path.name} is damaged")
+        raise _UnusablePartError(f"{path.name} is damaged")
     table, is_of = found
     if is_of != wanted:
         campaign, _, runs = is_of.partition(" ")
         whose = f"is of {runs}" if wanted.startswith(campaign) else "is of another campaign"
-        raise _WrongPartError(f"{path.name} {whose}")
+        raise _UnusablePartError(f"{path.name} {whose}")
     return pa.BufferReader(table)
 
 
-def _fly(plan: Plan, parts: Path, missing: list[int], workers: int, scheduler: str | None) -> None:
+def _fly_chunks(plan: CampaignPlan, parts: Path, missing: list[int], workers: int, scheduler: str | None) -> None:
     flights = len(plan.gains) * len(plan.scenarios)
-    flown = chunks(plan) - len(missing)
+    flown = chunk_count(plan) - len(missing)
     with _executor(workers, scheduler) as (executor, ahead), _progress(plan, flown) as advance:
 
         def keep(chunk: int, part: bytes) -> None:
@@ -145,14 +149,16 @@ def _fly(plan: Plan, parts: Path, missing: list[int], workers: int, scheduler: s
             run_all(executor, ahead, partial(fly_chunk, plan.files), missing, keep)
         except KeyboardInterrupt:
             runs = min(flown * CHUNK, plan.description.runs)
-            raise SitlError(f"ended after {runs} of {plan.description.runs} runs; {AGAIN}", exit_code=130) from None
+            raise SitlError(
+                f"interrupted after {runs} of {plan.description.runs} runs; {RESUME}", exit_code=130
+            ) from None
         except BrokenProcessPool:
-            raise SitlError(f"a worker process was killed, out of memory perhaps; {AGAIN}", exit_code=1) from None
+            raise SitlError(f"a worker process was killed, perhaps for lack of memory; {RESUME}", exit_code=1) from None
 
 
 @contextmanager
 def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, int]]:
-    """Where to fly, and how many chunks to hand over at a time."""
+    """The executor, and the number of chunks to queue in it."""
     if scheduler is None:
         with processes(workers) as executor:
             yield executor, 2 * workers
@@ -165,7 +171,9 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, i
     try:
         client = Client(scheduler, timeout=5)
     except (OSError, ValueError) as error:
-        raise SitlError(f"--scheduler {scheduler}: no scheduler answers there ({error})", exit_code=1) from error
+        raise SitlError(
+            f"--scheduler {scheduler}: no scheduler answers ({error}); check the address", exit_code=1
+        ) from error
     with client:
         threads = sum(client.ncores().values())
         if not threads:
@@ -173,15 +181,15 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, i
         try:
             yield client.get_executor(pure=False), 2 * threads
         except (KilledWorker, CancelledError, CommClosedError) as error:
-            raise SitlError(f"--scheduler {scheduler}: the cluster failed ({error}); {AGAIN}", exit_code=1) from error
+            raise SitlError(f"--scheduler {scheduler}: the cluster failed ({error}); {RESUME}", exit_code=1) from error
 
 
 @contextmanager
-def _progress(plan: Plan, flown: int) -> Iterator[Callable[[int], Any]]:
-    """A bar with the rate and the time left, on a terminal; yields what advances it by so many flights."""
+def _progress(plan: CampaignPlan, flown: int) -> Iterator[Callable[[int], Any]]:
+    """A progress bar on a terminal; yields a function that advances it by a number of flights."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    a_run = len(plan.gains) * len(plan.scenarios)
+    per_run = len(plan.gains) * len(plan.scenarios)
     columns = (
         BarColumn(),
         MofNCompleteColumn(),
@@ -189,7 +197,7 @@ def _progress(plan: Plan, flown: int) -> Iterator[Callable[[int], Any]]:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=progress_console(), transient=True) as bar:
-        task = bar.add_task("", total=plan.description.runs * a_run, completed=flown * CHUNK * a_run, rate="-")
+        task = bar.add_task("", total=plan.description.runs * per_run, completed=flown * CHUNK * per_run, rate="-")
 
         def advance(flights: int) -> None:
             speed = bar.tasks[0].speed
@@ -198,15 +206,15 @@ def _progress(plan: Plan, flown: int) -> Iterator[Callable[[int], Any]]:
         yield advance
 
 
-def _merge(plan: Plan, parts: Path, results: Path) -> None:
-    """All parts as one file, in order; only one row group is in memory at a time."""
-    whole, count = inside(parts, RESULTS), chunks(plan)
-    begin = pq.read_table(_table(plan, parts, 0))
-    schema, a_group = begin.schema, max(1, ROW_GROUP // begin.num_rows)
+def _merge_parts(plan: CampaignPlan, parts: Path, results: Path) -> None:
+    """Merge all parts into one file, in order, with one row group in memory at a time."""
+    whole, count = inside(parts, RESULTS), chunk_count(plan)
+    begin = pq.read_table(_checked_table(plan, parts, 0))
+    schema, per_group = begin.schema, max(1, ROW_GROUP // begin.num_rows)
     with pq.ParquetWriter(whole, schema, compression="zstd", write_page_checksum=True) as writer:
-        for first in range(0, count, a_group):
-            chosen = range(first, min(first + a_group, count))
-            tables = [pq.read_table(_table(plan, parts, chunk), schema=schema) for chunk in chosen]
+        for first in range(0, count, per_group):
+            chosen = range(first, min(first + per_group, count))
+            tables = [pq.read_table(_checked_table(plan, parts, chunk), schema=schema) for chunk in chosen]
             writer.write_table(pa.concat_tables(tables).unify_dictionaries().combine_chunks())
     with whole.open("rb") as stream:
         os.fsync(stream.fileno())

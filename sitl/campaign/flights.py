@@ -1,4 +1,4 @@
-"""The flights of a campaign, chunk by chunk: what every worker does, on this machine or another."""
+"""The flights of a campaign, chunk by chunk: the work of every worker process, on any machine."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from mimopilot.codegen.render import generator_version
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot
-from mimopilot.sitl.campaign.draws import Draw, Variator
-from mimopilot.sitl.campaign.plan import Plan, plan_from_files
+from mimopilot.sitl.campaign.draws import Draw, RunSampler
+from mimopilot.sitl.campaign.plan import CampaignPlan, plan_from_files
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.flight.metrics import Performance, performance
@@ -23,21 +23,21 @@ from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, first_loss
 
 from mimopilot.common.files import seal
 
-CHUNK = 64  # runs: what is lost of a worker that dies
+CHUNK = 64  # runs per chunk: at most these are lost when a worker dies
 FIGURES = tuple(field.name for field in fields(Performance))
-_one_at_a_time = Lock()
+_runner_lock = Lock()
 
 
-class Stand:
-    """A vehicle, its gain sets and buffers for one flight, used again and again.
+class FlightRunner:
+    """Flies the runs of a campaign one after the other; reuses its buffers for every flight.
 
     Parameters
     ----------
-    plan : Plan
-        What is flown.
+    plan : CampaignPlan
+        The campaign.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: CampaignPlan) -> None:
         self.plan = plan
         first = next(iter(plan.gains.values()))
         self.autopilots = {name: Autopilot(plan.airframe, gains) for name, gains in plan.gains.items()}
@@ -52,16 +52,16 @@ class Stand:
         self.truth = np.zeros(samples, TRUTH)
         self.record = np.zeros(samples, RECORD)
         self.runs = np.ones(samples, np.int64)
-        self.variator = Variator(plan.airframe, plan.description.vary, plan.scenarios[0])
+        self.sampler = RunSampler(plan.airframe, plan.description.vary, plan.scenarios[0])
 
     def draw(self, run: int) -> Draw:
-        """Everything random of a run: what varies, and the noise, which is the same for all its flights."""
+        """Draw a run and its noise, which is the same for all flights of the run."""
         seed = self.plan.description.seed
         np.random.default_rng([seed, run, 1]).standard_normal(out=self.noise)
-        return self.variator.draw(seed, run)
+        return self.sampler.draw(seed, run)
 
     def fly(self, draw: Draw, gains: str, index: int) -> Flight:
-        """One flight of the run that was drawn last, on the axis of the scenario `index`; the next overwrites it."""
+        """Fly scenario `index` with the run that was drawn last; the next flight overwrites the result."""
         simulator, autopilot, record = self.simulator, self.autopilots[gains], self.record
         scenario = self.plan.scenarios[index]
         simulator.plant, simulator.delay = draw.plant, draw.delay
@@ -81,7 +81,7 @@ class Stand:
         return Flight(scenario, record, self.truth, self.runs)
 
     def flights(self, run: int) -> Iterator[tuple[dict[str, Any], Flight]]:
-        """All flights of a run, each with its row of the results."""
+        """Fly a run with every gain set on every axis; yields each flight with its row of the results."""
         draw = self.draw(run)
         for name in self.plan.gains:
             for index, axis in enumerate(self.plan.description.axes):
@@ -89,7 +89,7 @@ class Stand:
                 yield self.row(run, draw, name, axis, flight), flight
 
     def row(self, run: int, draw: Draw, name: str, axis: str, flight: Flight) -> dict[str, Any]:
-        """What the results say of a flight."""
+        """The row of a flight in the results."""
         lost = first_loss(flight.truth, flight.record, flight.scenario.Ts)
         figures = performance(flight, *self.models[name, flight.scenario.axis])
         return {
@@ -104,18 +104,18 @@ class Stand:
         }
 
 
-def chunks(plan: Plan) -> int:
-    """In how many chunks a campaign is flown."""
+def chunk_count(plan: CampaignPlan) -> int:
+    """Number of chunk_count of a campaign."""
     return -(-plan.description.runs // CHUNK)
 
 
-def runs_of(plan: Plan, chunk: int) -> range:
+def runs_of(plan: CampaignPlan, chunk: int) -> range:
     """The runs of a chunk."""
     return range(chunk * CHUNK, min((chunk + 1) * CHUNK, plan.description.runs))
 
 
-def label(plan: Plan, chunk: int) -> str:
-    """What a part is: of which campaign, and of which of its runs."""
+def label(plan: CampaignPlan, chunk: int) -> str:
+    """Label of a part file: digest of the campaign, and its runs."""
     runs = runs_of(plan, chunk)
     return f"{plan.digest} runs {runs[0]} to {runs[-1]}"
 
@@ -126,29 +126,31 @@ def fly_chunk(files: dict[str, str], chunk: int) -> bytes:
     Parameters
     ----------
     files : dict
-        Of the `Plan`.
+        Files of the `CampaignPlan`.
     chunk : int
-        From 0.
+        Number of the chunk, from 0.
 
     Returns
     -------
     bytes
-        A Parquet file, a row for each flight, by run, gain set and axis; sealed under `label`.
+        A Parquet file with one row per flight, ordered by run, gain set and axis; sealed with `label`.
 
     Raises
     ------
     SitlError
-        When this machine has another version of mimopilot than the one that leads.
+        When this worker has another version of mimopilot than the campaign.
     """
-    with _one_at_a_time:  # a cluster's worker may have several threads, the stand is one
-        stand = stand_of(tuple(files.items()))
-        version = stand.plan.description.mimopilot
+    with _runner_lock:  # a cluster worker may have several threads, but there is one runner
+        runner = flight_runner(tuple(files.items()))
+        version = runner.plan.description.mimopilot
         if version != generator_version():
-            raise SitlError(f"a worker has mimopilot {generator_version()}, the campaign is one of {version}")
-        rows = [row for run in runs_of(stand.plan, chunk) for row, _ in stand.flights(run)]
+            raise SitlError(
+                f"a worker has mimopilot {generator_version()}, the campaign has {version}; install the same version"
+            )
+        rows = [row for run in runs_of(runner.plan, chunk) for row, _ in runner.flights(run)]
     stream = io.BytesIO()
     pq.write_table(pa.Table.from_pylist(rows, schema(rows[0])), stream)
-    return seal(stream.getvalue(), label(stand.plan, chunk))
+    return seal(stream.getvalue(), label(runner.plan, chunk))
 
 
 def schema(row: dict[str, Any]) -> pa.Schema:
@@ -158,6 +160,6 @@ def schema(row: dict[str, Any]) -> pa.Schema:
 
 
 @lru_cache(maxsize=1)
-def stand_of(files: tuple[tuple[str, str], ...]) -> Stand:
-    """The stand of a plan, kept for the next chunk of the same."""
-    return Stand(plan_from_files(dict(files)))
+def flight_runner(files: tuple[tuple[str, str], ...]) -> FlightRunner:
+    """The runner of a plan's files; cached for the next chunk."""
+    return FlightRunner(plan_from_files(dict(files)))

@@ -1,4 +1,4 @@
-"""What a campaign flies, as the text files that stand beside its results: the same texts, the same results."""
+"""The plan of a campaign, stored as text files beside its results; the same files give the same results."""
 
 from __future__ import annotations
 
@@ -28,27 +28,27 @@ SPEC, AIRFRAME = "spec.toml", "airframe.toml"
 RESULTS, PARTS, LOCK = "results.parquet", "parts", "campaign.lock"
 SUMMARY, REPORT = "summary.json", "report.html"
 HEAD = "# A campaign of mimopilot. Run k is drawn from the seed and k alone; every gain set flies the same runs."
-MAX_RUNS = 100_000_000
+MAX_RUNS = 100_000_000  # the number of a part file has seven digits
 
 
-class Description(BaseModel):
-    """The campaign's own file, `spec.toml`.
+class CampaignSpec(BaseModel):
+    """The campaign's specification file, `spec.toml`.
 
     Attributes
     ----------
     mimopilot : str
-        Version that flies it.
+        Version that flies the campaign.
     runs, seed : int
     gains : tuple of str
-        Names of the gain sets; each has a file.
+        Names of the gain sets; one file each.
     manoeuvre : str
         See `sitl.flight.scenario.make_scenario`.
     axes : tuple of str
-        Each run flies the manoeuvre on each.
-    amplitude_deg, period_s, tail_s : float
-        Of the manoeuvre.
+        Each run flies the manoeuvre on every axis.
+    amplitude_deg, period_s, tail_s : float, deg, s, s
+        Amplitude and length of the manoeuvre, and level flight after it.
     faults : tuple of str
-        Of every flight, as `sitl.faults.kinds.parse_fault` reads them.
+        Faults of every flight, in the notation of `sitl.faults.kinds.parse_fault`.
     vary : Variation
     """
 
@@ -68,44 +68,44 @@ class Description(BaseModel):
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class CampaignPlan:
     """A campaign.
 
     Attributes
     ----------
     files : dict
-        Name -> text: what `plan_from_files` makes the same plan of, on this machine or another.
-    description : Description
+        Name -> text, from which `plan_from_files` restores the plan on any machine.
+    description : CampaignSpec
     airframe : Airframe
     gains : dict of Gains
-        By name, in order.
+        Name -> gains, in order.
     scenarios : list of Scenario
-        One an axis.
+        One per axis.
     """
 
     files: dict[str, str]
-    description: Description
+    description: CampaignSpec
     airframe: Airframe
     gains: dict[str, Gains]
     scenarios: list[Scenario]
 
     @cached_property
     def digest(self) -> str:
-        """Hash of all that decides what the flights are."""
+        """Hash of everything that determines the flights."""
         return sha256(json.dumps(self.files, sort_keys=True))
 
 
-def make_plan(vehicle: AirframeFile, gains: dict[str, Gains], **entries: Any) -> Plan:
+def make_plan(vehicle: AirframeFile, gains: dict[str, Gains], **entries: Any) -> CampaignPlan:
     """A plan from its parts.
 
     Parameters
     ----------
     vehicle : AirframeFile
-        What flies.
+        The vehicle.
     gains : dict of Gains
-        By name.
+        Name -> gains.
     **entries
-        The rest of `Description`; `vary` as a mapping.
+        The rest of `CampaignSpec`; `vary` as a mapping.
 
     Raises
     ------
@@ -120,39 +120,41 @@ def make_plan(vehicle: AirframeFile, gains: dict[str, Gains], **entries: Any) ->
 
 
 def gains_file(name: str) -> str:
-    """Where the gain set of a name lies in a campaign's folder."""
+    """Path of a gain set in the campaign's folder."""
     return f"gains/{name}.gains.toml"
 
 
-def plan_from_files(files: dict[str, str], where: str = "campaign") -> Plan:
-    """The plan that a campaign's files describe.
+def plan_from_files(files: dict[str, str], where: str = "campaign") -> CampaignPlan:
+    """The plan described by a campaign's files.
 
     Raises
     ------
     SitlError
-        When a file is missing, or what it says cannot be flown.
-    TuningError
+        When a file is missing, or the scenario is impossible.
+    InputFileError
         When a file is not TOML, or an entry is unknown or impossible.
     """
     try:
-        description = checked(Description, parse_toml(files[SPEC], f"{where}/{SPEC}"), f"{where}/{SPEC}")
+        description = checked(CampaignSpec, parse_toml(files[SPEC], f"{where}/{SPEC}"), f"{where}/{SPEC}")
         airframe = airframe_from_toml(files[AIRFRAME], f"{where}/{AIRFRAME}")
         names = description.gains
         gains = {name: gains_from_toml(files[gains_file(name)], f"{where}/{gains_file(name)}") for name in names}
     except KeyError as error:
-        raise SitlError(f"{where}: {error.args[0]} is missing") from error
+        raise SitlError(f"{where}: {error.args[0]} is missing; start the campaign again in another folder") from error
     periods = {one.Ts for one in gains.values()}
     if len(periods) > 1:
-        raise SitlError(f"gains: the sets are for different control periods, {sorted(periods)} s; fly each by itself")
+        raise SitlError(
+            f"gains: the sets have different control periods, {sorted(periods)} s; fly one campaign for each"
+        )
     d, (Ts,) = description, periods
     faults = tuple(map(parse_fault, d.faults))
     made = (make_scenario(d.manoeuvre, axis, d.amplitude_deg, d.period_s, Ts, d.tail_s) for axis in d.axes)
     scenarios = [replace(scenario, faults=faults) for scenario in made]
-    return Plan(files, description, airframe, gains, scenarios)
+    return CampaignPlan(files, description, airframe, gains, scenarios)
 
 
 def read_files(folder: Path) -> dict[str, str]:
-    """Texts of the campaign in a folder, by name; empty when there is none."""
+    """Files of the campaign in a folder, name -> text; empty when there is no campaign."""
     if not (folder / SPEC).is_file():
         return {}
     texts = {SPEC: read_text(folder / SPEC, "campaign's specification")}
@@ -164,27 +166,28 @@ def read_files(folder: Path) -> dict[str, str]:
     return texts
 
 
-def settle(plan: Plan, folder: Path) -> None:
-    """Put the plan's files into a folder.
+def write_plan_files(plan: CampaignPlan, folder: Path) -> None:
+    """Write the plan's files into a folder.
 
     Raises
     ------
     SitlError
-        When the folder holds another campaign: names the first difference; or results of an unknown one.
-    TuningError
-        When a file of the campaign that it holds cannot be read.
+        When the folder holds another campaign (names the first difference), or results without a specification.
+    InputFileError
+        When a file of the campaign in the folder cannot be read.
     OSError
-        When a link lies on the way to one of the files, or one cannot be written.
+        When a file would be written through a symbolic link, or cannot be written.
     """
     there = read_files(folder)
     if not there and ((folder / RESULTS).exists() or (folder / PARTS).exists()):
-        raise SitlError(f"{folder}: holds results, but no {SPEC} that says of what; give another --out")
+        raise SitlError(f"{folder}: holds results but no {SPEC}; give another --out")
     if there and there != plan.files:
         raise SitlError(
             f"{folder}: holds another campaign ({_difference(there, plan.files)}); give another --out, or the same "
-            "arguments to go on with it"
+            "arguments to resume it"
         )
-    for name, text in sorted(plan.files.items(), key=lambda item: item[0] == SPEC):  # the spec last: it counts
+    # The specification is last: with it the folder counts as a campaign.
+    for name, text in sorted(plan.files.items(), key=lambda item: item[0] == SPEC):
         write_atomically(inside(folder, name), text)
 
 
@@ -192,17 +195,17 @@ def _difference(there: dict[str, str], here: dict[str, str]) -> str:
     old, new = parse_toml(there[SPEC], SPEC), parse_toml(here[SPEC], SPEC)
     for name in [*new, *old]:
         if old.get(name) != new.get(name):
-            return f"{name}: {shown(old.get(name))} there, {shown(new.get(name))} here"
+            return f"{name}: {shown(old.get(name))} in the folder, {shown(new.get(name))} now"
     names = [name for name in [*here, *there] if here.get(name) != there.get(name)]
     return f"{names[0]} differs"
 
 
 @contextmanager
-def reading(results: Path) -> Iterator[None]:
-    """A table of results that is damaged is told in one line."""
+def reading_results(results: Path) -> Iterator[None]:
+    """Turn read errors of a damaged results file into one message."""
     try:
         yield
     except (pa.ArrowException, ValueError, OSError) as error:
-        if isinstance(error, OSError) and error.errno:  # of the system: not the fault of what is in the file
+        if isinstance(error, OSError) and error.errno:  # an error of the operating system, not of the contents
             raise
-        raise SitlError(f"{results}: damaged; remove it and give the campaign's command again") from error
+        raise SitlError(f"{results}: damaged; remove it and give the campaign command again") from error

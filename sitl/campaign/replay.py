@@ -1,4 +1,4 @@
-"""One flight of a campaign, flown again from what lies in its folder."""
+"""Replay of one flight of a campaign from the files in its folder."""
 
 from __future__ import annotations
 
@@ -9,57 +9,58 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from mimopilot.sitl.campaign.flights import Stand
-from mimopilot.sitl.campaign.plan import RESULTS, SPEC, Plan, plan_from_files, read_files, reading
+from mimopilot.sitl.campaign.flights import FlightRunner
+from mimopilot.sitl.campaign.plan import RESULTS, SPEC, CampaignPlan, plan_from_files, read_files, reading_results
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.simulator import Flight
 
 
 @dataclass(frozen=True, eq=False)
-class Again:
-    """The flight, its row of figures, and the row that the results have for it (None before they are merged)."""
+class Replay:
+    """A repeated flight, its row of figures, and its row in the results (None before the parts are merged)."""
 
-    plan: Plan
+    plan: CampaignPlan
     flight: Flight
     row: dict[str, Any]
     flown: dict[str, Any] | None
 
     def compare(self) -> None:
-        """Check that it was the same flight, bit for bit.
+        """Check that the flight equals the one in the results, bit for bit.
 
         Raises
         ------
         SitlError
-            When a figure differs from that in the results.
+            When a figure differs from the results.
         """
         for name, value in (self.flown or {}).items():
             if not _same(value, self.row.get(name)):
                 raise SitlError(
-                    f"{name} is {self.row.get(name)!r}, in the results {value!r}: the campaign was flown by another "
-                    "version, compiler or processor",
+                    f"{name} is {self.row.get(name)!r}, in the results {value!r}: the campaign was flown with another "
+                    "version, compiler or processor; replay it with the same",
                     exit_code=1,
                 )
 
 
-def fly_again(folder: Path, run: int, gains: str | None, axis: str | None) -> Again:
-    """Fly a run again.
+def replay_flight(folder: Path, run: int, gains: str | None, axis: str | None) -> Replay:
+    """Repeat one flight of a campaign.
 
     Parameters
     ----------
     folder : Path
-        Of the campaign.
+        Folder of the campaign.
     run : int
+        Number of the run, from 0.
     gains, axis : str or None
-        The first of the campaign when not given.
+        Gain set and axis; None: the first of the campaign.
 
     Raises
     ------
     SitlError
-        When the campaign has no such run, or the folder no campaign.
+        When the folder holds no campaign, or the campaign no such flight.
     """
     files = read_files(folder)
     if not files:
-        raise SitlError(f"{folder}: no campaign is here, {SPEC} is missing")
+        raise SitlError(f"{folder}: not the folder of a campaign: {SPEC} is missing")
     plan = plan_from_files(files, str(folder))
     d = plan.description
     gains, axis = gains or d.gains[0], axis or d.axes[0]
@@ -68,17 +69,19 @@ def fly_again(folder: Path, run: int, gains: str | None, axis: str | None) -> Ag
             f"--run {run} --gains {gains} --axis {axis}: the campaign has runs 0 to {d.runs - 1}, gains "
             f"{', '.join(d.gains)} and axes {', '.join(d.axes)}"
         )
-    stand = Stand(plan)
-    draw = stand.draw(run)
-    flight = stand.fly(draw, gains, d.axes.index(axis))
-    return Again(plan, flight, stand.row(run, draw, gains, axis, flight), _flown(folder / RESULTS, run, gains, axis))
+    runner = FlightRunner(plan)
+    draw = runner.draw(run)
+    flight = runner.fly(draw, gains, d.axes.index(axis))
+    return Replay(
+        plan, flight, runner.row(run, draw, gains, axis, flight), _row_in_results(folder / RESULTS, run, gains, axis)
+    )
 
 
-def _flown(results: Path, run: int, gains: str, axis: str) -> dict[str, Any] | None:
+def _row_in_results(results: Path, run: int, gains: str, axis: str) -> dict[str, Any] | None:
     if not results.is_file():
         return None
     chosen = (pc.field("run") == run) & (pc.field("gains") == gains) & (pc.field("axis") == axis)
-    with reading(results):
+    with reading_results(results):
         (row,) = pq.read_table(results, filters=chosen, page_checksum_verification=True).to_pylist()
     return dict(row)
 

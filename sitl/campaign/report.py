@@ -1,18 +1,18 @@
-"""The report of a campaign: tables and figures in one page."""
+"""The HTML report of a campaign: tables and plots on one page."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from mimopilot.sitl.campaign import figures
-from mimopilot.sitl.campaign.flights import stand_of
+from mimopilot.sitl.campaign import campaign_figures
+from mimopilot.sitl.campaign.flights import flight_runner
 from mimopilot.sitl.campaign.plan import REPORT, SPEC
 from mimopilot.sitl.campaign.summary import (
     FIGURE_COLUMNS,
     SURVIVAL_COLUMNS,
     WORST_COLUMNS,
-    Results,
-    Summary,
+    CampaignResults,
+    CampaignSummary,
     figure_rows,
     survival_rows,
     worst_rows,
@@ -24,59 +24,63 @@ from mimopilot.common.html_report import ReportTable, Section, write_report
 
 INTERVALS = (
     "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "
-    "counts as worse than every other."
+    "counts as worse than any surviving one."
 )
 
 
-def write_campaign_report(results: Results, summary: Summary, over: tuple[str, str] | None = None) -> Path:
+def write_campaign_report(
+    results: CampaignResults, summary: CampaignSummary, over: tuple[str, str] | None = None
+) -> Path:
     """Write `report.html` beside the results.
 
     Parameters
     ----------
-    results : Results
-        What was flown, and the table.
-    summary : Summary
-        Of it.
+    results : CampaignResults
+        Plan and results.
+    summary : CampaignSummary
+        Summary of the results.
     over : (str, str), optional
-        The quantities of the survival map; by default `sitl.campaign.figures.choose_map`.
+        Quantities of the survival map; by default those of `sitl.campaign.campaign_figures.choose_map`.
     """
     plan = results.plan
-    d, stand = plan.description, stand_of(tuple(plan.files.items()))
+    d, runner = plan.description, flight_runner(tuple(plan.files.items()))
     what = [f"{d.amplitude_deg:g} degrees", f"{d.period_s:g} s", *d.faults]
     lead = (
         f"{plan.airframe.name}: {d.runs} runs, seed {d.seed}, each a {d.manoeuvre} on {' and '.join(d.axes)} "
-        f"({', '.join(what)}) under {', '.join(plan.gains)}. All fly the same vehicles with the same noise. "
-        f"{summary.rejected} draws of no vehicle that flies were drawn again."
+        f"({', '.join(what)}) under {', '.join(plan.gains)}. All gain sets fly the same vehicles with the same noise. "
+        f"{summary.rejected} impossible draws were repeated."
     )
     tables = [
         ReportTable("Survived", SURVIVAL_COLUMNS, survival_rows(summary)),
         ReportTable("Figures", FIGURE_COLUMNS, figure_rows(summary)),
-        ReportTable("Worst flights; the commands are for this folder", WORST_COLUMNS, worst_rows(summary, ".")),
+        ReportTable("Worst flights; run the commands in this folder", WORST_COLUMNS, worst_rows(summary, ".")),
     ]
-    sample = figures.fly_sample(stand)
+    sample = campaign_figures.fly_sample(runner)
     envelopes = [
-        svg(figures.envelope_figure(stand, sample, results, index), f"envelope {axis}")
+        svg(campaign_figures.envelope_figure(runner, sample, results, index), f"envelope {axis}")
         for index, axis in enumerate(d.axes)
     ]
     sections = [
         Section("Summary", INTERVALS, tables=tables),
         Section(
             "Responses",
-            f"True angles of those of the first {min(d.runs, figures.ENVELOPE_RUNS)} runs that survived, and of the "
-            "worst run of all.",
+            "True angles of the surviving runs among the first "
+            f"{min(d.runs, campaign_figures.ENVELOPE_RUNS)}, and of the worst run of all.",
             figures=envelopes,
         ),
         Section(
             "Distributions",
-            "Share of all flights whose figure is at most that of the abscissa: left is better, and a curve that ends "
-            "below 1 has lost the rest.",
-            figures=[svg(figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes],
+            "Fraction of all flights whose figure is at most the abscissa. Further left is better. A curve that ends "
+            "below 1 has lost the rest of the flights.",
+            figures=[
+                svg(campaign_figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes
+            ],
         ),
     ]
-    names = over or figures.choose_map(results)
+    names = over or campaign_figures.choose_map(results)
     if names:
-        maps = [svg(figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
-        sections.append(Section("Survival", "Over two of the quantities that vary.", figures=maps))
+        maps = [svg(campaign_figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
+        sections.append(Section("Survival", "Over two varied quantities.", figures=maps))
     sections.append(
         Section(
             "What was flown", "", tables=[ReportTable(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])]

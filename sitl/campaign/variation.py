@@ -1,8 +1,8 @@
-"""What varies from run to run: distributions of the vehicle, its sensors, the weather, the start and the faults.
+"""Specification of what varies between runs: vehicle, sensors, wind, initial state and faults.
 
-A specification is TOML. Each entry is a distribution, ``{ uniform = [low, high] }``, ``{ normal = [mean, deviation] }``
-or ``{ loguniform = [low, high] }``, in SI units; with ``relative = true`` it is a factor on the airframe's own value.
-Whole numbers of samples are rounded, so that ``delay = { uniform = [0.5, 3.5] }`` draws 1, 2 and 3 alike.
+A specification is TOML. Each entry is a distribution in SI units: ``{ uniform = [low, high] }``,
+``{ normal = [mean, deviation] }`` or ``{ loguniform = [low, high] }``. With ``relative = true`` it is a factor on the
+airframe's value. Numbers of samples are rounded: ``delay = { uniform = [0.5, 3.5] }`` draws 1, 2 and 3 equally often.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Pair = tuple[Finite, Finite]
 
 
 class Distribution(BaseModel):
-    """One quantity: exactly one of the three kinds."""
+    """Distribution of one quantity: exactly one of the three kinds."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -38,7 +38,7 @@ class Distribution(BaseModel):
             raise ValueError("expected exactly one of uniform, normal and loguniform")
         first, second = getattr(self, kinds[0])
         if kinds == ["normal"] and second < 0:
-            raise ValueError("normal: expected [mean, deviation], the deviation not negative")
+            raise ValueError("normal: expected [mean, deviation] with a deviation of 0 or more")
         if kinds != ["normal"] and not first <= second:
             raise ValueError(f"{kinds[0]}: expected [low, high] in this order")
         if kinds == ["loguniform"] and first <= 0:
@@ -46,7 +46,7 @@ class Distribution(BaseModel):
         return self
 
     def draw(self, generator: np.random.Generator, own: float = 0.0) -> float:
-        """A number; `own` is the airframe's value, for relative ones."""
+        """Draw a number; `own` is the airframe's value, the unit of a relative distribution."""
         if self.normal is not None:
             mean, deviation = self.normal
             value = mean + deviation * generator.standard_normal()
@@ -65,38 +65,38 @@ Number = Finite | Distribution
 
 def _absolute(value: Distribution) -> Distribution:
     if value.relative:
-        raise ValueError("the airframe has no value of its own that this could be relative to")
+        raise ValueError("the airframe has no value of its own; remove relative = true")
     return value
 
 
-class _Table(BaseModel):
+class _VariationTable(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     def entries(self) -> Iterator[tuple[str, Distribution]]:
-        """Names and distributions of what varies."""
+        """Names and distributions of the varied quantities."""
         for name in type(self).model_fields:
             if isinstance(value := getattr(self, name), Distribution):
                 yield name, value
 
 
-class InertiaVariation(_Table):
-    """Moments of inertia, kg m^2: each axis is scaled, the share of coupling (product over their root) stays."""
+class InertiaVariation(_VariationTable):
+    """Moments of inertia, kg m^2. Products scale along, so that product / sqrt(moment * moment) stays."""
 
     xx: Distribution | None = None
     yy: Distribution | None = None
     zz: Distribution | None = None
 
 
-class ProductVariation(_Table):
-    """Off-diagonal elements of the tensor, kg m^2 (minus the products of inertia), in place of the airframe's."""
+class ProductVariation(_VariationTable):
+    """Off-diagonal elements of the tensor, kg m^2 (minus the products of inertia); they replace the airframe's."""
 
     xy: Distribution | None = None
     xz: Distribution | None = None
     yz: Distribution | None = None
 
 
-class MotorVariation(_Table):
-    """Constants of all motors, as in the airframe's file; `effectiveness` (share of thrust) is drawn for each motor."""
+class MotorVariation(_VariationTable):
+    """Motor constants as in the airframe file; `effectiveness` (fraction of thrust) is drawn for each motor."""
 
     thrust_max: Distribution | None = None
     time_constant: Distribution | None = None
@@ -104,14 +104,14 @@ class MotorVariation(_Table):
     effectiveness: Distribution | None = None
 
 
-class NoiseVariation(_Table):
+class NoiseVariation(_VariationTable):
     """Standard deviation of the state estimate: angle (rad), rate (rad/s)."""
 
     angle: Distribution | None = None
     rate: Distribution | None = None
 
 
-class _AbsoluteTable(_Table):
+class _AbsoluteVariationTable(_VariationTable):
     @model_validator(mode="after")
     def _is_absolute(self) -> Any:
         for _, value in self.entries():
@@ -119,24 +119,24 @@ class _AbsoluteTable(_Table):
         return self
 
 
-class WindVariation(_AbsoluteTable):
-    """Constant wind, m/s: velocity of the air."""
+class WindVariation(_AbsoluteVariationTable):
+    """Velocity of the air, constant, m/s."""
 
     north: Distribution | None = None
     east: Distribution | None = None
     down: Distribution | None = None
 
 
-class AngleVariation(_AbsoluteTable):
-    """Three angles or body rates at the start."""
+class AngleVariation(_AbsoluteVariationTable):
+    """Initial attitude or body rates."""
 
     roll: Distribution | None = None
     pitch: Distribution | None = None
     yaw: Distribution | None = None
 
 
-class FaultVariation(_Table):
-    """A fault, see `sitl.faults.kinds.Fault`, whose numbers may be distributions; a drawn motor is a whole number."""
+class FaultVariation(_VariationTable):
+    """A fault (`sitl.faults.kinds.Fault`) whose numbers may be distributions; a drawn motor is rounded."""
 
     kind: str
     at: Number
@@ -154,25 +154,25 @@ class FaultVariation(_Table):
         return self
 
 
-class Variation(_Table):
-    """A specification; what is not named stays as the airframe has it.
+class Variation(_VariationTable):
+    """The whole specification; quantities without an entry keep the airframe's value.
 
     Attributes
     ----------
     mass : kg
-        Of the whole vehicle.
+        Mass of the whole vehicle.
     inertia, products, motors, noise, wind
         See their classes.
     attitude_deg, rates_deg_s : degrees, deg/s
-        At the start.
+        Initial attitude and body rates.
     rate_damping : 1/s
     drag : N s/m
     delay : samples
-        Whole control periods between a measurement and the motor command made from it.
+        Control periods from a measurement to its motor command.
     amplitude_deg : degrees
-        Largest angle of the set-points.
+        Amplitude of the setpoints.
     fault
-        What goes wrong, beside the faults of the scenario.
+        Faults in addition to those of the scenario.
     """
 
     mass: Distribution | None = None
@@ -191,7 +191,7 @@ class Variation(_Table):
 
 
 def read_variation(path: Path) -> dict[str, Any]:
-    """The table of a specification's file, checked; see `variation_from_toml`."""
+    """Read and check a specification file; returns its table, see `variation_from_toml`."""
     table = read_toml(path, "specification")
     checked(Variation, table, str(path))
     return table
@@ -202,14 +202,14 @@ def variation_from_toml(text: str, where: str) -> Variation:
 
     Raises
     ------
-    TuningError
+    InputFileError
         When it is not TOML, or an entry is unknown or impossible.
     """
     return checked(Variation, parse_toml(text, where), where)
 
 
-#: Beginning of a drawn quantity's name -> its unit.
-UNITS = {
+#: Prefix of a varied quantity's name -> its unit.
+VARIED_UNITS = {
     "mass": "kg",
     "inertia": "kg m^2",
     "products": "kg m^2",

@@ -10,6 +10,27 @@ from mimopilot.sitl.physics.compiled import compiled
 from mimopilot.tuning.reference_model import ReferenceModel
 from numpy.typing import NDArray
 
+#: Figure of a flight -> its label: those of `Performance`, then of `sitl.flight.fault_recovery.Recovery`.
+FIGURE_LABELS = {
+    "J_M_o": "J_M,o [rad^2]",
+    "J_M_i": "J_M,i [rad^2/s^2]",
+    "J_r_o": "J_r,o [rad^2]",
+    "J_r_i": "J_r,i [rad^2/s^2]",
+    "peak_deg": "peak [deg]",
+    "offaxis_peak_deg": "off-axis peak [deg]",
+    "offaxis_rms_deg": "off-axis RMS [deg]",
+    "effort_rms": "effort, RMS of u [-]",
+    "saturated": "saturated samples",
+    "crashed_at_s": "lost at [s]",
+    "deviation_peak_deg": "peak, from the flight without faults [deg]",
+    "deviation_rms_deg": "RMS, from the same [deg]",
+    "saturated_since": "saturated samples since the fault",
+    "recovery_s": "recovered after [s]",
+    "detected_s": "detected after [s]",
+    "detected_by": "detected by",
+    "nonfinite": "non-finite outputs",
+}
+
 
 @dataclass(frozen=True)
 class Performance:

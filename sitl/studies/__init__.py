@@ -1,1 +1,1 @@
-"""Whole experiments that use every room; nothing but the front door imports them."""
+"""Whole experiments that use all packages; only the command line imports them."""

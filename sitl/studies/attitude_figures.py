@@ -1,4 +1,4 @@
-"""Figures of the attitude studies: motor commands, gains with their spread, figures of merit with theirs."""
+"""Plots of the attitude studies: tracking, motor commands, gains and costs with their spread."""
 
 from __future__ import annotations
 
@@ -9,32 +9,27 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from mimopilot.sitl.flight.figures import STYLES
-from mimopilot.sitl.flight.metrics import reference_responses
+from mimopilot.sitl.flight.metrics import FIGURE_LABELS, reference_responses
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.flight.simulator import Flight
-from mimopilot.sitl.studies.attitude import MIMO, REFINED, SISO, Run, Study
-from mimopilot.sitl.studies.attitude_runs import Statistics
+from mimopilot.sitl.studies.attitude_run import AttitudeRun
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
+from mimopilot.sitl.studies.attitude_study import MIMO, REFINED, SISO, AttitudeStudy
 from numpy.typing import NDArray
 
-#: A colour, a line and a marker of its own for each method that is compared everywhere.
+#: Method -> (colour, line style) and marker.
 LOOK = dict(zip((SISO, MIMO, REFINED), zip(STYLES, "so^", strict=False), strict=False))
 PRINTED = {"color": "black", "marker": "x", "markersize": 7, "markeredgewidth": 1.6, "linestyle": "none"}
 MATRICES = {"Kp_o": "1/s", "Kp_i": "s", "Ki_i": "-", "Kd_i": "s^2"}
 ELEMENTS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
-COSTS = {
-    "J_M_o": "J_M,o [rad^2]",
-    "J_M_i": "J_M,i [rad^2/s^2]",
-    "J_r_o": "J_r,o [rad^2]",
-    "J_r_i": "J_r,i [rad^2/s^2]",
-    "offaxis_peak_deg": "off-axis peak [deg]",
-    "effort_rms": "effort: RMS of u [-]",
-}
-#: What the bars of a spread reach over.
+#: Figure -> label.
+COSTS = {name: FIGURE_LABELS[name] for name in ("J_M_o", "J_M_i", "J_r_o", "J_r_i", "offaxis_peak_deg", "effort_rms")}
+#: Percentiles at the ends of the bars.
 LOW, HIGH = 5, 95
 
 
-def tracking_figure(found: Run, study: Study) -> Figure:
-    """Distance of angle and rate to the reference models, driven by their own set-points, in both doublets."""
+def tracking_figure(found: AttitudeRun, study: AttitudeStudy) -> Figure:
+    """Error of angle and rate to the reference models of their setpoints, in both doublets."""
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     panels: Any = figure.subplots(2, 2, sharex=True, sharey="row")
     for method, ((colour, style), _) in LOOK.items():
@@ -58,18 +53,18 @@ def tracking_figure(found: Run, study: Study) -> Figure:
 
 
 def _time(flight: Flight) -> NDArray[np.float64]:
-    """From the start of the doublet, s."""
+    """Time from the start of the doublet, s, (N,)."""
     return np.asarray((np.arange(len(flight.record)) - flight.scenario.window[0]) * flight.scenario.Ts, np.float64)
 
 
 def _shown(flight: Flight) -> NDArray[np.bool_]:
-    """From shortly before the doublet to its length after it."""
+    """Samples from 0.1 s before the doublet until one doublet length after it, (N,)."""
     start, stop = flight.scenario.window
     return np.asarray((_time(flight) >= -0.1) & (_time(flight) <= 2 * (stop - start) * flight.scenario.Ts))
 
 
-def motors_figure(found: Run, rotors: int, title: str) -> Figure:
-    """Commands of all motors in both doublets, one row a motor."""
+def motors_figure(found: AttitudeRun, rotors: int, title: str) -> Figure:
+    """Commands of all motors in both doublets, one row of panels per motor."""
     figure = Figure(figsize=(9, 1.5 + 1.5 * rotors), layout="constrained")
     panels: Any = figure.subplots(rotors, 2, sharex=True, sharey=True)
     for method, ((colour, style), _) in LOOK.items():
@@ -92,8 +87,8 @@ def motors_figure(found: Run, rotors: int, title: str) -> Figure:
     return figure
 
 
-def gains_figure(found: Statistics, printed: Mapping[str, Any], table: str) -> Figure:
-    """Every gain: median and 5 to 95 % over the seeds; a cross where the thesis prints one."""
+def gains_figure(found: StudyStatistics, printed: Mapping[str, Any], table: str) -> Figure:
+    """Median and 5 to 95 % of every gain over the seeds; a cross marks a value printed in the thesis."""
     figure = Figure(figsize=(9, 8.5), layout="constrained")
     panels: Any = figure.subplots(4, 4)
     for row, (name, unit) in zip(panels, MATRICES.items(), strict=True):
@@ -118,8 +113,10 @@ def gains_figure(found: Statistics, printed: Mapping[str, Any], table: str) -> F
     return figure
 
 
-def costs_figure(found: Statistics, methods: Sequence[str], printed: Mapping[str, Any], axis_printed: str) -> Figure:
-    """Every figure of merit by method: median and 5 to 95 % over the seeds, roll and pitch."""
+def costs_figure(
+    found: StudyStatistics, methods: Sequence[str], printed: Mapping[str, Any], axis_printed: str
+) -> Figure:
+    """Median and 5 to 95 % of every cost over the seeds, by method, for roll and pitch."""
     figure = Figure(figsize=(9, 8.5), layout="constrained")
     panels: Any = figure.subplots(3, 2, sharey=True)
     places = np.arange(len(methods))[::-1]
@@ -162,6 +159,6 @@ def _spread(panel: Any, place: float, values: NDArray[np.float64], look: Any, la
 
 
 def _legend(figure: Figure, panel: Any) -> None:
-    """One entry for each label of a panel, below the figure."""
+    """A legend below the figure with each label of a panel once."""
     handles = dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True))
     figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=9)

@@ -1,4 +1,4 @@
-"""An attitude study as tables and figures, beside what the thesis prints."""
+"""Report of an attitude study: tables and plots, beside the values printed in the thesis."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import numpy as np
 from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.sitl.studies.attitude import AUTOTUNE, BEST, BOUND, DEFAULT, EFFORT, MIMO, REFINED, SISO, SISO_OWN, Study
 from mimopilot.sitl.studies.attitude_figures import (
     COSTS,
     ELEMENTS,
@@ -21,29 +20,41 @@ from mimopilot.sitl.studies.attitude_figures import (
     motors_figure,
     tracking_figure,
 )
-from mimopilot.sitl.studies.attitude_runs import Statistics
+from mimopilot.sitl.studies.attitude_run import EFFORT_RATIO
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
+from mimopilot.sitl.studies.attitude_study import (
+    AUTOTUNE,
+    BEST,
+    BOUND,
+    DEFAULT,
+    MIMO,
+    REFINED,
+    SISO,
+    SISO_OWN,
+    AttitudeStudy,
+)
 
 from mimopilot.common.html_report import ReportTable, Section
 
-IN_KIND = (
-    "The thesis' figures of real flights can only be compared in kind: its vehicles' inertias, motors and winds are "
-    "not known, and those of the bench are class values."
+COMPARABILITY = (
+    "Only trends can be compared with the thesis' real flights: the inertias, motors and winds there are not known, "
+    "and those of the simulation are class values."
 )
 METHODS = (
-    f"{DEFAULT}: the gains that flew the experiment. {AUTOTUNE}: one axis at a time by the rule of PX4's autotune, "
+    f"{DEFAULT}: the gains during the experiment. {AUTOTUNE}: one axis at a time by the rule of PX4's autotune, "
     f"from the same log. {SISO} and {MIMO}: VRFT with the thesis' reference models. {REFINED}: {MIMO} refined on a "
-    f"model from the same log, for this doublet, with {EFFORT - 1:.0%} more effort than {SISO} is predicted to need. "
-    f"{BEST}: all gains found by direct optimisation in the bench, with the effort that {REFINED} spends there (median "
-    "of the first seeds) and the certificate's limits on the true plant, Ms less what a log leaves open of it; no "
-    f"method knows the true plant. {BOUND}: with as much effort as it takes. Effort: RMS of both moments together."
+    f"model from the same log, for this doublet, with a predicted effort {EFFORT_RATIO - 1:.0%} above {SISO}'s. "
+    f"{BEST}: all gains by direct optimisation in the simulation, with the effort of {REFINED} there (median of the "
+    "first seeds) and the certificate's limits on the true plant, the limit on Ms less the error of Ms from a log; no "
+    f"method knows the true plant. {BOUND}: the same with any effort. Effort: RMS of both torques together."
 )
 SPREAD_COLUMNS = ("gain", *ELEMENTS)
-COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].partition(":")[0] for text in COSTS.values()))
+COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].removesuffix(", RMS of u") for text in COSTS.values()))
 CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms", "lost flights")
 
 
-def study_sections(found: Statistics) -> list[Section]:
-    """Headings, tables and figures of a study."""
+def study_sections(found: StudyStatistics) -> list[Section]:
+    """The report sections of a study."""
     study, name = found.study, found.study.name
     inner, outer = study.models(MIMO, found.shown.experiment.scenario.Ts)
     rotors = len(load_airframe(study.airframe).airframe.rotors)
@@ -66,15 +77,15 @@ def study_sections(found: Statistics) -> list[Section]:
         ),
         Section(
             f"{name}: gains",
-            f"Medians, in brackets {LOW} to {HIGH} % of {len(found.runs)} experiments with other noise and another "
-            "PRBS. Kp_o in 1/s, Kp_i in s, Ki_i without unit, Kd_i in s^2.",
+            f"Medians, in brackets {LOW} to {HIGH} % of {len(found.runs)} experiments with different noise and PRBS. "
+            "Kp_o in 1/s, Kp_i in s, Ki_i without unit, Kd_i in s^2.",
             [gains_table(found)],
             [svg(gains_figure(found, study.gains_table[1], study.gains_table[0]), f"{name} gains")],
         ),
         Section(
             f"{name}: doublets",
-            f"Doublet of {study.amplitude_deg:g} degrees, {study.period_s:g} s. J over the doublet, each method beside "
-            f"the models that it was tuned for. {METHODS} {IN_KIND if costs else ''}",
+            f"Doublet of {study.amplitude_deg:g} degrees, {study.period_s:g} s. J over the doublet, against the models "
+            f"that each method was tuned for. {METHODS} {COMPARABILITY if costs else ''}",
             [costs_table(found), certificates_table(found)],
             [
                 svg(costs_figure(found, study.methods(), costs, axis), f"{name} costs"),
@@ -87,7 +98,7 @@ def study_sections(found: Statistics) -> list[Section]:
     ]
 
 
-def _lead(study: Study, inner: str, outer: str) -> str:
+def _lead(study: AttitudeStudy, inner: str, outer: str) -> str:
     seconds, amplitude, bandwidth = study.excitation
     text = (
         f"{load_airframe(study.airframe).airframe.description}. PRBS of amplitude {amplitude:g} and {bandwidth:g} "
@@ -99,14 +110,14 @@ def _lead(study: Study, inner: str, outer: str) -> str:
         text += f" SISO: {omega:g}, {zeta:g}, {delay}; {omega_o:g}, {zeta_o:g}, {delay_o}."
     if study.siso_airframe != study.airframe:
         text += (
-            f" {SISO} is tuned on the log of {study.siso_airframe}, as the thesis had to; {SISO_OWN} is what this "
-            "vehicle's own log gives."
+            f" {SISO} is tuned on the log of {study.siso_airframe}, as in the thesis; {SISO_OWN} is tuned on "
+            "this vehicle's own log."
         )
     return text
 
 
-def gains_table(found: Statistics) -> ReportTable:
-    """Medians and spread of every method, beside the thesis'."""
+def gains_table(found: StudyStatistics) -> ReportTable:
+    """Median and spread of the gains of every method, beside the thesis' values."""
     number, printed = found.study.gains_table
     rows = []
     for matrix in MATRICES:
@@ -123,8 +134,8 @@ def gains_table(found: Statistics) -> ReportTable:
     return ReportTable(f"{found.study.name}: gains, output <- error", SPREAD_COLUMNS, rows)
 
 
-def costs_table(found: Statistics) -> ReportTable:
-    """Medians of every figure by method and axis, beside the thesis' real flights."""
+def costs_table(found: StudyStatistics) -> ReportTable:
+    """Medians of every figure by axis and method, beside the thesis' real flights."""
     number, axis_printed, printed = found.study.costs_table
     rows = []
     for axis in AXES:
@@ -138,8 +149,8 @@ def costs_table(found: Statistics) -> ReportTable:
     return ReportTable(caption, COST_COLUMNS, rows)
 
 
-def certificates_table(found: Statistics) -> ReportTable:
-    """What the certificate says of every method, from the log that this vehicle flew."""
+def certificates_table(found: StudyStatistics) -> ReportTable:
+    """Certificates of every method, from this vehicle's own log."""
     rows = []
     for method in found.study.methods():
         verdicts = ", ".join(f"{count}: {verdict}" for verdict, count in found.verdicts(method).items())
@@ -153,8 +164,8 @@ def certificates_table(found: Statistics) -> ReportTable:
     )
 
 
-def study_figures(found: Statistics) -> dict[str, Any]:
-    """The study's part of what ``--json`` prints."""
+def study_figures(found: StudyStatistics) -> dict[str, Any]:
+    """The study's part of the object that ``--json`` prints."""
     study = found.study
 
     def spread(values: Any) -> dict[str, Any]:
@@ -175,7 +186,7 @@ def study_figures(found: Statistics) -> dict[str, Any]:
     }
 
 
-def _printed(study: Study) -> Mapping[str, Any]:
+def _printed(study: AttitudeStudy) -> Mapping[str, Any]:
     number, axis, costs = study.costs_table
     found: dict[str, Any] = {}
     if study.gains_table[1]:
@@ -190,5 +201,5 @@ def _figure(name: str, value: float) -> str:
 
 
 def _plain(text: str) -> str:
-    """Without a minus sign before zero."""
+    """The number without a minus sign before zero."""
     return text.removeprefix("-") if not text.strip("-0.") else text

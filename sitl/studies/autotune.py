@@ -1,18 +1,18 @@
-"""A per-axis baseline: what an autopilot's own autotune makes of the same log.
+"""Per-axis baseline: the rule of PX4's autotune applied to the same log.
 
-PX4's multicopter autotune treats one axis at a time. It low-passes u and the rate at the gyro's cut-off (30 Hz) and
-high-passes them at 0.5 Hz, fits by least squares
+PX4's multicopter autotune tunes one axis at a time. It low-passes u and the rate at the gyro cut-off (30 Hz),
+high-passes them at 0.5 Hz, and fits by least squares
 
     y(k) = -a1 y(k-1) - a2 y(k-2) + b0 u(k-1) + b1 u(k-2) + b2 u(k-3)
 
-at a period of at most 10 ms, and designs a PID by generalised minimum variance: T. Yamamoto, K. Fujii, M. Kaneda,
+at a period of at most 10 ms. It then designs a PID by generalised minimum variance: T. Yamamoto, K. Fujii, M. Kaneda,
 "Design and implementation of a self-tuning PID controller" (1998). With B(1) = b0 + b1 + b2 and the wanted denominator
 P(z^-1) = 1 + p1 z^-1 + p2 z^-2 (rise time 0.14 s, critically damped), the polynomials of
 
     P = (1 - z^-1) A (1 + e1 z^-1) + z^-2 (f0 + f1 z^-1 + f2 z^-2)
 
-give the law (lambda + (1 + e1) B(1)) du = F(1) r - F y, which is an I-PD controller; lambda = 0.7 makes it gentler.
-The attitude gain asks for the full moment at 60 degrees of error, within 2 to 6.5 1/s. Written from that description.
+give the law (lambda + (1 + e1) B(1)) du = F(1) r - F y, which is an I-PD controller; lambda = 0.7 lowers the gains.
+The attitude gain commands full torque at 60 degrees of error, within 2 to 6.5 1/s. Written from that description.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from mimopilot.tuning.provenance import Provenance
 from numpy.typing import NDArray
 from scipy.signal import butter, sosfilt
 
-BAND_HZ = (0.5, 30.0)
-PERIOD = 0.010  # s, at most
-RISE_TIME, LAMBDA = 0.14, 0.7
-FULL_MOMENT = np.radians(60.0)
-ATTITUDE_GAIN = (2.0, 6.5)
-#: PX4's allocation of an X quadrotor makes this many times the moment of ours from one unit: lambda has that unit.
+BAND_HZ = (0.5, 30.0)  # high-pass and low-pass, PX4
+PERIOD = 0.010  # s, largest period of the model, PX4
+RISE_TIME, LAMBDA = 0.14, 0.7  # s, -: PX4
+FULL_MOMENT = np.radians(60.0)  # rad of error at full torque, PX4
+ATTITUDE_GAIN = (2.0, 6.5)  # 1/s, limits of PX4
+#: Torque of PX4's allocation of an X quadrotor over ours, per unit of u; lambda is in PX4's unit.
 UNIT = np.sqrt(2.0)
 
 Signal = NDArray[np.float64]
@@ -44,9 +44,9 @@ def autotune(experiment: Experiment, flown: Gains) -> Gains:
     Parameters
     ----------
     experiment : Experiment
-        One flight, each axis excited for a while.
+        One flight that excites each axis in turn.
     flown : Gains
-        The set that flew.
+        The gains that flew.
     """
     external, _ = external_signal(experiment)
     found = np.zeros((4, 2))
@@ -75,14 +75,14 @@ def identify_arx(parts: list[tuple[Signal, Signal]], Ts: float) -> tuple[Signal,
     Parameters
     ----------
     parts : list of (u, y)
-        Stretches without a gap, (N,) arrays each.
+        Segments without a gap, (N,) arrays each.
     Ts : float, s
 
     Returns
     -------
     a, b : (2,), (3,) arrays
     period : float, s
-        Of the model.
+        Sampling period of the model.
     """
     every = max(1, int(PERIOD / Ts + 1e-9))
     low, high = BAND_HZ
@@ -106,8 +106,9 @@ def minimum_variance_pid(a: Signal, b: Signal, Ts: float, rise_time: float = RIS
     a, b : (2,), (3,) arrays
         Denominator and numerator of the model.
     Ts : float, s
-        Its period.
+        Sampling period of the model.
     rise_time : float, s
+        Of the wanted closed loop.
     """
     # A critically damped pair of poles: P = (1 - exp(-2 Ts / rise time) z^-1)^2.
     pole = np.exp(-2.0 * Ts / rise_time)

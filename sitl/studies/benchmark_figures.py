@@ -1,4 +1,4 @@
-"""Figures of `mimopilot reproduce`: how near each closed loop is to the reference model."""
+"""Plots of the benchmark studies: each closed loop beside the reference model."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from mimopilot.sitl.flight.figures import MODEL, STYLES
 from mimopilot.sitl.studies.benchmarks import Benchmark
 from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 
-#: Okabe-Ito, and a style of its own each.
+#: (colour, line style) of each controller: Okabe and Ito's palette for colour blindness.
 LINES = (*STYLES, ("#E69F00", (0, (5, 1, 1, 1, 1, 1))))
 
 
 def step_figure(task: Benchmark, controllers: Mapping[str, LoopController], samples: int, title: str) -> Figure:
-    """Noise-free answer of both outputs (rows) to a unit step of each set-point (columns)."""
+    """Noise-free response of both outputs (rows) to a unit step of each setpoint (columns)."""
     figure, panels = _panels(title)
     time = np.arange(samples) * task.plant.Ts
     for j in range(2):
@@ -30,7 +30,7 @@ def step_figure(task: Benchmark, controllers: Mapping[str, LoopController], samp
             for i in range(2):
                 line = {"color": colour, "linestyle": style, "linewidth": 1.6, "label": label}
                 panels[i, j].step(time, y[:, i], where="post", **line)
-        panels[0, j].set_title(f"step of set-point {j + 1}", fontsize=10)
+        panels[0, j].set_title(f"step of setpoint {j + 1}", fontsize=10)
         panels[1, j].set_xlabel("time [s]")
         panels[j, 0].set_ylabel(f"output {j + 1} [-]")
     panels[0, 0].legend(fontsize=8)

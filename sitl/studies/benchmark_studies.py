@@ -1,4 +1,4 @@
-"""Chapter 5 of the thesis: its two benchmarks, computed again and printed beside its own figures."""
+"""Chapter 5 of the thesis: its two benchmarks computed again, beside the printed values."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from mimopilot.sitl.flight.figures import svg
 from mimopilot.sitl.studies.benchmark_figures import sensitivity_figure, step_figure
 from mimopilot.sitl.studies.benchmarks import Benchmark, Signal, excitation, lv100, numerical_example
-from mimopilot.sitl.studies.part import Part
+from mimopilot.sitl.studies.report_part import ReportPart
 from mimopilot.tuning.design.refine import refine
 from mimopilot.tuning.estimation.cbt_ift import Comparison, correlation_based_tuning, iterative_feedback_tuning
 from mimopilot.tuning.estimation.siso import siso_vrft
@@ -24,10 +24,11 @@ from mimopilot.tuning.plant.pbsid import pbsid
 
 from mimopilot.common.html_report import ReportTable, Section
 
-SAMPLES = 5000
-IFT_SAMPLES = 1000
-RUNS, LENGTHS, CHUNK, WORKERS = 500, (1000, 10_000), 25, 2
-SEEDS = 20
+SAMPLES = 5000  # per experiment
+IFT_SAMPLES = 1000  # per experiment of Iterative Feedback Tuning
+RUNS, LENGTHS = 500, (1000, 10_000)  # experiments of Table 5.2, and their lengths in samples
+CHUNK, WORKERS = 25, 2  # experiments simulated at once; threads
+SEEDS = 20  # experiments per design in the one-experiment comparison
 CONTROLLER_COLUMNS = ("controller", "(1,1)", "(1,2)", "(2,1)", "(2,2)", "J_MR", "experiments")
 SPREAD_COLUMNS = ("gain, N", "mean", "std", "printed |mean|", "printed std")
 
@@ -40,7 +41,7 @@ def one_experiment(task: Benchmark, design: str, seed: int, samples: int = SAMPL
 
 
 def tune_once(task: Benchmark, design: str, seed: int) -> dict[str, LoopController]:
-    """Every method that needs one experiment, on the same one.
+    """Tune by every method that needs one experiment, on the same experiment.
 
     Parameters
     ----------
@@ -69,14 +70,14 @@ def tune_once(task: Benchmark, design: str, seed: int) -> dict[str, LoopControll
 
 
 def run_cbt(task: Benchmark, seed: int) -> Comparison:
-    """Correlation-based Tuning: 8 experiments of 5000 samples, binary input of amplitude 1."""
+    """Tune by Correlation-based Tuning: 8 experiments of 5000 samples, binary input of amplitude 1."""
     generator = np.random.default_rng(seed)
     w = generator.choice([-1.0, 1.0], SAMPLES)
     return correlation_based_tuning(lambda c, r, u: task.run(c, r, u, generator), task.models, w)
 
 
 def run_ift(task: Benchmark, seed: int) -> Comparison:
-    """Iterative Feedback Tuning: 6 iterations, experiments of 1000 samples, binary set-point of amplitude 1."""
+    """Tune by Iterative Feedback Tuning: 6 iterations of 1000-sample experiments, binary setpoint of amplitude 1."""
     generator = np.random.default_rng(seed)
     r = generator.choice([-1.0, 1.0], (IFT_SAMPLES, 2))
     assert task.initial is not None
@@ -84,7 +85,7 @@ def run_ift(task: Benchmark, seed: int) -> Comparison:
 
 
 def gain_spread(task: Benchmark, samples: int, runs: int, seed: int) -> Signal:
-    """Gains of repeated experiments, simulation included: Table 5.2.
+    """Gains from repeated simulated experiments, as in Table 5.2.
 
     Parameters
     ----------
@@ -114,7 +115,7 @@ def gain_spread(task: Benchmark, samples: int, runs: int, seed: int) -> Signal:
         return np.array([gain for part in pool.map(chunk, starts) for gain in part])
 
 
-def study_numerical_example() -> Part:
+def study_numerical_example() -> ReportPart:
     """Table 5.3 and Figure 5.3: noise-free MIMO and SISO VRFT."""
     task = numerical_example()
     half = 1000
@@ -131,21 +132,21 @@ def study_numerical_example() -> Part:
     table = ReportTable("Table 5.3: (B0 z + B1)/(z - 1), noise-free", CONTROLLER_COLUMNS, _rows(task, shown, {}))
     figure = svg(step_figure(task, found, 60, "Steps of the numerical example: MIMO and SISO VRFT"), "steps")
     lead = (
-        "The 2x2 numerical example of the thesis, tuned without noise: one input after the other, white, in open loop."
+        "The 2x2 numerical example of the thesis, tuned without noise: white inputs, one after the other, in open loop."
     )
     section = Section("Table 5.3 and Figure 5.3", "J_MR: (3.1), here on the true plant.", [table], [figure])
-    return Part(lead, [section], {"table_5_3": _numbers(task, shown, {})})
+    return ReportPart(lead, [section], {"table_5_3": _numbers(task, shown, {})})
 
 
-def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
+def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> ReportPart:
     """Tables 5.1 and 5.2, Figures 5.1 and 5.2, and J_MR from one experiment over noise seeds.
 
     Parameters
     ----------
     runs : int
-        Experiments a length in Table 5.2.
+        Experiments per length in Table 5.2.
     seeds : int
-        Experiments a design in the one-experiment comparison.
+        Experiments per design in the one-experiment comparison.
     """
     task = lv100()
     with _progress("LV100: one-experiment methods"):
@@ -168,7 +169,7 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
     ours |= {name: comparison.controller for name, comparison in comparisons.items()}
     printed = _printed(task, "table_5_1")
     corrected = np.array(task.printed["table_5_1"]["VRFT"]["B1"])
-    corrected[1, 0] = -19.2  # Table 5.1 contradicts Table 5.2 here
+    corrected[1, 0] = -19.2  # Table 5.1 contradicts Table 5.2, which has this value
     printed["VRFT with (2,1) corrected"] = LoopController.from_polynomial(
         printed["VRFT"].polynomial()[0], corrected, 0.1
     )
@@ -190,7 +191,7 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
                 for i, name in enumerate(("u", "y"))
             ],
         ),
-        ReportTable(f"Table 5.2: gains of {runs} experiments a length", SPREAD_COLUMNS, _spread_rows(task, gains)),
+        ReportTable(f"Table 5.2: gains of {runs} experiments per length", SPREAD_COLUMNS, _spread_rows(task, gains)),
     )
     main = {
         name: ours[name] for name in ("VRFT, instrument u_bar, W = I", "VRFT, refined on a PBSID model", "CbT", "IFT")
@@ -202,10 +203,10 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
             tables[:1],
             [
                 svg(sensitivity_figure(task, main, "LV100: complementary sensitivity"), "sensitivity"),
-                svg(step_figure(task, main, 60, "LV100: steps of the set-points"), "steps"),
+                svg(step_figure(task, main, 60, "LV100: steps of the setpoints"), "steps"),
             ],
         ),
-        Section("One experiment", "The plant is known to none of the methods; J_MR is computed on it.", tables[1:2]),
+        Section("One experiment", "No method knows the plant; J_MR is computed on it.", tables[1:2]),
         Section("Table 5.2", "VRFT, instrument u_bar, W = I. The thesis prints magnitudes.", tables[2:]),
     ]
     figures = {
@@ -217,7 +218,7 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> Part:
         },
         "table_5_2_seconds": seconds,
     }
-    return Part("The LV100 gas turbine, M = 0.4/(z - 0.6) I, Ts = 0.1 s.", sections, figures)
+    return ReportPart("The LV100 gas turbine, M = 0.4/(z - 0.6) I, Ts = 0.1 s.", sections, figures)
 
 
 def _progress(text: str) -> Any:

@@ -1,4 +1,4 @@
-"""The thesis' two benchmark plants, and experiments on them. Benchmark signals have no unit."""
+"""The thesis' two benchmark plants and experiments on them. Their signals have no unit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete
 
 TABLES = Path(__file__).with_name("thesis_tables.json")
-#: Frequencies of J_MR, (3.1).
+#: Number of frequencies for J_MR, (3.1) of the thesis.
 GRID = 4000
 
 Signal = NDArray[np.float64]
@@ -24,16 +24,16 @@ Signal = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Benchmark:
-    """A known 2x2 plant and the task set on it.
+    """A known 2x2 plant and its tuning task.
 
     Attributes
     ----------
     plant : StateSpace
-        The truth, which no method sees.
+        The true plant; no tuning method uses it.
     model : ReferenceModel
-        Wanted complementary sensitivity of both outputs.
+        Desired complementary sensitivity of both outputs.
     initial : LoopController or None
-        What is in the loop during experiments; None: they are in open loop.
+        Controller during experiments; None: open loop.
     deviation : float
         Standard deviation of the white measurement noise.
     printed : dict
@@ -48,11 +48,11 @@ class Benchmark:
 
     @property
     def models(self) -> list[ReferenceModel]:
-        """One model an output."""
+        """The reference model of each output."""
         return [self.model] * 2
 
     def cost(self, controller: LoopController) -> float:
-        """J_MR (3.1) on the true plant; infinite when the true loop is not stable."""
+        """J_MR, (3.1) of the thesis, on the true plant; infinite when the loop is not stable."""
         if not closed_loop(self.plant, controller).stable:
             return float("inf")
         return model_reference_cost(self.plant, controller, self.models, GRID)
@@ -64,16 +64,16 @@ class Benchmark:
         u_bar: Signal,
         generator: np.random.Generator,
     ) -> tuple[Signal, Signal]:
-        """One experiment, or several at once, from rest.
+        """Run one experiment, or several at once, from rest.
 
         Parameters
         ----------
         controller : LoopController or None
-            In the loop; None: open loop, where r has no effect.
+            Controller in the loop; None: open loop, r has no effect.
         r, u_bar : (N, 2) or (N, runs, 2) arrays
-            Set-point, and excitation added at the plant's input.
+            Setpoint, and excitation added at the plant input.
         generator : numpy.random.Generator
-            Of the measurement noise.
+            For the measurement noise.
 
         Returns
         -------
@@ -94,7 +94,7 @@ def excitation(samples: int, design: str, generator: np.random.Generator, amplit
     ----------
     samples : int
     design : str
-        ``in turn``: one axis in each half, as the thesis does. ``together``: both axes all the time.
+        ``in turn``: one axis in each half, as in the thesis. ``together``: both axes all the time.
     generator : numpy.random.Generator
     amplitude : float
 

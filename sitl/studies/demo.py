@@ -1,4 +1,4 @@
-"""The whole way, once: from a flight to tested firmware."""
+"""`mimopilot demo`: the whole process from a flight to tested firmware."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.mavlink.simulator_api import lockstep
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
+from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.reader import read_log
@@ -35,14 +36,14 @@ from mimopilot.common.html_report import ReportTable, Section, write_report
 
 AIRFRAME = "adam0"
 METHODS = ("default", "siso", "mimo")
+#: PRBS of the experiment: s per axis, amplitude (normalised torque), bandwidth (rad/s).
 SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH = 20.0, 0.15, 50.0
-DOUBLET_DEG, DOUBLET_S = 22.5, 0.42
-TABLES = Path(__file__).with_name("thesis_tables.json")
+DOUBLET_DEG, DOUBLET_S = 22.5, 0.42  # deg, s: the thesis' simulated doublet
 
 
 @dataclass(frozen=True, eq=False)
-class Summary:
-    """What the demo found: paths, gain sets, figures by axis and method, and the seconds it took."""
+class DemoSummary:
+    """Result of the demo: paths, gain sets, figures by axis and method, and the run time (s)."""
 
     paths: dict[str, Path]
     gains: dict[str, Gains]
@@ -70,7 +71,7 @@ class Summary:
 
 @contextmanager
 def _stage(text: str) -> Iterator[None]:
-    """Say on a terminal's standard error what is being done."""
+    """Show the current stage on standard error if that is a terminal."""
     if not sys.stderr.isatty():
         yield
         return
@@ -80,15 +81,15 @@ def _stage(text: str) -> Iterator[None]:
         yield
 
 
-def run_demo(out: Path, seed: int) -> Summary:
+def run_demo(out: Path, seed: int) -> DemoSummary:
     """Fly, tune, generate, compile, fly again, compare with MAVLink, report.
 
     Parameters
     ----------
     out : Path
-        Folder for everything that is made.
+        Folder for all output files.
     seed : int
-        Of all randomness.
+        Seed of all random numbers.
 
     Raises
     ------
@@ -102,7 +103,7 @@ def run_demo(out: Path, seed: int) -> Summary:
     vehicle = load_airframe(AIRFRAME)
     airframe, gains = vehicle.airframe, {"default": vehicle.default_gains()}
 
-    with _stage("experiment: 40 s of flight with a PRBS moment on roll, then on pitch (the first run compiles)"):
+    with _stage("experiment: 40 s of flight with a PRBS torque on roll, then on pitch (the first run compiles)"):
         controllers = {"default": _controller(gains["default"], firmware["default"])}
         generator = np.random.default_rng(seed)
         scenario = excitation_flight(SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH, gains["default"].Ts, generator)
@@ -117,7 +118,7 @@ def run_demo(out: Path, seed: int) -> Summary:
         for method, path in paths.items():
             gains[method].save(path)
 
-    with _stage("firmware: emitting and compiling the C++ of each gain set"):
+    with _stage("firmware: generating and compiling the C++ of each gain set"):
         for method in ("siso", "mimo"):
             controllers[method] = _controller(gains[method], firmware[method])
 
@@ -126,7 +127,7 @@ def run_demo(out: Path, seed: int) -> Summary:
         for axis in AXES:
             task = doublet(axis, float(np.radians(DOUBLET_DEG)), DOUBLET_S, gains["default"].Ts)
             flights[axis] = {m: _doublet(airframe, gains[m], controllers[m], task, seed) for m in METHODS}
-        speed = _same_over_mavlink(airframe, gains["mimo"], controllers["mimo"], flights["roll"]["mimo"], seed)
+        speed = _check_over_mavlink(airframe, gains["mimo"], controllers["mimo"], flights["roll"]["mimo"], seed)
 
     figures = {
         axis: {
@@ -138,11 +139,20 @@ def run_demo(out: Path, seed: int) -> Summary:
     with _stage("report"):
         _write_report(report, gains, figures, flights, flight)
     samples = len(flights["roll"]["mimo"].record)
-    return Summary(paths, gains, figures, report, log, samples, speed, time.monotonic() - begin)
+    return DemoSummary(
+        paths=paths,
+        gains=gains,
+        figures=figures,
+        report=report,
+        log=log,
+        mavlink_samples=samples,
+        mavlink_speed=speed,
+        seconds=time.monotonic() - begin,
+    )
 
 
 def _controller(gains: Gains, folder: Path) -> NativeController:
-    """Emit, compile and load the C++ of a set; it starts with the gains that were compiled in."""
+    """Generate, compile and load the C++ of a gain set, with these gains compiled in."""
     return NativeController(load_native(gains, folder))
 
 
@@ -157,10 +167,10 @@ def _doublet(airframe: Airframe, gains: Gains, controller: NativeController, tas
     return _survived(fly(airframe, Autopilot(airframe, gains, fresh), task, seed))
 
 
-def _same_over_mavlink(
+def _check_over_mavlink(
     airframe: Airframe, gains: Gains, controller: NativeController, flight: Flight, seed: int
 ) -> float:
-    """Fly again as two processes; the moments must be the same bits. Returns times real time."""
+    """Repeat a flight over MAVLink and check that all torques are equal bit for bit; returns the real-time factor."""
     autopilot = Autopilot(airframe, gains, NativeController(controller.library))
     autopilot.warm_up()
     with plant_process(AIRFRAME, 0, gains.Ts, seed, None) as port:
@@ -172,7 +182,7 @@ def _same_over_mavlink(
     )
     if len(different):
         raise SitlError(
-            f"over MAVLink {len(different)} of {len(record)} moments differ from the flight in process, first at "
+            f"over MAVLink {len(different)} of {len(record)} torques differ from the flight in process, first at "
             f"sample {different[0]}",
             exit_code=1,
         )
@@ -191,7 +201,7 @@ def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
     rows = []
     for name in MATRICES:
         if name == "Kff_i":
-            continue  # zero in every set
+            continue  # zero in every gain set
         for label, values in sets:
             matrix = values[name] if isinstance(values, dict) else getattr(values, name)
             found = {} if isinstance(values, dict) else values.provenance.standard_deviation
@@ -252,22 +262,22 @@ def _write_report(
     sections = [
         Section(
             "Experiment",
-            f"PRBS moment of amplitude {AMPLITUDE:g} and bandwidth {BANDWIDTH:g} rad/s on roll, then on pitch, "
+            f"PRBS torque of amplitude {AMPLITUDE:g} and bandwidth {BANDWIDTH:g} rad/s on roll, then on pitch, "
             "under the default gains.",
             figures=[svg(experiment_figure(experiment), "experiment")],
         ),
         Section(
             "Gains",
-            "Beside those that the thesis prints for its own simulator, whose inertia it does not give. In brackets: "
-            "standard deviation under repeated noise. Kp_o in 1/s, Kp_i in s, Ki_i dimensionless, Kd_i in s^2; a small "
-            "negative Kd_i means that these models ask for no damping beyond the vehicle's own. SISO tunes each axis "
-            "by itself with the same instruments.",
+            "Beside the thesis' values for its own simulator, whose inertia is not printed. In brackets: the spread to "
+            "expect if the flight were repeated with fresh noise (standard deviation). Kp_o in 1/s, Kp_i in s, Ki_i "
+            "dimensionless, Kd_i in s^2; a small negative Kd_i means that these models need no damping beyond the "
+            "vehicle's own. SISO tunes each axis by itself with the same instruments.",
             tables=[ReportTable("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
         ),
         Section(
             "Doublets",
             f"{DOUBLET_DEG:g} degrees, {DOUBLET_S:g} s. J in rad^2 and rad^2/s^2, over the doublet. The flight over "
-            "MAVLink (roll, MIMO) gave the same moments bit for bit.",
+            "MAVLink (roll, MIMO) gave the same torques bit for bit.",
             tables=[ReportTable("Performance figures, (6.1)-(6.4)", FIGURE_COLUMNS, _figure_rows(figures))],
             figures=doublets,
         ),
@@ -275,13 +285,13 @@ def _write_report(
     write_report(path, "mimopilot demo", lead, sections)
 
 
-def print_summary(summary: Summary) -> None:
-    """The tables, and where everything is."""
+def print_summary(summary: DemoSummary) -> None:
+    """Print the tables and the paths of all files."""
     print_table("Gains beside Table 5.4 of the thesis", GAIN_COLUMNS, _gain_rows(summary.gains))
     title = f"Doublet of {DOUBLET_DEG:g} deg, {DOUBLET_S:g} s: J in rad^2 and rad^2/s^2"
     print_table(title, FIGURE_COLUMNS, _figure_rows(summary.figures))
     print(
-        f"over MAVLink (roll, MIMO): {summary.mavlink_samples} moments, 0 differ from the flight in process; "
+        f"over MAVLink (roll, MIMO): {summary.mavlink_samples} torques, 0 differ from the flight in process; "
         f"{summary.mavlink_speed:.0f} times real time"
     )
     print(f"log     {summary.log}")

@@ -1,4 +1,4 @@
-"""What the multivariable method is expected to do, and whether it does: one row for each study and axis."""
+"""Expected performance of the multivariable method: limits on ratios of medians, and whether they are met."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from mimopilot.sitl.flight.scenario import AXES
-from mimopilot.sitl.studies.attitude import BEST, MIMO, REFINED, SISO
-from mimopilot.sitl.studies.attitude_runs import Statistics
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
+from mimopilot.sitl.studies.attitude_study import BEST, MIMO, REFINED, SISO
 
 from mimopilot.common.html_report import ReportTable
 
-#: J_M,o over that of the best on the true plant, effort over SISO's, and how equal "no worse" is.
+#: Limits: J_M,o over the best on the true plant, effort over SISO's, J_M,o over SISO's.
 NEAR_BEST, EFFORT, NO_WORSE = 1.15, 1.10, 1.0
 COLUMNS = ("study", "medians", "at most", MIMO, "", REFINED, "")
 
@@ -23,10 +23,11 @@ class Expectation:
     Attributes
     ----------
     study, axis, figure : str
-        Of `sitl.flight.metrics.Performance`.
+        `figure` is a field of `sitl.flight.metrics.Performance`.
     over : str
-        Method whose figure it is compared with.
+        Method in the denominator.
     text : str
+        Label of the row.
     limit : float
     ratios : dict
         Method -> ratio.
@@ -41,12 +42,12 @@ class Expectation:
     ratios: dict[str, float]
 
     def met(self, method: str) -> bool:
-        """Whether the method keeps the limit."""
+        """Whether a method is within the limit."""
         return self.ratios[method] <= self.limit
 
 
-def expectations(found: Sequence[Statistics]) -> list[Expectation]:
-    """Every expectation of every study, on the medians over the seeds."""
+def expectations(found: Sequence[StudyStatistics]) -> list[Expectation]:
+    """All expectations of all studies, for the medians over the seeds."""
     rows = []
     for statistics in found:
         offaxis = statistics.study.offaxis
@@ -66,7 +67,7 @@ def expectations(found: Sequence[Statistics]) -> list[Expectation]:
 
 
 def expectations_table(rows: Sequence[Expectation]) -> ReportTable:
-    """Met or not, with the figure."""
+    """Table of the ratios and whether each is met."""
 
     def cells(row: Expectation, method: str) -> list[str]:
         return [f"{row.ratios[method]:.3f}", "met" if row.met(method) else "NOT met"]

@@ -1,7 +1,7 @@
-"""The best that the controller's structure can do on the true plant: the yardstick, not a method.
+"""The best gains of the controller structure on the true plant: a reference for the methods, not a method.
 
-It flies the doublets in the bench itself, without noise, and changes every gain until nothing gets better. A vehicle's
-owner cannot do that; no data-driven method may use it.
+The doublets are flown in simulation without noise, and all gains are optimised directly. This needs the true plant, so
+no data-driven method may use it.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from mimopilot.tuning.design.refine_manoeuvre import OTHER_AXIS, typical_sizes
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import PlantResponse
-from mimopilot.tuning.plant.inertia import RigidBody
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel
 from numpy.typing import NDArray
 
-#: Every gain of the structure that the thesis' tables have.
+#: The optimised gains: those in the thesis' tables.
 FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
-#: Relative step of the differences: the flown controller is single precision.
+#: Relative step of the finite differences: coarse, because the controller computes in float32.
 STEP = 1e-3
-#: Limits of `Task.examine`, and what a gain set that cannot fly costs (rad^2).
-LIMITS, LOST = 5, 10.0
+LIMITS = 5  # constraints in `OptimumTask.examine`
+LOST = 10.0  # rad^2: cost of gains outside the range of their parameters
 
 Signal = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """What is to be flown best.
+class OptimumTask:
+    """The optimisation task: vehicle, doublets, reference model and constraints.
 
     Attributes
     ----------
@@ -50,15 +50,18 @@ class Task:
     doublets : sequence of 2 Scenario
         Roll, pitch.
     outer : ReferenceModel
-        What the attitude should follow.
+        Reference model of the attitude.
     plant : PlantResponse
-        Response of the vehicle that a log gives: the gains must be ones that could be certified from it.
+        Frequency response of the vehicle from a log; the gains must be certifiable with it.
+    body : RigidBody
+        Rigid-body fit of the same vehicle.
     peak : float
-        Largest peak of the sensitivity for that.
+        Largest allowed peak of the sensitivity.
     effort : sequence of 2 float or None
-        RMS of the moments allowed in each doublet; None: as much as it takes.
+        Largest RMS of the torques in each doublet; None: no limit.
     integral : float, 1/s
-        Integral action that is needed, see `tuning.plant.inertia.RigidBody.least`: a vehicle must find its trim.
+        Least integral action, see `tuning.plant.rigid_body_fit.RigidBody.least`: the integrators must trim the
+        vehicle.
     """
 
     airframe: Airframe
@@ -72,20 +75,26 @@ class Task:
     integral: float
 
     def fly(self, gains: Gains) -> list[Flight]:
-        """Both doublets, without noise."""
+        """Fly both doublets without noise."""
         return [
             fly(self.airframe, Autopilot(self.airframe, gains, NativeController(self.library, gains)), task, 0, False)
             for task in self.doublets
         ]
 
     def examine(self, gains: Gains) -> tuple[Signal, list[float]]:
-        """Distance of both angles to the model in each sample, weighed as the method does so that the sum of squares
-        is a mean square (rad^2), and what the limits leave.
+        """Fly the doublets with a gain set.
+
+        Returns
+        -------
+        residuals : (N,) array, rad
+            Errors of both angles to the model, weighted as in the method; their sum of squares is a mean square.
+        margins : list of `LIMITS` float
+            Relative distance to each constraint; negative when violated.
         """
         spans = [stop - start for start, stop in (task.window for task in self.doublets)]
         try:
             flights = self.fly(gains)
-        except TuningError:  # a gain outside of the range of its parameter
+        except TuningError:  # a gain is outside the range of its parameter
             samples = 2 * sum(spans)
             return np.full(samples, np.sqrt(LOST / samples)), [-1.0] * LIMITS
         errors = []
@@ -106,18 +115,18 @@ class Task:
 
 
 def flown_effort(flight: Flight) -> float:
-    """RMS of the roll and pitch moments together over the manoeuvre."""
+    """RMS of the roll and pitch torques together over the manoeuvre, normalised."""
     return float(moment_rms(flight.record["moment"][slice(*flight.scenario.window), :2].astype(np.float64)))
 
 
-def best_gains(task: Task, starts: Sequence[Gains]) -> Gains:
-    """The gains that keep both angles nearest to the model in both doublets within the limits, from several starts.
+def best_gains(task: OptimumTask, starts: Sequence[Gains]) -> Gains:
+    """Minimise the errors of both angles to the model in both doublets within the constraints.
 
     Parameters
     ----------
-    task : Task
+    task : OptimumTask
     starts : sequence of Gains
-        Where the descent begins; the best end counts.
+        Starting points of the descent; the best result is returned.
     """
     ends = []
     for start in starts:

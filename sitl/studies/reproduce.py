@@ -1,4 +1,4 @@
-"""`mimopilot reproduce`: the thesis' tables and figures computed again, one report."""
+"""`mimopilot reproduce`: the thesis' tables and figures computed again, in one report."""
 
 from __future__ import annotations
 
@@ -7,34 +7,34 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from mimopilot.sitl.studies.attitude import studies
-from mimopilot.sitl.studies.attitude_report import IN_KIND, study_figures, study_sections
-from mimopilot.sitl.studies.attitude_runs import Statistics, run_studies
+from mimopilot.sitl.studies.attitude_report import COMPARABILITY, study_figures, study_sections
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics, run_studies
+from mimopilot.sitl.studies.attitude_study import studies
 from mimopilot.sitl.studies.benchmark_studies import study_lv100, study_numerical_example
 from mimopilot.sitl.studies.expectations import expectations, expectations_table
-from mimopilot.sitl.studies.part import Part
+from mimopilot.sitl.studies.report_part import ReportPart
 
 from mimopilot.common.console import print_table
 from mimopilot.common.files import inside
 from mimopilot.common.html_report import ReportTable, Section, write_report
 
-#: Noise seeds of the attitude studies: what is expected is expected of their medians.
+#: Noise seeds of the attitude studies; the expectations apply to the medians over them.
 SEEDS = 50
-BENCHMARKS: dict[str, Callable[[], Part]] = {"numerical-example": study_numerical_example, "lv100": study_lv100}
+BENCHMARKS: dict[str, Callable[[], ReportPart]] = {"numerical-example": study_numerical_example, "lv100": study_lv100}
 STUDIES = (*BENCHMARKS, *studies())
 ALL = "all"
 
 UNMET = (
-    "Where J_M,o misses the best possible, the doublet drives the motors to their limits (coupled, adam0-sim, adam0). "
-    "A rotor's lag acts on its speed, thrust goes with the square: at the limits moments come faster than in the small "
-    "motions of the log, so a model from that log overrates the effort of brisk gains and asks for less than is "
-    "allowed. adam0-small is the same vehicle with a doublet that stays away from the limits."
+    "J_M,o misses the expectation if the doublet saturates the motors (coupled, adam0-sim, adam0). Rotor lag acts on "
+    "speed, and thrust is proportional to its square. So near the limits torque builds up faster than in the small "
+    "motions of the log. A model from that log overestimates the effort of high gains, and the refinement uses less "
+    "effort than allowed. adam0-small is the same vehicle with a doublet that does not saturate the motors."
 )
 
 
 @dataclass(frozen=True)
 class Reproduction:
-    """What was computed: the object that ``--json`` prints, the tables, and the report."""
+    """Result of `reproduce`: figures for ``--json``, tables, and the path of the report."""
 
     figures: dict[str, Any]
     tables: tuple[ReportTable, ...]
@@ -46,7 +46,7 @@ class Reproduction:
 
 
 def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = None) -> Reproduction:
-    """One study, or all of them, into one report.
+    """Run one study, or all, and write one report.
 
     Parameters
     ----------
@@ -55,9 +55,9 @@ def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = No
     out : Path
         Folder of the report, NAME.html.
     seeds : int
-        Experiments of each attitude study.
+        Experiments per attitude study.
     workers : int, optional
-        Processes; by default one a core. The result does not depend on it.
+        Processes; by default one per core. The result does not depend on it.
     """
     report = inside(out, f"{name}.html")
     chosen = STUDIES if name == ALL else (name,)
@@ -73,21 +73,21 @@ def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = No
     return Reproduction({study: part.figures for study, part in parts.items()}, tables, report)
 
 
-def _attitude_parts(found: Sequence[Statistics], seeds: int) -> dict[str, Part]:
-    """Expectations of all, then every study."""
+def _attitude_parts(found: Sequence[StudyStatistics], seeds: int) -> dict[str, ReportPart]:
+    """The expectations of all studies, then every study."""
     rows = expectations(found)
     section = Section("Expectations", f"Ratios of medians over {seeds} seeds. {UNMET}", [expectations_table(rows)])
     lead = (
-        "Each vehicle flies an experiment on the bench, is tuned from it by every method, and flies doublets. Its "
-        f"constants are class values. {IN_KIND}"
+        "Each vehicle flies an experiment in simulation, is tuned from it by every method, and flies doublets. Its "
+        f"constants are class values. {COMPARABILITY}"
     )
     table = [{**asdict(row), "met": {method: row.met(method) for method in row.ratios}} for row in rows]
-    studied = {one.study.name: Part("", study_sections(one), study_figures(one)) for one in found}
-    return {"expectations": Part(lead, [section], {"seeds": seeds, "rows": table}), **studied}
+    studied = {one.study.name: ReportPart("", study_sections(one), study_figures(one)) for one in found}
+    return {"expectations": ReportPart(lead, [section], {"seeds": seeds, "rows": table}), **studied}
 
 
 def print_reproduction(found: Reproduction) -> None:
-    """The tables, and where the report is."""
+    """Print the tables and the path of the report."""
     for table in found.tables:
         print_table(table.caption, table.columns, table.rows)
     print(f"report  {found.report}")

@@ -18,7 +18,7 @@ from mimopilot.tuning.design.cascade import NO_MOTORS, tune
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.motors import fit_motors, rotor_lag, saturation_warnings
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.spec import Manoeuvre
 
 from tests.tuning.logs.flights import make_flight, microseconds, px4_topics, write_ulog
@@ -58,7 +58,7 @@ def test_the_motor_that_carries_a_mass_hovers_higher(logs):
 
 @pytest.mark.parametrize("name", ["adam0_nominal", "adam0_perturbed", "antr"])
 def test_the_lag_of_the_rotors_is_a_pole_of_the_identified_plant(logs, name):
-    lag = rotor_lag(Measured(logs[name]).identified.model.plant)
+    lag = rotor_lag(PlantEstimates(logs[name]).identified.model.plant)
     # Half a period is the hold's.
     assert lag == pytest.approx(load_airframe(name).airframe.motors.time_constant, rel=0.08)
 
@@ -110,7 +110,7 @@ def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axi
         angles, _ = model.fly(GainStack.of(gains))
         return np.degrees(np.sqrt(np.mean((angles[axis, 0, :, axis] - flown) ** 2)))
 
-    model = doublet_model(Measured(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
+    model = doublet_model(PlantEstimates(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
     without = deviation_deg(dataclasses.replace(model, motors=None))
     assert deviation_deg(model) < 0.25  # of 40
     assert deviation_deg(model) < without / 3
@@ -118,7 +118,7 @@ def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axi
 
 def test_the_drawn_out_switch_of_the_integral_hardly_changes_a_doublet(logs):
     log = logs["adam0_nominal"]
-    model = doublet_model(Measured(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
+    model = doublet_model(PlantEstimates(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
     stack = GainStack.of(tune(log, thesis()))
     sharp, soft = model.fly(stack)[0], model.fly(stack, 0.05)[0]
     assert 0 < np.degrees(np.abs(soft - sharp).max()) < 0.5

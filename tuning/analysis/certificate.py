@@ -25,7 +25,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import COHERENT, DRAWS, MIN_FREQUENCIES, PlantResponse
-from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
 from numpy.typing import NDArray

@@ -9,7 +9,7 @@ import numpy as np
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.motors import Motors, rotor_lag
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.spec import Manoeuvre
 from mimopilot.tuning.statespace import StateSpace
 from numpy.typing import NDArray
@@ -86,12 +86,12 @@ class DoubletModel:
         return self.motors.mixer, inverse, self.motors.hover, float(np.exp(-self.plant.Ts / lag)) if lag else 0.0
 
 
-def doublet_model(measured: Measured, manoeuvre: Manoeuvre) -> DoubletModel:
+def doublet_model(measured: PlantEstimates, manoeuvre: Manoeuvre) -> DoubletModel:
     """The manoeuvre around the plant that was identified from an experiment.
 
     Parameters
     ----------
-    measured : Measured
+    measured : PlantEstimates
     manoeuvre : Manoeuvre
 
     Raises

@@ -20,7 +20,7 @@ from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import PlantResponse
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import SecondOrder, second_order
 from mimopilot.tuning.spec import TuningSpec
 from numpy.typing import NDArray
@@ -161,7 +161,7 @@ def advise(
         When the log cannot be tuned from at all, no candidate is certified, or a non-minimum-phase zero forbids all.
     """
     doublet = doublet or Doublet()
-    measured = Measured(experiment)
+    measured = PlantEstimates(experiment)
     plant = measured.response
     candidates: list[Candidate] = []
     cutoffs = _cutoffs(experiment, spec)

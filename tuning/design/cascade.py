@@ -26,8 +26,8 @@ from mimopilot.tuning.estimation.vrft import LoopEstimate, vrft
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains, Limits, YawGains
 from mimopilot.tuning.law import Filters, rebuild_rate_setpoint
-from mimopilot.tuning.plant.inertia import RigidBody
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.spec import TuningSpec
@@ -231,7 +231,7 @@ def _rate_setpoint(
 def tune(
     experiment: Experiment,
     spec: TuningSpec | None = None,
-    measured: Measured | None = None,
+    measured: PlantEstimates | None = None,
     repeat: Experiment | None = None,
 ) -> Gains:
     """Gains of the whole cascade: VRFT of both loops, quality gates, refinement, certificate.
@@ -242,7 +242,7 @@ def tune(
         One flight with excitation.
     spec : TuningSpec, optional
         Method and reference models.
-    measured : Measured, optional
+    measured : PlantEstimates, optional
         What the experiment says of the vehicle, when it is at hand already.
     repeat : Experiment, optional
         See `estimate`.
@@ -258,7 +258,7 @@ def tune(
         As `estimate`, or when the gains would be nonsense, or unstable.
     """
     spec = spec or TuningSpec()
-    measured = measured or Measured(experiment)
+    measured = measured or PlantEstimates(experiment)
     excited_stretches(experiment, external_signal(experiment)[0], spec.method)
     found = estimate(experiment, spec, repeat, measured.body)
     plant = measured.response
@@ -328,7 +328,7 @@ def tune(
     return tuned
 
 
-def _certified(gains: Gains, measured: Measured, spec: TuningSpec) -> Gains:
+def _certified(gains: Gains, measured: PlantEstimates, spec: TuningSpec) -> Gains:
     """The gains with their certificate."""
     inner, outer = spec.models("inner", gains.Ts), spec.models("outer", gains.Ts)
     sha256, thresholds = measured.experiment.sha256, spec.certificate
@@ -364,7 +364,7 @@ def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | No
             f"{experiment.source}: one unit of moment stands for {theirs} N m (roll, pitch), in the gains for {ours}; "
             "convert the gains (mimopilot convert), or certify them with a log of their own allocator"
         )
-    return _certified(gains, Measured(experiment), spec or TuningSpec())
+    return _certified(gains, PlantEstimates(experiment), spec or TuningSpec())
 
 
 def _base(experiment: Experiment, spec: TuningSpec) -> Gains:

@@ -15,6 +15,7 @@ from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
+from mimopilot.tuning.logs.formats import SUFFIXES
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.spec import TuningSpec
@@ -25,7 +26,6 @@ from mimopilot.common.console import json_text, progress_console
 from mimopilot.common.files import inside, write_atomically
 from mimopilot.common.parallel import processes, run_all
 
-LOGS = (".ulg", ".bin", ".csv", ".mat")
 QUANTILES = (0.05, 0.5, 0.95)
 PAIRS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
 
@@ -128,9 +128,9 @@ def find_logs(paths: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        inside = sorted(one for one in path.iterdir() if one.suffix.lower() in LOGS) if path.is_dir() else [path]
+        inside = sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
         if not inside:
-            raise TuningError(f"{path}: no logs are in this folder; expected files ending in {', '.join(LOGS)}")
+            raise TuningError(f"{path}: no logs are in this folder; expected files ending in {', '.join(SUFFIXES)}")
         found += inside
     doubles = [name for name, count in Counter(path.stem for path in found).items() if count > 1]
     if doubles:

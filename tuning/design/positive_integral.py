@@ -14,7 +14,7 @@ import numpy as np
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import Stretches
 from mimopilot.tuning.estimation.vrft import LoopEstimate
-from mimopilot.tuning.plant.inertia import RigidBody
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import nnls

@@ -11,7 +11,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
 from mimopilot.tuning.plant.local_polynomial import local_response
-from mimopilot.tuning.plant.pbsid import pbsid_by_response
+from mimopilot.tuning.plant.rates_model import pbsid_by_response
 from numpy.typing import NDArray
 from scipy.signal import correlate
 

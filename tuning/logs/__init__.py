@@ -1,1 +1,1 @@
-"""Readers that turn flight logs into `tuning.experiment.Experiment`."""
+"""Flight logs: formats, readers, checks, and what a log contains."""

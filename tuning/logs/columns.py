@@ -1,4 +1,4 @@
-"""Names, units and signs of the columns of a CSV or MATLAB file. TOML in, validated."""
+"""The column file: names, units and signs of the columns of a CSV or MATLAB file (TOML)."""
 
 from __future__ import annotations
 
@@ -38,77 +38,76 @@ class _Column(BaseModel):
 
     @property
     def factor(self) -> float:
-        """What a value in the file is multiplied by to be in SI units."""
+        """Factor from a value in the file to SI units."""
         return self.sign * _FACTORS[getattr(self, "unit", "s")]
 
 
-class Time(_Column):
+class TimeColumn(_Column):
     """Time stamps."""
 
     sign: Literal[1] = 1
     unit: Literal["s", "ms", "us", "ns"] = "s"
 
 
-class Moment(_Column):
-    """A normalised moment: no unit."""
+class TorqueColumn(_Column):
+    """A torque, normalised: no unit."""
 
 
-class Rate(_Column):
-    """A body rate or its set-point."""
+class RateColumn(_Column):
+    """A body rate or its setpoint."""
 
     unit: Literal["rad/s", "deg/s"] = "rad/s"
 
 
-class Angle(_Column):
-    """An angle or its set-point."""
+class AngleColumn(_Column):
+    """An angle or its setpoint."""
 
     unit: Literal["rad", "deg"] = "rad"
 
 
 class Columns(BaseModel):
-    """Where the signals of a table are; an entry without `column` has the field's own name.
+    """The column of each signal in a table. An entry without `column` has the field's own name.
 
-    An entry's `index` picks a column of a MATLAB matrix; the first is 1, as in MATLAB.
+    `index` picks a column of a MATLAB matrix; the first is 1, as in MATLAB.
 
     Attributes
     ----------
     t
         Time.
     u_roll, u_pitch
-        Torque set-point after injection, normalised.
+        Torque setpoint after injection, normalised.
     p, q
         Body rates.
     roll, pitch
         Angles.
     roll_sp, pitch_sp, p_sp, q_sp
-        Set-points of the angles and rates; may be absent.
+        Setpoints of the angles and rates; may be absent.
     u_bar_roll, u_bar_pitch
-        Injected moment; may be absent.
+        Injected torque, normalised; may be absent.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    t: Time = Time()
-    u_roll: Moment = Moment()
-    u_pitch: Moment = Moment()
-    p: Rate = Rate()
-    q: Rate = Rate()
-    roll: Angle = Angle()
-    pitch: Angle = Angle()
-    roll_sp: Angle = Angle()
-    pitch_sp: Angle = Angle()
-    p_sp: Rate = Rate()
-    q_sp: Rate = Rate()
-    u_bar_roll: Moment = Moment()
-    u_bar_pitch: Moment = Moment()
+    t: TimeColumn = TimeColumn()
+    u_roll: TorqueColumn = TorqueColumn()
+    u_pitch: TorqueColumn = TorqueColumn()
+    p: RateColumn = RateColumn()
+    q: RateColumn = RateColumn()
+    roll: AngleColumn = AngleColumn()
+    pitch: AngleColumn = AngleColumn()
+    roll_sp: AngleColumn = AngleColumn()
+    pitch_sp: AngleColumn = AngleColumn()
+    p_sp: RateColumn = RateColumn()
+    q_sp: RateColumn = RateColumn()
+    u_bar_roll: TorqueColumn = TorqueColumn()
+    u_bar_pitch: TorqueColumn = TorqueColumn()
 
     def name(self, field: str) -> str:
-        """Name of a signal's column in the file."""
+        """Name of a field's column in the file."""
         return getattr(self, field).column or field
 
-
     def line(self, field: str, other: str, what: str) -> str:
-        """The line of a column file that gives a field another ``sign`` or ``unit``, or the column of another field."""
+        """The column-file line that corrects a field: `what` is ``sign``, ``unit`` or ``other`` (column of `other`)."""
         entry = getattr(self, other)
         values: dict[str, Any] = {"column": self.name(other)}
         values |= {key: value for key, value in entry.model_dump(exclude_defaults=True).items() if key != "column"}
@@ -125,11 +124,13 @@ def load_columns(path: Path) -> Columns:
     Raises
     ------
     TuningError
-        When it cannot be read, is not TOML, or holds an unknown signal, unit or sign.
+        When it holds an unknown signal.
+    InputFileError
+        When it cannot be read, is not TOML, or an entry is unknown or impossible.
     """
     table = read_toml(path, "column file")
     unknown = [name for name in table if name not in Columns.model_fields]
     if unknown:
         known = ", ".join(Columns.model_fields)
-        raise TuningError(f"{path}: {shown_text(unknown[0])}: no signal; known signals: {known}")
+        raise TuningError(f"{path}: {shown_text(unknown[0])}: not a signal; known signals: {known}")
     return checked(Columns, table, str(path))

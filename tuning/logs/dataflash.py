@@ -1,4 +1,4 @@
-"""ArduPilot dataflash logs (.bin): signals, flight, vehicle and parameters from their messages."""
+"""Reader of ArduPilot dataflash logs (.bin): signals, time in flight, vehicle type and parameters."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ import numpy as np
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.dataflash_file import DataflashFile, open_dataflash
 from mimopilot.tuning.logs.flight_phase import intervals
-from mimopilot.tuning.logs.recording import MAX_WILD, RANGES, Recording
+from mimopilot.tuning.logs.recording import MAX_OUTLIERS, RANGES, Recording
 from mimopilot.tuning.logs.resample import MAX_GAP, MIN_RATE, Interval, Series, monotone, sampling_period
 from mimopilot.tuning.logs.vehicle_type import ardupilot_vehicle
 from numpy.typing import NDArray
 
 DEGREE = np.pi / 180
 
-#: Signal -> (message, fields, factor to SI), best first. ANG has fast angles since 4.6; ATT is slow from then on.
+#: Signal -> (message, fields, factor to SI), best first. Since 4.6 ANG holds fast angles and ATT is slow.
 LAYOUTS = {
     "u": (("RATE", ("ROut", "POut"), 1.0),),
     "y_i": (("RATE", ("R", "P"), DEGREE),),
@@ -28,26 +28,27 @@ LAYOUTS = {
     "r_o": (("ANG", ("DesRoll", "DesPitch"), DEGREE), ("ATT", ("DesRoll", "DesPitch"), DEGREE)),
     "r_i": (("RATE", ("RDes", "PDes"), DEGREE),),
 }
-#: RATE of ArduCopter 3.3 and older (Log_Write_Rate): motor inputs of +-4500, rates in hundredths of a degree a second.
+#: Factors for RATE of ArduCopter 3.3 and older (Log_Write_Rate): motor inputs of +-4500, rates in 0.01 deg/s.
 OLD_FACTORS = {"u": 1 / 4500, "y_i": 0.01, "r_i": 0.01}
 MILLISECOND = 1e-3  # s
-#: Field with the time -> its unit, s. ArduCopter 3.3 and older have the latter.
+#: Field with the time -> its unit, s. ArduCopter 3.3 and older log TimeMS.
 CLOCKS = {"TimeUS": 1e-6, "TimeMS": MILLISECOND}
 
-#: Axis of the system identification mode (SIDS.Ax) whose waveform is added to the moment -> column of u.
+#: Axis of the system identification mode (SIDS.Ax) that adds its waveform to the torque -> column of u.
 MIXER_AXES = {10: 0, 11: 1}
 
+#: Event numbers of message EV (AP_Logger, LogEvent).
 EV_DISARMED, EV_LANDED, EV_NOT_LANDED = 11, 18, 28
-#: The firmware as it introduces itself, and its major version.
+#: Name and version of the firmware in message MSG or VER; group 1 is the major version.
 _RELEASE = re.compile(r"[A-Za-z:]{2,16}[ -]*[Vv](\d+)\.\d+\S*")
-SDLOG2_MESSAGES = {"TIME", "ATT"}  # ArduPilot has no message TIME
+SDLOG2_MESSAGES = {"TIME", "ATT"}  # ArduPilot logs have no message TIME
 SDLOG2 = (
-    "a log of PX4 before ULog (sdlog2, .px4log), not of ArduPilot: fly with PX4 1.8 or newer, which writes ULog; or "
-    "make a CSV file of it with PX4's sdlog2_dump.py and name its columns with --columns"
+    "an old PX4 log (sdlog2, .px4log), not an ArduPilot log: fly with PX4 1.8 or later, which writes ULog, or "
+    "convert it to CSV with PX4's sdlog2_dump.py and name its columns with --columns"
 )
 NOTE = (
-    "flown gains are not taken over: ArduPilot's D acts on the filtered error and its yaw error is filtered, which no "
-    "gains of this controller say; give yaw, limits and derivative_cutoff_hz in a --spec file"
+    "flown gains are not read: ArduPilot filters the error for D and for yaw, which this controller does not; give "
+    "yaw, limits and derivative_cutoff_hz in a --spec file"
 )
 
 
@@ -62,15 +63,15 @@ def record_dataflash(path: Path) -> Recording:
     Returns
     -------
     Recording
-        The waveform of the system identification mode is the excitation where it was added to the moment
-        (SID_AXIS 10 and 11, mixer).
+        The excitation is the waveform of the system identification mode, if added to the torque (SID_AXIS 10 and
+        11, mixer).
 
     Raises
     ------
     TuningError
-        When the file is damaged.
+        When the file is an sdlog2 log.
     """
-    log = _Log(open_dataflash(path))
+    log = _DataflashLog(open_dataflash(path))
     if SDLOG2_MESSAGES.issubset(log.file.names()):
         raise TuningError(f"{path}: {SDLOG2}")
     old = log.in_old_units()
@@ -97,7 +98,7 @@ def record_dataflash(path: Path) -> Recording:
     damage = log.file.damage
     return Recording(
         path=path,
-        format=_format(texts, old),
+        format=_format_name(texts, old),
         signals=signals,
         wanted=wanted,
         contents=log.file.names(),
@@ -114,13 +115,13 @@ def record_dataflash(path: Path) -> Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class _Log:
+class _DataflashLog:
     file: DataflashFile
 
     def timed(self, message: str, names: Sequence[str]) -> list[NDArray[Any]] | None:
         """Time (s) and fields of a message, one row a message; None when it is not logged with them.
 
-        Events of ArduCopter 3.3 and older have no time: that of the last RATE or ATT before them stands in.
+        Events of ArduCopter 3.3 and older have no time: the time of the last RATE or ATT before them is used.
         """
         values = self.file.fields(message, names)
         time = self._clock(message)
@@ -153,20 +154,20 @@ class _Log:
         return Series(time, np.column_stack(values) * factor, message)
 
     def in_old_units(self) -> bool:
-        """Whether RATE is that of `OLD_FACTORS`: a share of the full moment is never beyond its range."""
+        """Whether RATE is in the units of `OLD_FACTORS`: a normalised torque never exceeds its range."""
         outputs = self.series("RATE", ("ROut", "POut"), 1.0)
-        return outputs is not None and bool(np.mean(np.abs(outputs.values) > RANGES["u"]) > MAX_WILD)
+        return outputs is not None and bool(np.mean(np.abs(outputs.values) > RANGES["u"]) > MAX_OUTLIERS)
 
 
 def _unrounded(time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Stamps of a uniform loop from stamps in whole milliseconds: a straight line through each stretch."""
+    """Time stamps (s) of a uniform loop from stamps rounded to milliseconds: a line fit through each segment."""
     steps = np.diff(time)
     usual = np.median(steps)
     near = np.abs(steps - usual) <= max(usual / 2, MILLISECOND) + 1e-6
     smooth = time.copy()
     if usual <= 0 or not near.any():
         return smooth
-    cycles = np.round(steps / np.mean(steps[near]))  # neighbours, even where the loop takes 2.5 ms
+    cycles = np.round(steps / np.mean(steps[near]))  # counts neighbours as 1 even if the loop takes 2.5 ms
     bounds = [0, *(np.flatnonzero((cycles < 1) | (cycles > MAX_GAP)) + 1).tolist(), len(time)]
     for a, b in itertools.pairwise(bounds):
         if b - a > 2:
@@ -175,16 +176,16 @@ def _unrounded(time: NDArray[np.float64]) -> NDArray[np.float64]:
     return smooth
 
 
-def _wanted(log: _Log, message: str, fields: Sequence[str]) -> str:
-    """Where a signal should be, and what is there where the message has other fields."""
+def _wanted(log: _DataflashLog, message: str, fields: Sequence[str]) -> str:
+    """Where a signal should be; and the fields that the message has instead."""
     wanted = f"message {message} ({', '.join(fields)})"
     return (
         f"{wanted}, which has {', '.join(log.file.formats[message].letters)}" if message in log.file.names() else wanted
     )
 
 
-def _advice(log: _Log, parameters: dict[str, float], texts: Sequence[str]) -> str:
-    """What to change so that RATE and the angles are logged in every loop: nothing that is so already."""
+def _advice(log: _DataflashLog, parameters: dict[str, float], texts: Sequence[str]) -> str:
+    """What to change so that RATE and the angles are logged in every loop; names no setting that is right already."""
     bits, limit = parameters.get("LOG_BITMASK"), parameters.get("LOG_FILE_RATEMAX", 0)
     release = next((found for text in texts if (found := _RELEASE.match(text))), None)
     if bits is None or not 0 <= bits < 2**31:
@@ -196,12 +197,12 @@ def _advice(log: _Log, parameters: dict[str, float], texts: Sequence[str]) -> st
     elif release and int(release[1]) < 4:
         advice = (
             f"messages RATE and ATT are needed at {MIN_RATE:g} Hz or more and bit 0 of LOG_BITMASK is set already: fly "
-            f"with ArduCopter 4.0 or newer, which logs them in every loop (this is {release[0]})"
+            f"with ArduCopter 4.0 or later, which logs them in every loop (this is {release[0]})"
         )
     else:
         advice = (
             f"messages RATE and ANG (ATT before 4.6) are needed at {MIN_RATE:g} Hz or more and bit 0 of LOG_BITMASK is "
-            "set already: clear its other bits or take a faster card, so that the logger keeps up, and fly again"
+            "set already: clear its other bits or use a faster card, so that the logger keeps up, and fly again"
         )
     slow = log.series("PIDR", ("Act",), 1.0)
     if "RATE" not in log.file.names() and slow is not None:
@@ -209,8 +210,8 @@ def _advice(log: _Log, parameters: dict[str, float], texts: Sequence[str]) -> st
     return advice
 
 
-def _excitation(log: _Log) -> Series | None:
-    """The waveform that the system identification mode added to the moment; zero where that mode was off."""
+def _excitation(log: _DataflashLog) -> Series | None:
+    """The waveform that the system identification mode added to the torque; zero when that mode was off."""
     waveform = log.series("SIDD", ("Targ",), 1.0)
     runs = log.timed("SIDS", ("Ax",))
     if waveform is None or runs is None or not len(runs[0]):
@@ -221,7 +222,7 @@ def _excitation(log: _Log) -> Series | None:
     Ts = sampling_period(waveform.time)
     ends = np.flatnonzero(np.append(np.diff(waveform.time) > MAX_GAP * Ts, True))
     started, axes = runs[0], runs[1].astype(np.int64)
-    # The set-up is stamped just after or before the first sample of its run: the nearest start counts.
+    # SIDS is stamped just before or after the first sample of its run: the nearest one counts.
     begins = np.concatenate([[0], ends[:-1] + 1])
     run = np.searchsorted(begins, np.arange(len(waveform.time)), side="right") - 1
     axis = np.array([axes[np.argmin(np.abs(started - waveform.time[begin]))] for begin in begins])[run]
@@ -234,23 +235,30 @@ def _excitation(log: _Log) -> Series | None:
     return Series(time[order], values, "SIDD") if values.any() else None
 
 
-def _airborne(log: _Log) -> tuple[Interval, ...] | None:
+def _airborne(log: _DataflashLog) -> tuple[Interval, ...] | None:
     events = log.timed("EV", ("Id",))
     if events is None:
         return None
     time, code = events
-    known = np.isin(code, (EV_DISARMED, EV_LANDED, EV_NOT_LANDED))
+    known = np.isin(
+        code,
+        (  #: Event numbers of message EV (AP_Logger, LogEvent).
+            EV_DISARMED,
+            EV_LANDED,
+            EV_NOT_LANDED,
+        ),
+    )
     if not np.isin(code, (EV_LANDED, EV_NOT_LANDED)).any():
         return None
     time, flying = time[known], code[known] == EV_NOT_LANDED
     order = np.argsort(time, kind="stable")
     time, flying = time[order], flying[order]
-    # Before the first event it was the other way round.
+    # Before the first event the state was the opposite.
     return intervals(np.append(time[0] - 1.0, time), np.append(not flying[0], flying))
 
 
-def _parameters(log: _Log) -> tuple[dict[str, float], list[tuple[float, str, float]]]:
-    """The first value of each parameter, and (time s, name, value) of what was set later."""
+def _parameters(log: _DataflashLog) -> tuple[dict[str, float], list[tuple[float, str, float]]]:
+    """First value of each parameter, and later changes as (time s, name, value)."""
     columns = log.timed("PARM", ("Name", "Value"))
     if columns is None:
         return {}, []
@@ -267,13 +275,13 @@ def _parameters(log: _Log) -> tuple[dict[str, float], list[tuple[float, str, flo
     return first, changes
 
 
-def _span(log: _Log) -> Interval | None:
-    """First and last time (s) of the message that there are most of."""
+def _span(log: _DataflashLog) -> Interval | None:
+    """First and last time (s) of the most frequent message."""
     most = max(log.file.offsets, key=lambda name: len(log.file.offsets[name]), default="")
     columns = log.timed(most, ())
     return (float(columns[0].min()), float(columns[0].max())) if columns and len(columns[0]) else None
 
 
-def _format(texts: Sequence[str], old: bool) -> str:
+def _format_name(texts: Sequence[str], old: bool) -> str:
     vehicle = next((text for text in texts if _RELEASE.match(text)), "ArduPilot")
     return f"dataflash, {vehicle}{', RATE in the units of 3.3 and older' if old else ''}"

@@ -1,4 +1,4 @@
-"""The messages in an ArduPilot dataflash file (.bin): where they are, and the values of their fields."""
+"""Parser of ArduPilot dataflash files (.bin): message formats, fields and damage."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from mimopilot.tuning.logs.recording import listed
 from numpy.typing import NDArray
 
 HEAD = b"\xa3\x95"
-FMT, FMT_LENGTH = 0x80, 89  # the message that defines the others, itself as AP_Logger's LogStructure.h defines it
-PADDING = b"\x00\xff"  # what block devices leave behind the last message
+FMT, FMT_LENGTH = 0x80, 89  # message that defines the others; its own layout is in AP_Logger's LogStructure.h
+PADDING = b"\x00\xff"  # block devices leave these bytes after the last message
 
-#: Format letter of AP_Logger -> type in the file, and what the value is multiplied by.
+#: Format letter of AP_Logger -> type in the file.
 LETTERS = dict(
     zip("bBhHiIqQfdgM", ("i1", "u1", "<i2", "<u2", "<i4", "<u4", "<i8", "<u8", "<f4", "<f8", "<f2", "u1"), strict=True)
 )
 LETTERS |= {"c": "<i2", "C": "<u2", "e": "<i4", "E": "<u4", "L": "<i4", "n": "S4", "N": "S16", "Z": "S64", "a": "S64"}
+#: Format letter -> factor to the unit of the field.
 FACTORS = {"c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01, "L": 1e-7}
 
 
 @dataclass(frozen=True, eq=False)
-class Format:
-    """How a message is laid out: its length in bytes, head included, and the letter of each field."""
+class DataflashFormat:
+    """Layout of a message: name, length in bytes with the 3-byte header, and field -> format letter."""
 
     name: str
     length: int
@@ -34,7 +35,7 @@ class Format:
 
     @property
     def record(self) -> np.dtype[Any] | None:
-        """The fields behind the head; None when they do not fill the message, which is damage."""
+        """Type of the fields after the header; None when they do not fill the message, a sign of damage."""
         kinds = [(name, LETTERS.get(letter, "")) for name, letter in self.letters.items()]
         if not kinds or not all(kind for _, kind in kinds):
             return None
@@ -44,31 +45,31 @@ class Format:
 
 @dataclass(frozen=True, eq=False)
 class DataflashFile:
-    """A file with the places of its messages.
+    """A dataflash file and the offsets of its messages.
 
     Attributes
     ----------
     content : bytes
-        All of it.
+        The whole file.
     formats : dict
-        Message -> its layout.
+        Message name -> layout.
     offsets : dict
-        Message -> where each begins.
+        Message name -> offset of each message, bytes.
     damage : str
-        What could not be read; empty when all could.
+        What could not be read; empty when everything could.
     """
 
     content: bytes
-    formats: dict[str, Format]
+    formats: dict[str, DataflashFormat]
     offsets: dict[str, NDArray[np.int64]]
     damage: str
 
     def names(self) -> list[str]:
-        """The messages that are there."""
+        """Names of the messages that were logged."""
         return sorted(name for name, offsets in self.offsets.items() if len(offsets))
 
     def fields(self, message: str, names: Sequence[str]) -> list[NDArray[Any]] | None:
-        """Values of fields, one a message, in the unit of the format; None when there are none with these fields."""
+        """Values of fields, one per message, in the unit of the format; None when not logged with these fields."""
         layout = self.formats.get(message)
         record = layout.record if layout else None
         if layout is None or record is None or not set(names) <= set(layout.letters):
@@ -79,7 +80,7 @@ class DataflashFile:
         return [rows[name] * factor if factor else rows[name] for name, factor in zip(names, factors, strict=True)]
 
     def texts(self, message: str, field: str) -> list[str]:
-        """Values of a text field; none when the message is not logged with it."""
+        """Values of a text field; empty when not logged."""
         columns = self.fields(message, (field,))
         if columns is None or columns[0].dtype.kind != "S":
             return []
@@ -87,27 +88,27 @@ class DataflashFile:
 
 
 def open_dataflash(path: Path) -> DataflashFile:
-    """Find the messages of a file; where bytes make no message, the next one that does is sought.
+    """Parse a file; after damaged bytes, continue at the next valid message.
 
-    A message counts when its type is known and another one, or the end of the file, follows it. So a damaged byte
-    costs the message that it is in.
+    A message is valid when its type is defined and another message or the end of the file follows. So a damaged
+    byte costs only the message that it is in.
     """
     content = path.read_bytes()
     lengths = [0] * 256
     lengths[FMT] = FMT_LENGTH
-    names: dict[int, Format] = {}
+    names: dict[int, DataflashFormat] = {}
     places: dict[int, list[int]] = {FMT: []}
     at, end, lost, gaps = 0, len(content), 0, 0
-    solid = len(content.rstrip(PADDING))
+    data_end = len(content.rstrip(PADDING))
     while at < end:
-        following = _following(content, lengths, at)
-        if not following or not _continues(content, solid, following):
-            resumed = _resume(content, lengths, solid, at + 1)
-            # Whole all the same where just the head of the next message is damaged.
-            if not following or following + _length(content, lengths, following) != resumed:
-                if resumed == end and _cut(content, lengths, at):
+        end_of_message = _message_end(content, lengths, at)
+        if not end_of_message or not _is_followed(content, data_end, end_of_message):
+            resumed = _next_valid(content, lengths, data_end, at + 1)
+            # This message is complete if only the header of the next one is damaged.
+            if not end_of_message or end_of_message + _length(content, lengths, end_of_message) != resumed:
+                if resumed == end and _is_truncated(content, lengths, at):
                     break
-                if at < solid:
+                if at < data_end:
                     lost, gaps = lost + resumed - at, gaps + 1
                 at = resumed
                 continue
@@ -117,17 +118,19 @@ def open_dataflash(path: Path) -> DataflashFile:
             number, layout = _format(content[at + 3 : at + FMT_LENGTH])
             if number != FMT and number not in names and layout.length >= 3:
                 names[number], lengths[number], places[number] = layout, layout.length, []
-        at = following
-    # A damaged definition may give a second type the name of another: the one that is used counts.
+        at = end_of_message
+    # A damaged FMT message may give two types one name: the type with more messages counts.
     used = sorted(names, key=lambda number: len(places[number]))
     damage = []
     if lost:
-        damage.append(f"damaged: {lost} of {end} bytes, in {gaps} place{'s'[: gaps > 1]}, are no message and left out")
+        damage.append(
+            f"damaged: {lost} of {end} bytes, in {gaps} place{'s'[: gaps > 1]}, are not valid messages and ignored"
+        )
     unread = sorted(names[n].name for n in used if places[n] and names[n].length > 3 and names[n].record is None)
     if unread:
-        damage.append(f"the format of {listed(unread)} is not known or damaged, none of them is read")
+        damage.append(f"the format of {listed(unread)} is unknown or damaged; these messages are not read")
     if at < end:
-        damage.append("it ends in the middle of a message: not downloaded completely, or the power was cut")
+        damage.append("the file ends inside a message: the download is incomplete or power was lost")
     return DataflashFile(
         content,
         {names[number].name: names[number] for number in used},
@@ -136,50 +139,50 @@ def open_dataflash(path: Path) -> DataflashFile:
     )
 
 
-def _continues(content: bytes, solid: int, at: int) -> bool:
-    """Whether a message or nothing but padding follows here."""
-    return at >= solid or content.startswith(HEAD, at)
+def _is_followed(content: bytes, data_end: int, at: int) -> bool:
+    """Whether a message or only padding begins at `at`."""
+    return at >= data_end or content.startswith(HEAD, at)
 
 
 def _length(content: bytes, lengths: list[int], at: int) -> int:
-    """Length of the message whose type stands here; 0 when it is not known."""
+    """Length of the message at `at`, bytes; 0 when its type is not defined."""
     return lengths[content[at + 2]] if at + 2 < len(content) else 0
 
 
-def _cut(content: bytes, lengths: list[int], at: int) -> bool:
-    """Whether the file ends before the message that begins here does."""
+def _is_truncated(content: bytes, lengths: list[int], at: int) -> bool:
+    """Whether the file ends before the end of the message that begins at `at`."""
     tail = content[at : at + 3]
     return (HEAD.startswith(tail[:2]) and len(tail) < 3) or (
         tail.startswith(HEAD) and at + _length(content, lengths, at) > len(content)
     )
 
 
-def _following(content: bytes, lengths: list[int], at: int) -> int:
-    """Where the message that begins here ends; 0 when none does, or not within the file."""
+def _message_end(content: bytes, lengths: list[int], at: int) -> int:
+    """End of the message that begins at `at`; 0 when there is none, or it exceeds the file."""
     length = _length(content, lengths, at) if content.startswith(HEAD, at) else 0
     return at + length if length and at + length <= len(content) else 0
 
 
-def _resume(content: bytes, lengths: list[int], solid: int, start: int) -> int:
-    """Where the next message begins that another one or the end of the file follows; the end if there is none."""
+def _next_valid(content: bytes, lengths: list[int], data_end: int, start: int) -> int:
+    """Offset of the next message that is followed by another or by the end of the file; the end if there is none."""
     while (start := content.find(HEAD, start)) >= 0:
-        following = _following(content, lengths, start)
-        if following and _continues(content, solid, following):
+        end_of_message = _message_end(content, lengths, start)
+        if end_of_message and _is_followed(content, data_end, end_of_message):
             return start
         start += 1
     return len(content)
 
 
-def _format(payload: bytes) -> tuple[int, Format]:
-    """Type and layout that an FMT message defines."""
+def _format(payload: bytes) -> tuple[int, DataflashFormat]:
+    """Type number and layout defined by an FMT message."""
     number, length, name, letters, columns = struct.unpack("<BB4s16s64s", payload)
     name, letters, columns = (_text(text) for text in (name, letters, columns))
     fields = columns.split(",") if columns else []
     whole = len(fields) == len(letters) == len(set(fields))
-    return number, Format(name, length, dict(zip(fields, letters, strict=True)) if whole else {})
+    return number, DataflashFormat(name, length, dict(zip(fields, letters, strict=True)) if whole else {})
 
 
 def _text(field: bytes) -> str:
-    """A text field; damage does not bring control characters into messages."""
+    """A text field; replaces unprintable characters, which damage may cause."""
     text = field.partition(b"\0")[0].decode("ascii", "replace")
     return "".join(letter if letter.isprintable() else "?" for letter in text)

@@ -1,4 +1,4 @@
-"""Which part of a log is flight: where the vehicle says it was airborne, else where it moves."""
+"""The part of a log in flight: from the land detector or arming events, else from the body rates."""
 
 from __future__ import annotations
 
@@ -8,85 +8,87 @@ from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, Series
 from numpy.typing import NDArray
 
-STILL_RATE = 0.01  # rad/s, standard deviation over a second: no multirotor hovers that quietly
+STILL_RATE = 0.01  # rad/s, standard deviation over `STILL_WINDOW`: every hover is noisier
 STILL_WINDOW = 1.0  # s
-TUMBLE = np.radians(75.0)  # of tilt: no multirotor holds its altitude there
-BEFORE = 1.0  # s before a tumble that are not used: a vehicle is lost within 0.7 s of losing a motor
-AGAIN = 3  # tumbles that are none: degrees for radians, or aerobatics
-SHORT = 0.1  # s on the ground that are not worth telling
+TUMBLE = np.radians(75.0)  # rad of tilt: no multirotor holds altitude beyond it
+BEFORE_TUMBLE = 1.0  # s before a tumble that are not used: control is lost within 0.7 s of a motor failure
+MAX_TUMBLES = 3  # as many tumbles mean degrees taken for radians, or aerobatics
+SHORT = 0.1  # s on the ground during the excitation that need no warning
 
 
 def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str, ...]]:
-    """The parts of a log that may be used for tuning.
+    """The parts of a log that can be used for tuning.
 
-    An injected excitation marks the experiment: from its first to its last sample that is not zero. Of it, or of the
-    whole log, counts what was in the air, as the vehicle says, or from the first to the last movement; and nothing
-    from the second before a tumble on.
+    An injected excitation marks the experiment, from its first to its last nonzero sample; without one it is the
+    whole log. Of the experiment the part in flight is used: as the vehicle logged it, else from the first to the
+    last movement. Nothing is used from `BEFORE_TUMBLE` before a tumble on.
 
     Parameters
     ----------
     recording : Recording
-        With torque, rates and angles.
+        Holds torque, rates and angles.
 
     Returns
     -------
     parts : tuple of (begin, end), s
-    said : tuple of str
-        What was cut off and why.
+    warnings : tuple of str
+        What is not used and why.
 
     Raises
     ------
     TuningError
-        When the vehicle never flew, or tumbles again and again.
+        When the vehicle never flew, or tumbled `MAX_TUMBLES` times or more.
     """
     airborne, source = recording.airborne, str(recording.path)
     rates, torque = recording.signals["y_i"], recording.signals["u"]
     if airborne is not None:
         airborne = intersection(airborne, ((float(rates.time[0]), float(rates.time[-1])),))
     if airborne is not None and not airborne:
-        raise TuningError(f"{source}: no flight: {recording.evidence} says that it never left the ground; fly it")
+        raise TuningError(
+            f"{source}: no flight: according to {recording.evidence} the vehicle never left the ground; record a flight"
+        )
     marked = _marked(recording.signals.get("u_bar"))
-    said: list[str] = []
+    warnings: list[str] = []
     parts: tuple[Interval, ...] = (marked,) if marked else ((-np.inf, np.inf),)
     if airborne:
         parts = intersection(parts, airborne)
         if marked and not parts:
             raise TuningError(
-                f"{source}: no flight: {recording.evidence} says that it was on the ground while a torque was "
-                "injected; take off first"
+                f"{source}: no flight: according to {recording.evidence} the vehicle was on the ground while a torque "
+                "was injected; take off first"
             )
         grounded = marked[1] - marked[0] - sum(b - a for a, b in parts) if marked else 0.0
         if grounded > SHORT:
-            said.append(
-                f"{recording.evidence} says on the ground for {grounded:.1f} s of the excitation: that part is not used"
+            warnings.append(
+                f"on the ground for {grounded:.1f} s of the excitation, according to {recording.evidence}: not used"
             )
     parts, tumble = _before_tumble(recording, parts)
     if tumble:
-        said.append(tumble)
+        warnings.append(tumble)
     moving = _moving(rates, parts)
     if moving is None or not np.ptp(torque.values, axis=0).any():
         largest = float(np.abs(rates.values).max())
         still = (
-            f"the body rates in {rates.topic} do not move (at most {largest:.2g} rad/s)"
+            f"the body rates in {rates.topic} do not change (at most {largest:.2g} rad/s)"
             if moving is None
-            else f"{torque.topic} does not move"
+            else f"{torque.topic} does not change"
         )
         seconds = sum(b - a for a, b in airborne or ())
-        flew = f"{recording.evidence} says airborne for {seconds:.1f} s, but " if airborne else ""
-        unit = "; if it flew, the unit of the rates is wrong" if moving is None else ""
+        flew = f"airborne for {seconds:.1f} s according to {recording.evidence}, but " if airborne else ""
+        unit = "; if the vehicle flew, correct the unit of the rates" if moving is None else ""
         raise TuningError(
-            f"{source}: no flight: {flew}{still}; a log from the bench cannot be tuned from, fly it{unit}"
+            f"{source}: no flight: {flew}{still}; a log of a vehicle at rest cannot be used, record a flight{unit}"
         )
-    return parts if marked or airborne else intersection(parts, (moving,)), tuple(said)
+    return parts if marked or airborne else intersection(parts, (moving,)), tuple(warnings)
 
 
 def _before_tumble(recording: Recording, parts: tuple[Interval, ...]) -> tuple[tuple[Interval, ...], str]:
-    """The parts without what comes from the second before a tumble on, and what is to be said of it.
+    """The parts until `BEFORE_TUMBLE` before the first tumble, and a warning; empty when there is no tumble.
 
     Raises
     ------
     TuningError
-        When the tilt is large again and again: that is no multirotor that was lost.
+        When there are `MAX_TUMBLES` tumbles or more, or one at the beginning of the experiment.
     """
     angles, source = recording.signals["y_o"], str(recording.path)
     tilt = np.arccos(np.clip(np.cos(angles.values[:, 0]) * np.cos(angles.values[:, 1]), -1.0, 1.0))
@@ -98,28 +100,27 @@ def _before_tumble(recording: Recording, parts: tuple[Interval, ...]) -> tuple[t
         return parts, ""
     level = np.flatnonzero(inside & (tilt < TUMBLE / 2))
     times = len(np.unique(np.searchsorted(level, beyond)))
-    if times >= AGAIN:
+    if times >= MAX_TUMBLES:
         raise TuningError(
-            f"{source}: {angles.topic}: a tilt beyond {np.degrees(TUMBLE):.0f} degrees {times} times where the "
-            "experiment is; no multirotor flies like that: are the angles in degrees (then give their unit), or was it "
-            "aerobatics? Excite in hover"
+            f"{source}: {angles.topic}: a tilt beyond {np.degrees(TUMBLE):.0f} degrees {times} times in the "
+            "experiment: if the angles are in degrees, give their unit; if it was aerobatics, excite in hover instead"
         )
     at = float(angles.time[beyond[0]])
-    kept = intersection(parts, ((-np.inf, at - BEFORE),))
+    kept = intersection(parts, ((-np.inf, at - BEFORE_TUMBLE),))
     begin = min(float(series.time[0]) for series in recording.signals.values())
     if not kept:
         raise TuningError(
             f"{source}: no flight: a tilt beyond {np.degrees(TUMBLE):.0f} degrees at {at - begin:.1f} s, at the "
-            "beginning of the experiment; fly it again"
+            "beginning of the experiment; repeat the flight"
         )
     return kept, (
-        f"the vehicle tumbled at {at - begin:.1f} s (tilt beyond {np.degrees(TUMBLE):.0f} degrees): only what is "
-        f"{BEFORE:g} s or more before it is used"
+        f"the vehicle tumbled at {at - begin:.1f} s (tilt beyond {np.degrees(TUMBLE):.0f} degrees): only the log until "
+        f"{BEFORE_TUMBLE:g} s before it is used"
     )
 
 
 def intervals(time: NDArray[np.float64], flag: NDArray[np.bool_]) -> tuple[Interval, ...]:
-    """When a logged state was true, each sample holding until the next.
+    """Intervals in which a logged state was true; each sample holds until the next.
 
     Parameters
     ----------
@@ -141,7 +142,7 @@ def intervals(time: NDArray[np.float64], flag: NDArray[np.bool_]) -> tuple[Inter
 
 
 def bridged(parts: tuple[Interval, ...], pause: float = 1.0) -> tuple[Interval, ...]:
-    """The intervals (s) with pauses up to `pause` (s) filled: idle throttle in a dive is still flight."""
+    """The intervals (s) with pauses up to `pause` (s) filled: idle throttle in a descent is still flight."""
     joined: list[Interval] = []
     for a, b in parts:
         if joined and a - joined[-1][1] <= pause:
@@ -151,7 +152,7 @@ def bridged(parts: tuple[Interval, ...], pause: float = 1.0) -> tuple[Interval, 
 
 
 def intersection(first: tuple[Interval, ...], second: tuple[Interval, ...]) -> tuple[Interval, ...]:
-    """What two lists of intervals share, s."""
+    """Intersection of two lists of intervals, s."""
     shared = ((max(a, c), min(b, d)) for a, b in first for c, d in second)
     return tuple(sorted((a, b) for a, b in shared if a < b))
 
@@ -164,7 +165,7 @@ def _marked(excitation: Series | None) -> Interval | None:
 
 
 def _moving(rates: Series, parts: tuple[Interval, ...]) -> Interval | None:
-    """From the second before the first movement to the one after the last; None when there is none."""
+    """From one window before the first movement to one after the last; None without movement."""
     inside = np.zeros(len(rates.time), bool)
     for a, b in parts:
         inside |= (rates.time >= a) & (rates.time <= b)

@@ -1,4 +1,4 @@
-"""The controller that flew, from a vehicle's parameters: ours (``MIMO_``), else PX4's own (``MC_``)."""
+"""The gains that flew, from the vehicle's parameters: this controller's (``MIMO_``), else PX4's (``MC_``)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mimopilot.tuning.provenance import Provenance
 
 SCALE = "SCALE"
 
-#: Matrix -> PX4's parameter for an axis; the rate terms are multiplied by the axis' K.
+#: Matrix -> PX4's parameter for an axis. PX4 multiplies the rate terms by MC_*RATE_K.
 _PX4 = {
     "Kp_o": "MC_{axis}_P",
     "Kp_i": "MC_{axis}RATE_P",
@@ -26,7 +26,7 @@ _PX4_INTEGRAL = ("MC_RR_INT_LIM", "MC_PR_INT_LIM", "MC_YR_INT_LIM")
 
 
 def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
-    """Gains that a vehicle's parameters describe.
+    """The gains in a vehicle's parameters.
 
     Parameters
     ----------
@@ -38,10 +38,10 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     Returns
     -------
     Gains or None
-        None when the parameters do not describe a whole controller. Elements that our module does not
-        have in that log (yaw, limits) are PX4's.
+        None when the parameters do not describe a complete controller. Elements without a ``MIMO_`` parameter in
+        the log (yaw, limits) are PX4's.
     """
-    # Vehicles store single precision: take the shortest decimal that means the same.
+    # Vehicles store float32: use the shortest decimal that rounds to the same float32.
     values = {name: float(str(np.float32(value))) for name, value in parameters.items()}
 
     def find(code: str, fallback: str, factor: float = 1.0) -> float:

@@ -1,4 +1,4 @@
-"""What is in a log, and whether gains can be tuned from it."""
+"""Inspection of a log: its signals, its excitation, and whether gains can be tuned from it."""
 
 from __future__ import annotations
 
@@ -19,29 +19,29 @@ from mimopilot.tuning.logs.resample import MAX_GAP, Interval, Series, held_sampl
 from numpy.typing import NDArray
 
 AXES = ("roll", "pitch")
-BAND_POWER = (0.05, 0.95)  # the band of a signal is where this share of its power lies
+BAND_POWER = (0.05, 0.95)  # the band of a signal is between these fractions of its cumulative power
 
 
 @dataclass(frozen=True)
 class SignalReport:
-    """One signal as logged, roll then pitch.
+    """One signal as logged; pairs are roll, pitch.
 
     Attributes
     ----------
     source : str
         Topic, message or columns.
     rate_hz : float, Hz
-        Messages a second.
+        Messages per second.
     held : int
-        Messages for which a value is repeated; 1 when it is fresh in each.
+        Messages for which each value is held; 1 when every message has a new value.
     gaps : int
-        Pauses of more than five periods.
+        Pauses of more than `tuning.logs.resample.MAX_GAP` periods.
     longest_gap_s : float, s
         The longest pause.
     minimum, maximum : tuple of 2 float
         Extremes, in SI units.
     saturated : tuple of 2 float or None
-        Share of the samples at the limit of the moment; None for other signals.
+        Fraction of torque samples at the limit; None for other signals.
     """
 
     source: str
@@ -56,7 +56,7 @@ class SignalReport:
 
 @dataclass(frozen=True)
 class ExcitationReport:
-    """The external signal on one axis: RMS in its own unit, and the band (Hz) that holds 90 % of its power."""
+    """The external signal on one axis: RMS in the unit of the signal, and the band (Hz) with 90 % of its power."""
 
     rms: float
     band_hz: tuple[float, float]
@@ -64,26 +64,26 @@ class ExcitationReport:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """The findings about one log.
+    """What was found in one log.
 
     Attributes
     ----------
     recording : Recording
-        The log as it was read.
+        The log as read.
     seconds : float, s
-        From the first to the last sample of any of its signals, without them of the log.
+        From the first to the last sample of all signals; of the log when it has no signals.
     airborne : tuple of (begin, end) or None, s
-        When the vehicle says it flew, since the first sample. None: the log does not say.
+        When the vehicle flew according to the log, since the first sample. None: not logged.
     signals : dict
-        Name -> what was logged.
+        Signal name -> report.
     parts : tuple of (begin, end) in s
-        What may be used, since the first sample; empty when the vehicle did not fly.
+        Usable parts, since the first sample; empty when the vehicle did not fly.
     experiment : Experiment or None
-        The usable part; None when there is none.
+        The usable parts; None when there are none.
     excitation : dict
-        Name of the external signal and axis -> its strength; empty when there is none.
+        Name and axis of the external signal -> report; empty without excitation.
     reason : str or None
-        Why gains cannot be tuned from the log and what to change; None when they can.
+        Why gains cannot be tuned from the log and what to change; None when they can be.
     """
 
     recording: Recording
@@ -97,22 +97,22 @@ class Inspection:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is wrong with the log although it can be used."""
+        """What is wrong with a log that can still be used."""
         return self.experiment.warnings if self.experiment else tuple(self.recording.warnings)
 
     @property
     def flown(self) -> Gains | None:
-        """The controller that flew, where the log says so."""
+        """The gains that flew; None when not logged."""
         return self.experiment.flown if self.experiment else None
 
 
 def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
-    """Look into a log without tuning from it.
+    """Inspect a log without tuning from it.
 
     Parameters
     ----------
     path : Path
-        A log of any format that `tuning.logs.reader.read_log` knows.
+        A log of any format in `tuning.logs.formats`.
     columns : Columns, optional
         Names and units in a CSV or MATLAB file.
 
@@ -123,7 +123,7 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
     Raises
     ------
     TuningError
-        When the file cannot be read at all.
+        When the file cannot be read.
     """
     recording = open_log(path, columns)
     limit = 1.0
@@ -183,7 +183,7 @@ def _signal(name: str, signal: Series, stamps: NDArray[np.float64], limit: float
 
 
 def _excitation(signal: NDArray[np.float64], experiment: Experiment) -> ExcitationReport:
-    """Strength and band of one axis of the external signal, over the segments."""
+    """RMS and band of one axis of the external signal in the segments of the experiment."""
     from scipy.signal import periodogram
 
     rows = [signal[a:b] for a, b in experiment.segments]

@@ -1,4 +1,4 @@
-"""An inspection as people and as programs read it."""
+"""Output of `mimopilot inspect`: tables for people, plain values for ``--json``."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from mimopilot.tuning.parameters import MATRICES
 
 from mimopilot.common.console import print_table
 
-#: Signal -> its name, unit for people, and what an SI value is multiplied by for it.
+#: Signal -> its name, its unit in the table, and the factor from SI to that unit.
 _NAMES = {
     "u": ("torque u", "", 1.0),
     "y_i": ("rates y_i", "deg/s", 180 / math.pi),
     "y_o": ("angles y_o", "deg", 180 / math.pi),
     "u_bar": ("injected u_bar", "", 1.0),
-    "r_o": ("attitude set-point r_o", "deg", 180 / math.pi),
-    "r_i": ("rate set-point r_i", "deg/s", 180 / math.pi),
+    "r_o": ("attitude setpoint r_o", "deg", 180 / math.pi),
+    "r_i": ("rate setpoint r_i", "deg/s", 180 / math.pi),
 }
 
 
 def as_mapping(found: Inspection) -> dict[str, Any]:
-    """An inspection as plain values, in SI units, for `mimopilot.common.console.print_json`."""
+    """An inspection as plain values in SI units, for `mimopilot.common.console.print_json`."""
     recording, experiment = found.recording, found.experiment
     return {
         "log": str(recording.path),
@@ -46,7 +46,7 @@ def as_mapping(found: Inspection) -> dict[str, Any]:
 
 
 def print_inspection(found: Inspection) -> None:
-    """An inspection as tables on standard output."""
+    """Print an inspection as tables on standard output."""
     recording, experiment = found.recording, found.experiment
     rows = []
     for name, (title, unit, factor) in _NAMES.items():
@@ -68,7 +68,7 @@ def print_inspection(found: Inspection) -> None:
         print("used: " + ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.parts))
     if experiment is not None:
         count = len(experiment.segments)
-        print(f"experiment: {experiment.seconds:.1f} s at {1 / experiment.Ts:.1f} Hz, {count} stretches without a gap")
+        print(f"experiment: {experiment.seconds:.1f} s at {1 / experiment.Ts:.1f} Hz, {count} segments without a gap")
     for name, excitation in found.excitation.items():
         low, high = excitation.band_hz
         print(f"excitation {name}: {excitation.rms:.4f} RMS, 90 % of its power from {low:.2f} to {high:.2f} Hz")

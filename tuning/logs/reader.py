@@ -1,8 +1,9 @@
-"""The one way from a log of any format to an experiment."""
+"""Reading a flight log of any known format into an `Experiment`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.flight_phase import flying_parts
 from mimopilot.tuning.logs.flown_gains import flown_gains
+from mimopilot.tuning.logs.formats import FORMATS, HEAD_BYTES, UNSUPPORTED, known_formats
 from mimopilot.tuning.logs.log_checks import check_angles, check_log
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, on_common_grid
@@ -18,79 +20,61 @@ from mimopilot.tuning.motors import Motors, fit_motors, saturation_warnings
 
 from mimopilot.common.files import sha256
 
-ULOG = b"ULog\x01\x12\x35"
-DATAFLASH = b"\xa3\x95"
-MATLAB = b"MATLAB 5.0 MAT-file"
-CHANGED = "parameters were changed during the part that is used, the values before are taken as flown: "
-#: Beginnings of logs that are known and not read -> what to do.
-REFUSED = {
-    b"MATLAB 7.3 MAT-file": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
-    b"\x89HDF\r\n\x1a\n": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
-    b"FMT,": "an ArduPilot log as text; give the .bin file that it was made from",
-    b"H Product:Blackbox": "a Betaflight log; make a CSV file with blackbox_decode and name its columns with --columns",
-}
+CHANGED = "parameters changed in the part that is used; the values before the change count as flown: "
 
 
 def read_log(path: Path, columns: Columns | None = None) -> Experiment:
-    """Read an experiment from a flight log of any format that is known.
+    """Read the experiment in a flight log.
 
     Parameters
     ----------
     path : Path
-        PX4 ULog, ArduPilot dataflash, CSV or MATLAB file; its content decides, not its name.
+        A log of one of `tuning.logs.formats.FORMATS`; its content decides, not its name.
     columns : Columns, optional
         Names and units in a CSV or MATLAB file; by default those of `tuning.logs.columns`.
 
     Returns
     -------
     Experiment
-        The part of the log with injected excitation, else the part in the air.
+        The part of the log with injected excitation, else the part in flight.
 
     Raises
     ------
     TuningError
-        When the file is of no known format, damaged, lacks a signal, never flew, is too slow or too short.
+        When the format is not known, or the log is damaged, lacks a signal, holds no flight, or is too slow or too
+        short.
     """
     return experiment_of(open_log(path, columns))
 
 
 def open_log(path: Path, columns: Columns | None = None) -> Recording:
-    """Read the signals of a log as they were logged; see `read_log`.
+    """Read the signals of a log as logged, each with its own time stamps; see `read_log`.
 
     Raises
     ------
     TuningError
-        When the file is of no known format or damaged.
+        When the format is not known or the file is damaged.
     """
     if not path.is_file():
-        raise TuningError(f"{path}: no such file; give the path of a flight log (.ulg, .bin, .csv or .mat)")
+        raise TuningError(f"{path}: no such file; give the path of a flight log: {known_formats()}")
     with path.open("rb") as stream:
-        head = stream.read(4096)
-    if columns is not None and head.startswith((ULOG, DATAFLASH)):
-        raise TuningError(f"{path}: a column file is for CSV and MATLAB files, this log names its signals itself")
-    if head.startswith(ULOG):
-        from mimopilot.tuning.logs.ulog import record_ulog
-
-        return record_ulog(path)
-    if head.startswith(DATAFLASH):
-        from mimopilot.tuning.logs.dataflash import record_dataflash
-
-        return record_dataflash(path)
-    for beginning, advice in REFUSED.items():
+        head = stream.read(HEAD_BYTES)
+    for beginning, advice in UNSUPPORTED.items():
         if head.startswith(beginning):
             raise TuningError(f"{path}: {advice}")
-    if head.startswith(MATLAB):
-        from mimopilot.tuning.logs.tables import record_matlab
-
-        return record_matlab(path, columns or Columns())
-    if b"\0" not in head and any(mark in head.partition(b"\n")[0] for mark in (b",", b";", b"\t")):
-        from mimopilot.tuning.logs.tables import record_csv
-
-        return record_csv(path, columns or Columns())
-    raise TuningError(
-        f"{path}: not a flight log: neither PX4 ULog, ArduPilot dataflash (.bin), MATLAB (version 5 to 7) nor CSV; "
-        f"it begins with {head[:8]!r}"
-    )
+    found = next((row for row in FORMATS if row.matches(head)), None)
+    if found is None:
+        raise TuningError(f"{path}: not a flight log: it begins with {head[:8]!r}; known formats: {known_formats()}")
+    module, _, function = found.reader.partition(":")
+    read = getattr(import_module(module), function)
+    if found.takes_columns:
+        recording: Recording = read(path, columns or Columns())
+        return recording
+    if columns is not None:
+        tables = " and ".join(row.name for row in FORMATS if row.takes_columns)
+        raise TuningError(f"{path}: --columns is for {tables} files; this log names its signals itself, leave it out")
+    recording = read(path)
+    return recording
 
 
 def experiment_of(recording: Recording) -> Experiment:
@@ -99,7 +83,7 @@ def experiment_of(recording: Recording) -> Experiment:
     Raises
     ------
     TuningError
-        When the log lacks a signal, never flew, is too slow or too short.
+        When the log lacks a signal, holds no flight, or is too slow or too short.
     """
     experiment = unchecked_experiment(recording)
     try:
@@ -110,29 +94,29 @@ def experiment_of(recording: Recording) -> Experiment:
 
 
 def unchecked_experiment(recording: Recording) -> Experiment:
-    """The experiment in a log whose signals may contradict each other; see `experiment_of`."""
-    said = [*recording.warnings]
+    """The experiment in a log, without checking the signals against each other; see `experiment_of`."""
+    warnings = [*recording.warnings]
     try:
-        return _experiment(recording, said)
+        return _experiment(recording, warnings)
     except TuningError as error:
-        raise _with_warnings(error, said) from error
+        raise _with_warnings(error, warnings) from error
 
 
-def _with_warnings(error: TuningError, said: Sequence[str]) -> TuningError:
-    return TuningError(f"{error} (the log: {'; '.join(said)})") if said else error
+def _with_warnings(error: TuningError, warnings: Sequence[str]) -> TuningError:
+    return TuningError(f"{error} (warnings about the log: {'; '.join(warnings)})") if warnings else error
 
 
-def _experiment(recording: Recording, said: list[str]) -> Experiment:
-    """The experiment; what is wrong with the log although it can be used is added to what is said of it."""
+def _experiment(recording: Recording, warnings: list[str]) -> Experiment:
+    """The experiment; appends to `warnings` what is wrong with a log that can still be used."""
     recording.require_signals()
     check_angles(recording)
     parts, cut = flying_parts(recording)
-    said += cut
+    warnings += cut
     grid = on_common_grid(recording.signals, parts, str(recording.path), recording.advice)
     begin = max(parts[0][0], float(recording.signals["u"].time[0]))
     parameters, changed = recording.parameters_during(begin, parts[-1][1])
-    said += [CHANGED + "; ".join(changed)] if changed else []
-    motors = _motors(recording, parts, said)
+    warnings += [CHANGED + "; ".join(changed)] if changed else []
+    motors = _motors(recording, parts, warnings)
     return Experiment(
         Ts=grid.Ts,
         segments=grid.segments,
@@ -140,13 +124,16 @@ def _experiment(recording: Recording, said: list[str]) -> Experiment:
         sha256=sha256(recording.path.read_bytes()),
         flown=flown_gains(parameters, grid.Ts),
         motors=motors,
-        warnings=tuple(said),
+        warnings=tuple(warnings),
         **grid.signals,  # type: ignore[arg-type]  # of the names in Experiment
     )
 
 
-def _motors(recording: Recording, parts: tuple[Interval, ...], said: list[str]) -> Motors | None:
-    """How the allocator moved the motors in the usable parts of a log, where it holds their commands."""
+def _motors(recording: Recording, parts: tuple[Interval, ...], warnings: list[str]) -> Motors | None:
+    """The allocation from torque to motor commands in the usable parts; None when the log holds no commands.
+
+    Appends warnings about saturated motors to `warnings`.
+    """
     commands, torque = recording.commands, recording.signals["u"]
     if commands is None:
         return None
@@ -155,5 +142,5 @@ def _motors(recording: Recording, parts: tuple[Interval, ...], said: list[str]) 
     u, given = torque.values[made[used]], commands.values[used]
     motors = fit_motors(u, given)
     injected = recording.signals.get("u_bar")
-    said += saturation_warnings(u, given, motors, float(np.abs(injected.values).max()) if injected else 0.0)
+    warnings += saturation_warnings(u, given, motors, float(np.abs(injected.values).max()) if injected else 0.0)
     return motors if recording.linear_thrust else None

@@ -1,4 +1,4 @@
-"""Bringing the signals of a log, each with its own time stamps, to one uniform grid."""
+"""Resampling the signals of a log, each with its own time stamps, to one uniform grid."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import numpy as np
 from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
 
-MIN_RATE = 100.0  # Hz, of torque, rates and angles: below it gains come out wrong
-MAX_GAP = 5  # samples
-MIN_SECONDS = 5.0
-SAME_RATE = 1.1  # periods closer than this factor count as equal
-MAX_EMPTY = 20  # a grid with more than this many points a sample is the work of a damaged time stamp
+MIN_RATE = 100.0  # Hz, of torque, rates and angles: gains from slower logs are wrong
+MAX_GAP = 5  # periods; a longer pause cuts the log
+MIN_SECONDS = 5.0  # s of flight without a gap that tuning needs
+SAME_RATE = 1.1  # periods within this factor count as equal
+MAX_EMPTY = 20  # grid points per sample; more means a damaged time stamp
 
-#: Signals that make the experiment: all must be there, and none may be slow.
+#: Signals that every log must hold, all at `MIN_RATE` or more.
 REQUIRED = ("u", "y_i", "y_o")
-#: Signals that are constant between samples; the others are interpolated.
+#: Signals held between samples; the others are interpolated.
 HELD = ("u", "u_bar", "r_o", "r_i")
 
 Interval = tuple[float, float]
@@ -28,7 +28,7 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True, eq=False)
 class Series:
-    """One signal as logged: time (N,), s; values (N, n); and the topic that it came from."""
+    """One signal as logged: time (N,), s; values (N, n); and the topic, message or columns it came from."""
 
     time: NDArray[np.float64]
     values: NDArray[np.float64]
@@ -37,7 +37,7 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Signals on one grid: period (s), name -> (N, 2) array, and the stretches without a gap (samples)."""
+    """Signals on one grid: period (s), name -> (N, 2) array, and the segments without a gap (samples)."""
 
     Ts: float
     signals: dict[str, NDArray[np.float64]]
@@ -45,16 +45,16 @@ class Grid:
 
 
 def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], source: str, advice: str) -> Grid:
-    """Torque, rates, angles and what else is logged on the grid of the torque.
+    """All signals on the time grid of the torque.
 
-    Set-points, torque and excitation are held, measurements interpolated. Where torque, rates or angles
-    pause for more than five periods the grid is cut. Where one of the three is slower than the others, all
-    signals are brought to its rate through one and the same zero-phase anti-alias filter.
+    Setpoints, torque and excitation are held; measurements are interpolated. A pause of more than five periods
+    in torque, rates or angles cuts the grid. If one of the three is slower than the others, all signals are
+    decimated to its rate by the same zero-phase anti-alias filter.
 
     Parameters
     ----------
     series : mapping
-        Name -> signal with time stamps that rise (see `monotone`); `REQUIRED` must be among them.
+        Name -> signal with increasing time stamps (see `monotone`); must hold `REQUIRED`.
     parts : sequence of (begin, end), s
         Parts of the log to use, in order.
     source : str
@@ -111,7 +111,7 @@ def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], sour
 
 
 def monotone(signal: Series) -> Series:
-    """The signal with time stamps that rise: of equal ones the last is kept, those out of order are dropped."""
+    """The signal with increasing time stamps: the last of equal ones is kept, those out of order are dropped."""
     keep = np.append(np.diff(signal.time) != 0, True)[: len(signal.time)]
     time, values = signal.time[keep], signal.values[keep]
     if np.any(np.diff(time) < 0):
@@ -121,7 +121,7 @@ def monotone(signal: Series) -> Series:
 
 
 def sampling_period(time: NDArray[np.float64]) -> float:
-    """Sampling period, s: the median interval, refined over the log where single samples are missing."""
+    """Sampling period, s: the median interval, refined by a line fit that allows for missing samples."""
     median = float(np.median(np.diff(time)))
     index = np.concatenate([[0], np.cumsum(np.maximum(1, np.round(np.diff(time) / median)))])
     refined = float(np.polyfit(index, time, 1)[0])
@@ -130,9 +130,9 @@ def sampling_period(time: NDArray[np.float64]) -> float:
 
 
 def held_samples(values: NDArray[np.float64]) -> int:
-    """Rows for which each value is repeated because a slower signal was held; 1 when it is not.
+    """Rows for which each value of a slower signal is held; 1 when it is not held.
 
-    Quantisation repeats values too, but now and then; a hold never gives runs much below its length.
+    Quantisation also repeats values, but irregularly; a hold never gives runs much shorter than its length.
     """
     changes = np.flatnonzero(np.any(np.diff(values, axis=0) != 0, axis=1))
     if len(changes) < 10:
@@ -143,20 +143,21 @@ def held_samples(values: NDArray[np.float64]) -> int:
 
 
 def _rate_of(name: str, signal: Series, begin: float, end: float, source: str) -> tuple[float, str]:
-    """Period (s) at which a signal brings news, and what is to be said of it when it is too long."""
+    """Period (s) at which the values of a signal change, and a complaint when it is too long."""
     inside = (signal.time >= begin - 1e-9) & (signal.time <= end + 1e-9)
     if np.count_nonzero(inside) < 3:
         raise TuningError(
-            f"{source}: too short: {signal.topic} has {np.count_nonzero(inside)} samples where the experiment is"
+            f"{source}: too short: {signal.topic} has {np.count_nonzero(inside)} samples in the "
+            "experiment; log it faster or fly longer"
         )
     period = sampling_period(signal.time[inside])
-    # Angles are quantised in many logs, so that only torque and rates show a hold for certain.
+    # Many logs quantise angles, so only torque and rates show a hold reliably.
     hold = held_samples(signal.values[inside]) if name != "y_o" else 1
     if 1 / (period * hold) >= MIN_RATE * 0.99:
         return period * hold, ""
     logged = f"{signal.topic} is logged at {1 / period:.1f} Hz"
     if hold > 1:
-        logged += f" but each value is held for {hold} samples, so its rate is {1 / (period * hold):.1f} Hz"
+        logged += f" but each value is held for {hold} samples: its rate is {1 / (period * hold):.1f} Hz"
     return period * hold, logged
 
 
@@ -165,7 +166,7 @@ def _inside(time: NDArray[np.float64], begin: float, end: float) -> NDArray[np.f
 
 
 def _longest_rise(time: NDArray[np.float64]) -> list[int]:
-    """Indices of the longest rising subsequence: one wild stamp costs one sample, whichever way it jumps."""
+    """Indices of the longest increasing subsequence: one wrong stamp costs one sample, whichever way it jumps."""
     tails: list[float] = []
     at: list[int] = []
     before = [-1] * len(time)
@@ -185,7 +186,7 @@ def _longest_rise(time: NDArray[np.float64]) -> list[int]:
 
 
 def _place(signal: Series, grid: NDArray[np.float64], Ts: float, hold: bool) -> NDArray[np.float64]:
-    # A thousandth of a period forgives rounding of the stamps, so that equal times pair exactly.
+    # Allow a thousandth of a period for rounding of the stamps, so that equal times pair exactly.
     index = np.searchsorted(signal.time, grid + 1e-3 * Ts, side="right") - 1
     last = signal.values[np.maximum(index, 0)]
     if hold:
@@ -196,7 +197,7 @@ def _place(signal: Series, grid: NDArray[np.float64], Ts: float, hold: bool) -> 
 
 
 def _covered(time: NDArray[np.float64], grid: NDArray[np.float64], Ts: float) -> NDArray[np.bool_]:
-    """False for grid points inside a pause of more than MAX_GAP periods."""
+    """Whether each grid point is outside pauses of more than MAX_GAP periods, (N,)."""
     right = np.clip(np.searchsorted(time, grid - 1e-3 * Ts, side="left"), 0, len(time) - 1)
     left = np.clip(np.searchsorted(time, grid + 1e-3 * Ts, side="right") - 1, 0, len(time) - 1)
     covered: NDArray[np.bool_] = time[right] - time[left] <= MAX_GAP * Ts * 1.001
@@ -211,7 +212,7 @@ def _runs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
 def _decimate(
     Ts: float, signals: Mapping[str, NDArray[np.float64]], segments: Sequence[tuple[int, int]], slow: float
 ) -> tuple[float, dict[str, NDArray[np.float64]], tuple[tuple[int, int], ...]]:
-    """Every signal at the slow period, segment by segment, so that nothing is filtered across a gap."""
+    """Every signal at the period `slow` (s). Each segment is filtered by itself: no filter crosses a gap."""
     from scipy.signal import resample_poly
 
     ratio = Fraction(Ts / slow).limit_denominator(16)

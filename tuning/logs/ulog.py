@@ -1,4 +1,4 @@
-"""PX4 ULog files, genuine or written by our bench: signals by the names that each PX4 release gave them."""
+"""Reader of PX4 ULog files: signals by the topic and field names of each PX4 release."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mimopilot.tuning.logs.ulog_file import UlogFile, open_ulog
 from mimopilot.tuning.logs.vehicle_type import px4_vehicle
 from numpy.typing import NDArray
 
-#: Signal -> the (topic, fields) that hold it, newest PX4 first.
+#: Signal -> (topic, fields) that hold it, newest PX4 first.
 LAYOUTS = {
     "u": (("vehicle_torque_setpoint", ("xyz[0]", "xyz[1]")), ("actuator_controls_0", ("control[0]", "control[1]"))),
     "y_i": (("vehicle_angular_velocity", ("xyz[0]", "xyz[1]")), ("vehicle_attitude", ("rollspeed", "pitchspeed"))),
@@ -29,10 +29,11 @@ LAYOUTS = {
 EXCITATION_TOPIC, EXCITATION_NAME = "debug_vect", "MIMO_EXC"
 #: Upward thrust, newest PX4 first: (topic, field, sign).
 THRUSTS = (("vehicle_thrust_setpoint", "xyz[2]", -1.0), ("actuator_controls_0", "control[3]", 1.0))
-MIN_THRUST = 0.1
+MIN_THRUST = 0.1  # normalised; above it the vehicle counts as flying when no land detector was logged
 MOTORS_TOPIC, MOTORS = "actuator_motors", tuple(f"control[{i}]" for i in range(12))
-#: PX4's share of the quadratic term in the thrust curve that it makes up for: 0 leaves commands that set the speed.
+#: PX4's thrust model factor. 0: PX4 does not compensate the thrust curve, commands are proportional to rotor speed.
 THRUST_CURVE = "THR_MDL_FAC"
+#: (topic, field, value when armed).
 ARMED = (("actuator_armed", "armed", 1), ("vehicle_status", "arming_state", 2))
 
 
@@ -47,15 +48,15 @@ def record_ulog(path: Path) -> Recording:
     Returns
     -------
     Recording
-        Measurements and torque at the time of the gyro sample that they belong to, so that one control
-        cycle has one time; set-points and excitation at the cycle that used them.
+        Measurements and torque have the time of their gyro sample, so that one control cycle has one time.
+        Setpoints and excitation have the time of the cycle that used them.
 
     Raises
     ------
     TuningError
-        When the file is damaged.
+        When the file cannot be read at all.
     """
-    log = _Log(open_ulog(path))
+    log = _UlogLog(open_ulog(path))
     signals: dict[str, Series] = {}
     for signal, layouts in LAYOUTS.items():
         for topic, fields in layouts:
@@ -84,7 +85,7 @@ def record_ulog(path: Path) -> Recording:
     }
     return Recording(
         path=path,
-        format=_firmware(file.information),
+        format=_format_name(file.information),
         signals=signals,
         wanted=wanted,
         contents=file.names(),
@@ -103,20 +104,20 @@ def record_ulog(path: Path) -> Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class _Log:
+class _UlogLog:
     file: UlogFile
 
     def fields(self, topic: str) -> dict[str, NDArray[Any]]:
-        """Field -> values of the first instance of a topic; empty when it is not logged."""
+        """Field -> values of the first instance of a topic; empty when not logged."""
         found = self.file.fields(topic)
         return found if "timestamp" in found else {}
 
     def is_sampled(self, topic: str) -> bool:
-        """Whether a topic says of which gyro sample it was made."""
+        """Whether the messages of a topic carry the time of their gyro sample."""
         return bool(np.any(self.fields(topic).get("timestamp_sample", 0)))
 
     def published(self, topic: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times (s) at which the messages of a topic were published, and of the samples that they were made of."""
+        """Times (s) at which the messages of a topic were published, and times of their gyro samples."""
         data = self.fields(topic)
         stamps = data["timestamp"]
         samples = data.get("timestamp_sample", stamps)
@@ -132,30 +133,30 @@ class _Log:
 
 
 def _advice(profile: float | None) -> str:
-    """What to change so that the signals are logged, and fast enough: nothing that is so already."""
+    """What to change so that the signals are logged fast enough; names no setting that is right already."""
     if profile is None or int(profile) & 49 != 49:
         now = f" (default, high rate and debug; it is {profile:.0f})" if profile is not None else ""
         return f"set SDLOG_PROFILE to 49{now} and fly again"
     return (
-        f"SDLOG_PROFILE is {profile:.0f} and asks for every loop already: it is read when the vehicle starts, so "
-        "restart it, take a faster card if the log has gaps, and fly again"
+        f"SDLOG_PROFILE is {profile:.0f}, which logs every loop, but PX4 reads it at startup: restart the vehicle, "
+        "use a faster card if the log has gaps, and fly again"
     )
 
 
 def _angles(series: Series) -> Series:
-    """Roll and pitch (rad) from quaternions w, x, y, z; passed on where they are angles already."""
+    """Roll and pitch (rad) from quaternions w, x, y, z; a series of angles is returned unchanged."""
     if series.values.shape[1] == 2:
         return series
     w, x, y, z = series.values.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    # A set-point that is not used is all zeros.
+    # PX4 fills an unused setpoint with zeros.
     unit = np.abs(w**2 + x**2 + y**2 + z**2 - 1) < 0.1
     return Series(series.time, np.where(unit[:, None], np.column_stack([roll, pitch]), np.nan), series.topic)
 
 
-def _excitation(log: _Log) -> Series | None:
-    """The injected moment, where one was logged."""
+def _excitation(log: _UlogLog) -> Series | None:
+    """The injected torque; None when not logged."""
     series = log.series(EXCITATION_TOPIC, ("x", "y", *(f"name[{i}]" for i in range(len(EXCITATION_NAME)))))
     if series is None:
         return None
@@ -164,24 +165,24 @@ def _excitation(log: _Log) -> Series | None:
     return Series(series.time[ours], values, series.topic) if values.any() else None
 
 
-def _commands(log: _Log) -> Series | None:
-    """The commands of the motors that there are, at the gyro sample that they were made of."""
+def _commands(log: _UlogLog) -> Series | None:
+    """Commands of the existing motors, at the time of their gyro sample."""
     fields = log.fields(MOTORS_TOPIC)
     logged = tuple(name for name in MOTORS if name in fields)
     series = log.series(MOTORS_TOPIC, logged) if logged else None
     if series is None:
         return None
-    turning = np.isfinite(series.values).any(axis=0)
-    values = series.values[:, turning]
-    whole = np.isfinite(values).all(axis=1)
-    return Series(series.time[whole], values[whole], series.topic) if values.size and whole.any() else None
+    used = np.isfinite(series.values).any(axis=0)
+    values = series.values[:, used]
+    complete = np.isfinite(values).all(axis=1)
+    return Series(series.time[complete], values[complete], series.topic) if values.size and complete.any() else None
 
 
 def _at_cycle(series: Series, torque: tuple[NDArray[np.float64], NDArray[np.float64]]) -> Series:
-    """A signal that only knows when it was published, at the gyro sample of the control cycle that used it.
+    """A signal without gyro time stamps, moved to the gyro sample of the control cycle that used it.
 
-    That is the first one whose torque was published after it, or up to a quarter of a period before, as
-    excitation is published beside the torque of its own cycle.
+    That is the first cycle whose torque was published after the signal, or up to a quarter of a period before:
+    excitation is published together with the torque of its own cycle.
     """
     published, sampled = torque
     if len(published) < 3 or np.any(np.diff(published) < 0):
@@ -194,8 +195,8 @@ def _at_cycle(series: Series, torque: tuple[NDArray[np.float64], NDArray[np.floa
     return Series(np.where(used, sampled[near], series.time - lag), series.values, series.topic)
 
 
-def _airborne(log: _Log) -> tuple[tuple[Interval, ...] | None, str]:
-    """When the vehicle was armed and not landed, as far as the log says, and what says so."""
+def _airborne(log: _UlogLog) -> tuple[tuple[Interval, ...] | None, str]:
+    """When the vehicle was armed and not landed, and the topics that say so; None when not logged."""
     states: list[tuple[str, NDArray[np.float64], NDArray[np.bool_]]] = []
     landed = log.fields("vehicle_land_detected")
     if "landed" in landed:
@@ -220,13 +221,13 @@ def _airborne(log: _Log) -> tuple[tuple[Interval, ...] | None, str]:
 
 
 def _span(file: UlogFile) -> Interval | None:
-    """First and last time (s) of the topic with most messages."""
+    """First and last time (s) of the topic with the most messages."""
     most = max((t for t in file.topics.values() if not t.instance), key=lambda t: len(t.offsets), default=None)
     stamps = file.fields(most.name).get("timestamp") if most else None
     return (float(stamps[0]) * 1e-6, float(stamps[-1]) * 1e-6) if stamps is not None and len(stamps) else None
 
 
-def _firmware(information: Mapping[str, str | int]) -> str:
+def _format_name(information: Mapping[str, str | int]) -> str:
     release = information.get("ver_sw_release")
     numbers = [release >> shift & 255 for shift in (24, 16, 8)] if isinstance(release, int) else []
     version = f" {'.'.join(str(number) for number in numbers)}" if any(numbers) else ""

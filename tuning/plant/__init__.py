@@ -1,1 +1,1 @@
-"""What an experiment says of the vehicle: frequency response, inertia, identified model."""
+"""Plant estimates from one experiment: frequency response, rigid body, identified state space."""

@@ -1,4 +1,4 @@
-"""The plant's frequency response from one experiment, with its error."""
+"""Frequency response of the plant from one experiment, with its standard deviation."""
 
 from __future__ import annotations
 
@@ -8,30 +8,31 @@ from functools import lru_cache
 import numpy as np
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, external_signal
-from mimopilot.tuning.plant.body_shape import fit_shape, shape_response
 from mimopilot.tuning.plant.local_polynomial import local_response
+from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, fit_shape, shape_response
 from numpy.typing import NDArray
 
-#: Frequencies count where the excitation explains more than this share of a rate's power.
+#: Least multiple coherence of a rate with the excitation at a coherent frequency.
 COHERENT = 0.7
-#: Windows of the response are at least this share of their frequency wide on each side: vehicles answer smoothly there.
+#: Least half width of a window, as a fraction of its frequency: within it a vehicle's response is smooth.
 GROWTH = 0.08
-#: Relative errors of G_i (Frobenius norms): below the first it is known whatever its coherence, many bins of little
-#: coherence tell as much as few of a high one; above the second it is not.
+#: Relative errors of G_i (Frobenius norms). Below the first a frequency is known at any coherence: many bins of low
+#: coherence hold as much information as a few of high coherence. Above the second it is not known.
 KNOWN, UNKNOWN = 0.3, 0.7
-#: Two known frequencies belong to one stretch up to this ratio: the damped body between them is interpolated.
+#: Largest ratio of neighbouring known frequencies in one band: in between, a damped body is interpolated.
 HOLE = 1.25
-#: Share of the excitation's power below the highest frequency of a response.
+#: Fraction of the excitation's power below the highest frequency of a response.
 POWER = 0.9999
-#: Smoothing over frequency: half width (ratio, as a logarithm), least number of values, largest mean square that is
-#: left over their variance, and the relative error that the shape of a body has of its own.
-SMOOTH, ENOUGH, EXPLAINED, SHAPE_ERROR = 0.3, 5, 1.5, 0.03
-#: Angles and rates are compared where the angles' relative error is below this.
+#: Smoothing over frequency: half width (natural logarithm of the ratio), least number of values, largest residual
+#: mean square over their variance.
+SMOOTH, ENOUGH, EXPLAINED = 0.3, 5, 1.5
+#: Largest relative error of the angles where they are compared with the rates.
 SURE = 0.1
-#: Most that rates may lag behind angles, s: filters of a gyro and an estimator.
+#: s. Largest lag of rates behind angles, from filters of gyro and estimator.
 LAG = 0.05
+#: Known frequencies that smoothing and integration of the rates need.
 MIN_FREQUENCIES = 8
-#: Plants that are drawn from the error of a response.
+#: Number of plants drawn from the error distribution of a response.
 DRAWS = 64
 
 Complex = NDArray[np.complex128]
@@ -40,14 +41,14 @@ Signal = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PlantResponse:
-    """What one experiment says of the plant, at K frequencies.
+    """Frequency response of the plant at K frequencies.
 
     Attributes
     ----------
     omega : (K,) array, rad/s
         Frequencies.
     G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
-        Responses of rates and angles to the moment.
+        Responses of rates and angles to the torque.
     root : (K, 6, 6) array
         Square root of the noise spectrum of [u, y_i, y_o].
     reach : (K, 2, 2) array
@@ -75,7 +76,7 @@ class PlantResponse:
         return deviation
 
     def known(self) -> NDArray[np.bool_]:
-        """Where G_i is known: the excitation explains both rates, or its error is small all the same, (K,)."""
+        """Whether G_i is known: both rates are coherent, or the error is small, (K,)."""
         error = self.rate_error()
         return np.asarray(np.all(self.coherence > COHERENT, axis=1) & (error < UNKNOWN) | (error < KNOWN))
 
@@ -85,16 +86,16 @@ class PlantResponse:
         return error
 
     def known_run(self) -> NDArray[np.intp]:
-        """The longest stretch of known frequencies, as indices; gaps up to `HOLE` do not end it.
+        """Indices of the longest band of known frequencies; gaps up to `HOLE` do not end it.
 
-        It begins where the error is small. Below, the flying loop leaves the torque little of the excitation: the rates
-        are coherent all the same, and what the vehicle does beside its linear response decides.
+        It begins where the error is small. Below, the closed loop rejects most of the excitation from the torque:
+        the rates are still coherent, but nonlinear effects dominate.
         """
         sure = np.logical_or.accumulate(self.rate_error() < KNOWN)
         return self._longest(self.known() & sure)
 
     def coherent_run(self) -> NDArray[np.intp]:
-        """The longest stretch where the excitation explains both rates: what designs may lean on, as indices."""
+        """Indices of the longest band with coherent rates; designs use only this band."""
         return self._longest(np.all(self.coherence > COHERENT, axis=1))
 
     def _longest(self, where: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -105,7 +106,7 @@ class PlantResponse:
         return max(np.split(indices, np.flatnonzero(far) + 1), key=len)
 
     def band(self, axis: int) -> tuple[float, float] | None:
-        """Where the excitation explains an axis' rate, rad/s: the first and the last such frequency; None: nowhere."""
+        """First and last frequency (rad/s) with a coherent rate of an axis; None when there is none."""
         where = self.omega[self.coherence[:, axis] > COHERENT]
         return (float(where[0]), float(where[-1])) if len(where) else None
 
@@ -122,10 +123,10 @@ class PlantResponse:
         return PlantResponse(Ts=self.Ts, **arrays)
 
     def extended(self) -> PlantResponse:
-        """The response with frequencies below its own added, where rates integrate the moment and angles the rates.
+        """The response extended below its lowest frequency as a rigid body: 1/w for rates, 1/w^2 for angles.
 
-        Set-points have most of their power there, and there the closed loop hardly depends on the plant: so the shape
-        of a rigid body, 1/w and 1/w^2 from the mean of the lowest frequencies on, is enough.
+        Setpoints have most of their power there. The closed loop hardly depends on the plant there, so scaling the
+        mean of the lowest frequencies is enough.
         """
         step = float(np.diff(self.omega).min())
         low = np.arange(self.omega[0] - step, step / 2, -step)[::-1]
@@ -145,9 +146,10 @@ class PlantResponse:
         )
 
     def interpolated(self, share: float) -> PlantResponse:
-        """The response with frequencies between its own, none further from the next than a share of itself.
+        """The response interpolated so that neighbouring frequencies differ by at most `share` of themselves.
 
-        A damped body has G_i^-1 and G_o^-1 / w that are linear in w: they are interpolated. All else is the nearest's.
+        G_i^-1 and G_o^-1 / w of a damped body are linear in w, so these are interpolated. All other fields are those
+        of the nearest frequency.
         """
         counts = np.ceil(np.diff(self.omega) / (share * self.omega[:-1])).astype(int)
         place = np.concatenate([*(k + np.arange(n) / n for k, n in enumerate(counts)), [len(counts)]])
@@ -164,7 +166,7 @@ class PlantResponse:
         return replace(dense, omega=omega, G_i=between(self.G_i), G_o=between(old * self.G_o) / new)
 
     def draw(self, generator: np.random.Generator) -> PlantResponse:
-        """Another plant that the experiment allows, from its error distribution."""
+        """A plant drawn from the error distribution of the response."""
         shape = (len(self.omega), 6, 2)
         X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
         E = self.root @ X @ self.reach
@@ -182,23 +184,23 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
     instrument : (N, 2) array
         Its external signal w.
     upper : float, rad/s
-        Largest frequency of interest; by default all below the Nyquist frequency.
+        Largest frequency of interest; by default the Nyquist frequency.
 
     Raises
     ------
     TuningError
-        When the flight is too short, or w does not reach both axes.
+        When the flight is too short, or w does not excite both axes.
     """
     signals = np.hstack([experiment.u, experiment.y_i, experiment.y_o])
     upper = min(upper, 0.95 * np.pi / experiment.Ts, _reach(experiment, instrument))
     found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper, GROWTH)
     T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
     if np.any(np.linalg.matrix_rank(T_u) < 2):
-        raise TuningError("not excited: the external signal does not move both moments independently")
+        raise TuningError("not excited: the external signal does not move both torques independently; excite each axis")
     for name, T in (("rates", T_i), ("angles", T_o)):
         if np.any(np.linalg.matrix_rank(T) < 2):
             raise TuningError(
-                f"{experiment.source}: roll and pitch {name} are one signal; check what was logged as pitch"
+                f"{experiment.source}: roll and pitch {name} are the same signal; check the source of pitch"
             )
     inverse = np.linalg.inv(T_u)
     plant = PlantResponse(
@@ -213,14 +215,14 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
     return _angles_from_rates(_smoothed(plant))
 
 
-@lru_cache(maxsize=1)  # a log is judged by its response when it is read, and then tuned from
+@lru_cache(maxsize=1)  # the log checks and the tuning use the same response
 def measured_plant(experiment: Experiment) -> PlantResponse:
     """The plant's frequency response from the experiment's external signal; see `plant_response`."""
     return plant_response(experiment, external_signal(experiment)[0])
 
 
 def _reach(experiment: Experiment, instrument: Signal) -> float:
-    """Highest frequency that was excited, rad/s: a chirp ends, and what is above it is told by chance only."""
+    """Highest excited frequency, rad/s. Above the end of a chirp the response is noise."""
     reached = 0.0
     for start, stop in experiment.segments:
         part = instrument[start:stop] - instrument[start:stop].mean(axis=0)
@@ -232,10 +234,10 @@ def _reach(experiment: Experiment, instrument: Signal) -> float:
 
 
 def _smoothed(plant: PlantResponse) -> PlantResponse:
-    """The response to the rates, surer where it is that of a body behind a delay and a lag.
+    """The rate response, smoothed over frequency relative to the fitted shape.
 
-    Divided by that shape it hardly changes with frequency, so each value is taken from a line through those within
-    `SMOOTH` of it; where the line does not explain them, at a mode of the frame, the value stays as it is.
+    Divided by the shape the response hardly changes with frequency, so each value is taken from a line fitted to the
+    values within `SMOOTH` of it. If the line does not fit, as at a frame mode, the value is kept.
     """
     use = plant.known()
     if np.count_nonzero(use) < MIN_FREQUENCIES:
@@ -256,7 +258,7 @@ def _smoothed(plant: PlantResponse) -> PlantResponse:
         inverse = np.linalg.inv(line.T @ (certainty[:, None] * line))
         values = ratio[near].reshape(len(near), -1)
         found = inverse @ (line.T @ (certainty[:, None] * values))
-        # Windows overlap by half: their errors are those of half as many.
+        # Windows overlap by half, so only half of them are independent.
         misfit = float(np.sum(certainty[:, None] * np.abs(values - line @ found) ** 2)) / (4 * (len(near) - 2))
         share = np.sqrt(2 * inverse[0, 0] * max(1.0, misfit) * certainty[near == k][0])
         if misfit < EXPLAINED and share < 1:
@@ -266,10 +268,10 @@ def _smoothed(plant: PlantResponse) -> PlantResponse:
 
 
 def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
-    """Angles by integrating the rates where these are the surer: noise of an angle does not fall with frequency.
+    """The angle response, replaced by the integrated rate response where that has the smaller error.
 
-    What lies between the two besides the integral, such as the gyro's filter, is a gain and a delay, found where both
-    are known well.
+    Noise of an angle does not fall with frequency. The gain and the delay between both, such as from the gyro's
+    filter, are fitted where both are well known.
     """
     s = 1j * plant.omega
     integral = plant.G_i / s[:, None, None]

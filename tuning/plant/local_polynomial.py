@@ -1,10 +1,9 @@
-"""Frequency responses with confidence, from one closed-loop experiment, by local polynomials.
+"""Local polynomial estimate of frequency responses and their covariance from one closed-loop experiment.
 
-Around each frequency the response of every signal to the external excitation, and the transient of each
-segment, are smooth: both are fitted by a quadratic in frequency over a few DFT bins. What is left over is
-noise, so its spectrum and the covariance of the response come with the estimate (R. Pintelon, J. Schoukens,
-System Identification, a Frequency Domain Approach, 2nd ed., section 7.2). Leakage does not bias it and a PRBS
-needs no whole number of periods.
+The response to the external excitation and the transient of each segment are smooth in frequency. Both are fitted
+by a quadratic over a few DFT bins. The residual gives the noise spectrum and the covariance of the response. Leakage
+causes no bias, so a PRBS needs no whole number of periods. Source: R. Pintelon, J. Schoukens, System Identification:
+A Frequency Domain Approach, 2nd ed., section 7.2.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
 
 ORDER = 2  # of the local polynomials
-FREEDOM = 8  # degrees of freedom of the noise, at least
-CENTRES = 1000  # frequencies, at most
-#: A wide window hides something when its noise is above that of narrow ones by so many deviations of their ratio.
+FREEDOM = 8  # least degrees of freedom of the noise estimate in a window
+CENTRES = 1000  # largest number of frequencies
+#: A window is too wide if its noise exceeds that of narrow windows by this many standard deviations of the ratio.
 HIDDEN = 4.0
 
 Complex = NDArray[np.complex128]
@@ -37,11 +36,11 @@ class LocalResponse:
     response : (K, n_v, n_w) array
         From w to v.
     noise : (K, n_v, n_v) array
-        Spectrum of what w does not explain: E[V V^H] / N of the DFT over N samples.
+        Spectrum of the part that w does not explain: E[V V^H] / N of the DFT over N samples.
     explained : (K, n_v) array
-        Multiple coherence: share of each signal's power that w explains.
+        Multiple coherence: fraction of each signal's power that w explains.
     error : (K, n_w, n_w) array
-        Cov(vec of a row pair) of the response is noise (x) error.
+        The covariance of the response is noise (x) error (Kronecker product).
     """
 
     omega: Signal
@@ -66,23 +65,23 @@ def local_response(
     upper: float | None = None,
     growth: float = 0.0,
 ) -> LocalResponse:
-    """Responses of `v` to `w`, their errors and the noise.
+    """Responses of `v` to `w`, their errors, and the noise.
 
     Parameters
     ----------
     w : (N, n_w) array
-        External signals: the injected excitation, or the set-points.
+        External signals: the injected excitation, or the setpoints.
     v : (N, n_v) array
         Signals of the loop.
     Ts : float, s
         Sampling period.
     segments : sequence of (start, stop)
-        Stretches without a gap.
+        Segments without a gap.
     upper : float, optional, rad/s
         Largest frequency; the Nyquist frequency by default.
     growth : float
-        Windows are at least this share of their frequency wide on each side, except where the response changes faster
-        than that: fewer and surer values at high frequencies. 0: all as narrow as the data allow.
+        Least half width of a window as a fraction of its frequency, except where the response changes faster: fewer
+        values with less error at high frequencies. 0: all windows as narrow as the data allow.
 
     Returns
     -------
@@ -96,13 +95,15 @@ def local_response(
     n_w = w.shape[1]
     spectra = [_Spectrum(w[start:stop], v[start:stop], Ts) for start, stop in segments]
     finest = min(s.step for s in spectra)
-    # Enough rows in the longest segment for all parameters of the response and of its transient.
+    # The longest segment needs enough bins for the parameters of response and transient.
     rows = (ORDER + 1) * (n_w + 1) + FREEDOM
     upper = np.pi / Ts if upper is None else upper
     narrowest = max(rows / 2 * finest, upper / CENTRES)
     fits = _fits(spectra, n_w, narrowest, upper, growth)
     if not fits:
-        raise TuningError(f"too short: {sum(b - a for a, b in segments) * Ts:.2f} s hold no frequency response")
+        raise TuningError(
+            f"too short: {sum(b - a for a, b in segments) * Ts:.2f} s give no frequency response; record longer"
+        )
     return LocalResponse(
         omega=np.array([fit.centre for fit in fits]),
         response=np.array([fit.response for fit in fits]),
@@ -114,7 +115,7 @@ def local_response(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """What one window says; fields as in `LocalResponse`, and the degrees of freedom of its noise."""
+    """Fit of one window: fields as in `LocalResponse`, and the degrees of freedom of the noise."""
 
     centre: float
     response: Complex
@@ -125,7 +126,7 @@ class _Fit:
 
 
 def _fits(spectra: Sequence[_Spectrum], n_w: int, narrowest: float, upper: float, growth: float) -> list[_Fit]:
-    """Windows up to `upper`, each up to the centre of the next; wide ones are cut where they would hide something."""
+    """Fits of overlapping windows up to `upper`; a window that `_is_too_wide` is replaced by narrow ones."""
     found: list[_Fit] = []
     centre = narrowest
     while centre < upper:
@@ -136,7 +137,7 @@ def _fits(spectra: Sequence[_Spectrum], n_w: int, narrowest: float, upper: float
                 _fit(spectra, middle, narrowest, n_w)
                 for middle in np.arange(centre - half + narrowest, centre + half, 2 * narrowest)
             ]
-            if _hides(wide, parts):
+            if _is_too_wide(wide, parts):
                 begin = max(centre - half / 2, found[-1].centre + narrowest) if found else centre - half / 2
                 middles = np.arange(begin, centre + half / 2, narrowest)
                 found += [_fit(spectra, middle, narrowest, n_w) for middle in middles if middle < upper]
@@ -147,8 +148,8 @@ def _fits(spectra: Sequence[_Spectrum], n_w: int, narrowest: float, upper: float
     return found
 
 
-def _hides(wide: _Fit, parts: Sequence[_Fit]) -> bool:
-    """Whether a window is too wide for what is in it, such as a mode of the frame: narrow windows leave less noise."""
+def _is_too_wide(wide: _Fit, parts: Sequence[_Fit]) -> bool:
+    """Whether narrow windows leave significantly less noise, as around a frame mode."""
     freedom = sum(part.freedom for part in parts)
     narrow = sum(part.freedom * np.real(np.diag(part.noise)) for part in parts) / freedom
     ratio = np.real(np.diag(wide.noise)) / np.maximum(narrow, 1e-300)
@@ -166,14 +167,14 @@ class _Spectrum:
         self.V: Complex = np.fft.fft(v, axis=0) * scale
 
     def around(self, centre: float, half: float) -> tuple[Signal, Complex, Complex]:
-        """Bins within `half` of `centre`: distance scaled to -1..1, W and V. Bin 0 holds the trim: left out."""
+        """Bins within `half` of `centre`: distance scaled to -1..1, W and V. Without bin 0, which holds the trim."""
         bins = np.arange(int(np.ceil((centre - half) / self.step)), int(np.floor((centre + half) / self.step)) + 1)
         bins = bins[bins % self.length != 0]
         return (bins * self.step - centre) / half, self.W[bins % self.length], self.V[bins % self.length]
 
 
 def _fit(spectra: Sequence[_Spectrum], centre: float, half: float, n_w: int) -> _Fit:
-    """Local least squares with the transient of each segment projected out."""
+    """Local least squares; the transient of each segment is projected out."""
     regressors, outputs = [], []
     lost = 0
     for spectrum in spectra:

@@ -1,11 +1,11 @@
 """PBSID: predictor-based subspace identification of a plant from closed-loop data.
 
-The plant in innovation form, x(k+1) = A x + B u + K e, y = C x + D u + e, is written with its one-step
-predictor, whose A - K C is stable even where the plant is not. A long VARX model (past window p) has the
-predictor's Markov parameters; over a future window f they make the state's row space, and an SVD gives its
-order; A, B, C, D and K follow by least squares. Because past u and y are regressors, feedback does no harm:
-e(k) is uncorrelated with the past whatever made u. Source: A. Chiuso, "The role of vector autoregressive
-modeling in predictor-based subspace identification", Automatica 43 (2007); the thesis uses it in 3.2.
+The plant in innovation form is x(k+1) = A x + B u + K e, y = C x + D u + e. Its one-step predictor has the matrix
+A - K C, which is stable even if the plant is not. A long VARX model (past window p) holds the predictor's Markov
+parameters. Over a future window f they span the state's row space, and an SVD gives its order. A, B, C, D and K
+follow by least squares. Past u and y are regressors, so feedback causes no bias: e(k) is uncorrelated with the past.
+Source: A. Chiuso, "The role of vector autoregressive modeling in predictor-based subspace identification",
+Automatica 43 (2007); section 3.2 of the thesis.
 """
 
 from __future__ import annotations
@@ -15,27 +15,19 @@ from dataclasses import dataclass
 
 import numpy as np
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.experiment import Experiment
-from mimopilot.tuning.plant.frequency_response import PlantResponse
-from mimopilot.tuning.statespace import Response, Signal, StateSpace
+from mimopilot.tuning.statespace import Signal, StateSpace
 from numpy.typing import NDArray
 from scipy.linalg import lstsq, qr, svd
 
-#: Orders that are tried when none is asked for.
+#: Largest order tried when none is given.
 MAX_ORDER = 20
-#: Orders that are compared with a measured response, at most: a body, rotors, a filter and delays on two axes.
-RESPONSE_ORDER = 12
+#: Default past window, samples.
 PAST = 20
-#: Order by response: the lowest whose weighted square error is within this factor of the least is taken; one that fits
-#: by less, percent, is of no use.
-NEARLY, POOR = 1.3, 50.0
-#: Relative error that a response has besides its noise, and the one at which it counts half for a fit.
-SHAPE, SURE = 0.01, 0.05
 
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedModel:
-    """What PBSID found.
+    """A state space identified by PBSID.
 
     Attributes
     ----------
@@ -44,13 +36,13 @@ class IdentifiedModel:
     K : (n, n_y) array
         Innovation gain.
     singular_values : (min(f n_y, p (n_u + n_y)),) array
-        Of the state's row space, in the unit of y times the root of the sample count.
+        Singular values of the state's row space, in the unit of y times the root of the sample count.
     covariance : (n_y, n_y) array
-        Of the innovation e, squared unit of y.
+        Covariance of the innovation e, squared unit of y.
     past, future : int, samples
         Windows p and f.
     samples : int
-        Equations used.
+        Number of samples used.
     """
 
     plant: StateSpace
@@ -68,11 +60,11 @@ class IdentifiedModel:
 
     @property
     def predictor_stable(self) -> bool:
-        """Whether the one-step predictor forgets: A - K C has its eigenvalues inside the unit circle."""
+        """Whether all eigenvalues of A - K C are inside the unit circle."""
         return bool(np.abs(np.linalg.eigvals(self.plant.A - self.K @ self.plant.C)).max() < 1)
 
     def predict(self, u: Signal, y: Signal) -> Signal:
-        """One-step-ahead prediction of y from past u and y (and u(k), where D is not zero), from rest.
+        """One-step-ahead prediction of y from past u and y, and from u(k) if D is not zero; from rest.
 
         Parameters
         ----------
@@ -89,7 +81,7 @@ class IdentifiedModel:
         return StateSpace(A, B, p.C, D, p.Ts).simulate(np.hstack([u, y]))
 
     def simulate(self, u: Signal) -> Signal:
-        """Output of the plant alone, without noise, from rest; a plant that is not stable is refused.
+        """Output of the plant alone, without noise, from rest.
 
         Parameters
         ----------
@@ -128,21 +120,20 @@ def pbsid(
     Parameters
     ----------
     u, y : (N, n_u), (N, n_y) arrays
-        Input and output of the plant. Their means are taken off.
+        Input and output of the plant. The means are removed.
     Ts : float, s
         Sampling period.
     order : int, optional
-        Number of states; by default where the singular values fall most.
+        Number of states; by default at the largest drop of the singular values.
     past : int, samples
         Window p of the VARX model.
     future : int, samples, optional
         Window f <= p; p by default.
     external : (N, n_u) array, optional
-        External signal of the same sample as u, for a plant whose output answers within the sample (D): in
-        closed loop u(k) holds noise of the same sample, and this is the instrument in its place. Without
-        it D is zero: u(k) moves y(k+1) first, as on a vehicle.
+        Instrument for D, for a plant whose output depends on the input of the same sample: in closed loop u(k)
+        holds noise of the same sample. Without it D is zero: u(k) first moves y(k+1), as on a vehicle.
     segments : sequence of (start, stop), optional
-        Stretches without a gap; all of the data by default.
+        Segments without a gap; all of the data by default.
 
     Returns
     -------
@@ -151,9 +142,9 @@ def pbsid(
     Raises
     ------
     TuningError
-        When the windows or the order do not fit, the data are too short, or the input does not excite.
+        When windows or order are impossible, the data are too short, or the input does not excite the plant.
     """
-    states = _states(u, y, Ts, past, future, external, segments)
+    states = state_sequence(u, y, Ts, past, future, external, segments)
     if order is not None and not 1 <= order <= states.most:
         raise TuningError(
             f"identification: got order {order}; expected 1..{states.most} for a future window of {states.future}"
@@ -161,90 +152,9 @@ def pbsid(
     return states.model(order or states.gap())
 
 
-def pbsid_by_response(
-    u: Signal,
-    y: Signal,
-    Ts: float,
-    omega: Signal,
-    response: Response,
-    deviation: Signal,
-    *,
-    past: int = PAST,
-    future: int | None = None,
-    segments: Sequence[tuple[int, int]] | None = None,
-    least_fit: float = POOR,
-) -> tuple[IdentifiedModel, float]:
-    """`pbsid` with the order whose frequency response is nearest to the measured one.
-
-    A gap in the singular values says little in closed loop: on logs of a genuine PX4 it asked for order 2, whose
-    predictor diverged, where orders 4 to 8 fit.
-
-    Parameters
-    ----------
-    omega : (K,) array, rad/s
-    response : (K, n_y, n_u) array
-        From u to y, measured there.
-    deviation : (K, n_y, n_u) array
-        Its standard deviation.
-    u, y, Ts, past, future, segments
-        See `pbsid`.
-    least_fit : float, percent
-        What fits by less is refused.
-
-    Returns
-    -------
-    model : IdentifiedModel
-        Of the lowest order that fits nearly best within the error of the response, with a stable predictor.
-    fit : float, percent
-        See `response_fit`.
-
-    Raises
-    ------
-    TuningError
-        As `pbsid`, or when no order has a stable predictor, or fits.
-    """
-    states = _states(u, y, Ts, past, future, None, segments)
-    size = np.linalg.norm(response, axis=(1, 2))[:, None, None]
-    weight = 1 / (deviation**2 + (SHAPE * size) ** 2)
-    found = []
-    for order in range(1, min(RESPONSE_ORDER, states.most, len(states.singular_values)) + 1):
-        model = states.model(order)
-        if model.predictor_stable:
-            error = float(np.sum(weight * np.abs(model.plant.frequency_response(omega) - response) ** 2))
-            found.append((error, model))
-    if not found:
-        raise TuningError("identification: no order has a stable predictor; record longer, or excite more strongly")
-    least = min(error for error, _ in found)
-    model = next(model for error, model in found if error <= NEARLY * least)
-    fit = response_fit(model.plant, omega, response, deviation)
-    if fit < least_fit:
-        raise TuningError(
-            f"identification: no model of order 1 to {RESPONSE_ORDER} is near the measured response (the best fits by "
-            f"{fit:.0f} %, at least {least_fit:g} % are needed); record longer, or excite more strongly"
-        )
-    return model, fit
-
-
-def response_fit(plant: StateSpace, omega: Signal, response: Response, deviation: Signal) -> float:
-    """100 (1 - |G - model| / |G|), percent: each frequency weighed by itself, so that all octaves of an integrator
-    count, and by how surely it is known.
-
-    Parameters
-    ----------
-    plant : StateSpace
-    omega : (K,) array, rad/s
-    response, deviation : (K, n_y, n_u) arrays
-        Measured, and its standard deviation.
-    """
-    size, spread = (np.linalg.norm(part, axis=(1, 2)) for part in (response, deviation))
-    weight = (omega / (1 + (spread / (SURE * size)) ** 2))[:, None, None]
-    off = np.linalg.norm(weight * (plant.frequency_response(omega) - response))
-    return 100 * (1 - float(off / np.linalg.norm(weight * response)))
-
-
 @dataclass(frozen=True, eq=False)
-class _States:
-    """The state's row space of one experiment: what models of any order are made from."""
+class StateSequence:
+    """The state's row space of one experiment, from which a model of any order follows."""
 
     Q: Signal
     U: Signal
@@ -265,7 +175,7 @@ class _States:
         return self.future * int(self.now_y.shape[1]) - 1
 
     def gap(self) -> int:
-        """The order where the singular values fall most."""
+        """The order at the largest drop of the singular values."""
         s = self.singular_values
         tried = min(MAX_ORDER, self.most, len(s) - 1)
         return int(np.argmax(s[:tried] / s[1 : tried + 1])) + 1
@@ -282,11 +192,17 @@ class _States:
         plant = StateSpace(ABK[:, :order], ABK[:, order : order + n_u], CD[:, :order], D, self.Ts)
         covariance = e.T @ e / (len(x) - self.needed)
         return IdentifiedModel(
-            plant, ABK[:, order + n_u :], self.singular_values, covariance, self.past, self.future, len(x)
+            plant=plant,
+            K=ABK[:, order + n_u :],
+            singular_values=self.singular_values,
+            covariance=covariance,
+            past=self.past,
+            future=self.future,
+            samples=len(x),
         )
 
 
-def _states(
+def state_sequence(
     u: Signal,
     y: Signal,
     Ts: float,
@@ -294,26 +210,26 @@ def _states(
     future: int | None,
     external: Signal | None,
     segments: Sequence[tuple[int, int]] | None,
-) -> _States:
-    """Everything of `pbsid` that does not depend on the order."""
+) -> StateSequence:
+    """The part of `pbsid` that does not depend on the order."""
     f = past if future is None else future
     n_u, n_y = u.shape[1], y.shape[1]
     if not 1 <= f <= past:
         raise TuningError(f"identification: got past {past}, future {f}; expected 1 <= future <= past")
-    stretches = [(a, b) for a, b in segments or [(0, len(u))] if b - a > past + 1]
+    parts = [(a, b) for a, b in segments or [(0, len(u))] if b - a > past + 1]
     direct = external is not None
     needed = past * (n_u + n_y) + n_u * direct
-    count = sum(b - a - past for a, b in stretches)
+    count = sum(b - a - past for a, b in parts)
     if count < 4 * needed:
         raise TuningError(
-            f"too short: {count} usable samples for {needed} unknowns an output; record longer, or ask for a "
-            "smaller past"
+            f"too short: {count} usable samples for {needed} unknowns per output; record longer, or give a "
+            "smaller past window"
         )
-    inside = np.concatenate([np.arange(a, b) for a, b in stretches])
+    inside = np.concatenate([np.arange(a, b) for a, b in parts])
     u, y = u - u[inside].mean(axis=0), y - y[inside].mean(axis=0)
-    Z = np.vstack([_past(u[a:b], y[a:b], past) for a, b in stretches])
-    now_u, now_y = (np.vstack([s[a + past : b] for a, b in stretches]) for s in (u, y))
-    w = np.vstack([external[a + past : b] for a, b in stretches]) if external is not None else now_u[:, :0]
+    Z = np.vstack([_past(u[a:b], y[a:b], past) for a, b in parts])
+    now_u, now_y = (np.vstack([s[a + past : b] for a, b in parts]) for s in (u, y))
+    w = np.vstack([external[a + past : b] for a, b in parts]) if external is not None else now_u[:, :0]
     if not direct:
         now_u = now_u[:, :0]
 
@@ -324,97 +240,24 @@ def _states(
         observability[i * n_y : (i + 1) * n_y, : (past - i) * width] = markov[:, i * width :]
     Q, R = qr(Z, mode="economic")
     U, s, _ = svd(R @ observability.T, full_matrices=False)
-    # The next state of a stretch's last sample is in another stretch: leave it out.
-    ends = np.cumsum([b - a - past for a, b in stretches]) - 1
+    # The last sample of a segment has no next state.
+    ends = np.cumsum([b - a - past for a, b in parts]) - 1
     followed = np.setdiff1d(np.arange(count), ends)
-    full_u = np.vstack([u[a + past : b] for a, b in stretches])
-    return _States(Q, U, s, now_u, now_y, w, full_u, followed, past, f, needed, Ts)
-
-
-@dataclass(frozen=True, eq=False)
-class RatesModel:
-    """A plant from torque to body rates, and how well it fits.
-
-    Attributes
-    ----------
-    model : IdentifiedModel
-    one_step_percent : (2,) array
-        Fit of the prediction one sample ahead, roll and pitch rate.
-    response_percent : float
-        Fit of its frequency response to the measured one, see `pbsid_by_response`.
-    """
-
-    model: IdentifiedModel
-    one_step_percent: Signal
-    response_percent: float
-
-
-def identify_rates(
-    experiment: Experiment,
-    plant: PlantResponse,
-    *,
-    order: int | None = None,
-    past: int = PAST,
-    future: int | None = None,
-) -> RatesModel:
-    """The plant from torque to body rates; see `pbsid`.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    plant : PlantResponse
-        Measured on it: the order is the one that fits it.
-    order, past, future
-        See `pbsid`.
-
-    Raises
-    ------
-    TuningError
-        As `pbsid_by_response`; or when the predictor of the order that was asked for is not stable.
-    """
-    u, y, segments = experiment.u, experiment.y_i, experiment.segments
-    known = plant.at(plant.known_run())
-    if not len(known.omega):
-        raise TuningError(f"{experiment.source}: not excited: the response of the rates is known at no frequency")
-    if order is None:
-        model, response = pbsid_by_response(
-            u, y, experiment.Ts, known.omega, known.G_i, known.deviation(), past=past, future=future, segments=segments
-        )
-    else:
-        model = pbsid(u, y, experiment.Ts, order=order, past=past, future=future, segments=segments)
-        if not model.predictor_stable:
-            raise TuningError(
-                f"identification: the predictor of order {order} is not stable, its predictions grow without bound; "
-                "ask for another order, or leave it out"
-            )
-        response = response_fit(model.plant, known.omega, known.G_i, known.deviation())
-    u, y = u - u.mean(axis=0), y - y.mean(axis=0)
-    parts = [(y[a:b][past:], model.predict(u[a:b], y[a:b])[past:]) for a, b in segments]
-    measured, predicted = (np.vstack(side) for side in zip(*parts, strict=True))
-    return RatesModel(model, fit(measured, predicted), response)
-
-
-def model_toml(model: IdentifiedModel, log_sha256: str) -> str:
-    """The model as readable TOML text: Ts (s), A, B, C, D, K, windows, and the hash of the log."""
-    rows = {name: getattr(model.plant, name).tolist() for name in "ABCD"} | {"K": model.K.tolist()}
-    lines = [
-        "# x(k+1) = A x + B u + K e, y = C x + D u + e; u dimensionless moment, y body rates in rad/s",
-        "version = 1",
-        f"Ts = {model.plant.Ts!r}",
-        f"past = {model.past}",
-        f"future = {model.future}",
-        f'log_sha256 = "{log_sha256}"',
-    ]
-    for name, matrix in rows.items():
-        lines += [f"{name} = [", *(f"  {row}," for row in matrix), "]"]
-    return "\n".join(lines) + "\n"
-
-
-def fit(measured: Signal, modelled: Signal) -> Signal:
-    """Normalised root mean square fit in percent, one for each column; 100 is perfect, 0 no better than the mean."""
-    error = np.sqrt(np.mean((measured - modelled) ** 2, axis=0))
-    figure: Signal = 100 * (1 - error / np.std(measured, axis=0))
-    return figure
+    full_u = np.vstack([u[a + past : b] for a, b in parts])
+    return StateSequence(
+        Q=Q,
+        U=U,
+        singular_values=s,
+        now_u=now_u,
+        now_y=now_y,
+        w=w,
+        full_u=full_u,
+        followed=followed,
+        past=past,
+        future=f,
+        needed=needed,
+        Ts=Ts,
+    )
 
 
 def _past(u: Signal, y: Signal, past: int) -> Signal:
@@ -429,9 +272,9 @@ def _instrumental(regressors: Signal, instruments: Signal, target: Signal) -> Si
     scale = np.sqrt(np.einsum("ij,ij->j", regressors, regressors))
     weight = np.sqrt(np.einsum("ij,ij->j", instruments, instruments))
     if not (np.all(scale > 0) and np.all(weight > 0)):
-        raise TuningError("not excited: a signal is constant, so the plant cannot be identified")
+        raise TuningError("not excited: a signal is constant; excite both axes")
     scaled = moment / weight[:, None] / scale
     if np.linalg.cond(scaled) > 1e12:
-        raise TuningError("not excited: the input does not move every axis independently over the past window")
+        raise TuningError("not excited: the input does not excite every axis independently over the past window")
     solution: Signal = np.linalg.solve(scaled, instruments.T @ target / weight[:, None]) / scale[:, None]
     return solution

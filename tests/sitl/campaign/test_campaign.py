@@ -1,4 +1,4 @@
-"""Campaigns: the same runs whatever flies them, begun again without loss, each flown again bit for bit."""
+"""Campaigns: results do not depend on the workers, resume without loss, and replay bit for bit."""
 
 import json
 import os
@@ -17,30 +17,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mimopilot.sitl.autopilot.autopilot import Autopilot
-from mimopilot.sitl.campaign.draws import Variator
+from mimopilot.sitl.campaign.campaign_figures import choose_map, parse_map
+from mimopilot.sitl.campaign.draws import RunSampler
 from mimopilot.sitl.campaign.execution import run_campaign
-from mimopilot.sitl.campaign.figures import choose_map, parse_map
-from mimopilot.sitl.campaign.flights import CHUNK, Stand
+from mimopilot.sitl.campaign.flights import CHUNK, FlightRunner
 from mimopilot.sitl.campaign.plan import make_plan
-from mimopilot.sitl.campaign.replay import fly_again
-from mimopilot.sitl.campaign.summary import Results
+from mimopilot.sitl.campaign.replay import replay_flight
+from mimopilot.sitl.campaign.summary import CampaignResults
 from mimopilot.sitl.campaign.variation import variation_from_toml
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY, checked_inertia
-from mimopilot.tuning.errors import TuningError
 from pyulog import ULog
 from scipy.special import ndtri
 from scipy.stats import binom
 
+from mimopilot.common.errors import InputFileError
 from mimopilot.common.intervals import quantile, wilson
 from tests.conftest import assert_one_clear_line
 from tests.paths import TOP
 from tests.sitl.mavlink.running import PATIENCE_S
 
-RUNS = 60 * CHUNK  # enough that what interrupts a campaign finds it under way
+RUNS = 60 * CHUNK  # enough to interrupt the campaign while it flies
 VARY = """
 mass = { normal = [1.0, 0.05], relative = true }
 delay = { uniform = [0.5, 3.5] }
@@ -74,20 +74,20 @@ def plan_of(vehicle, gains=None, vary=VARY, **entries):
 
 
 def unstable(gains):
-    return replace(gains, Kp_i=gains.Kp_i + 5 * gains.Kp_i[::-1], certificate=None)  # roll answers pitch and pitch roll
+    return replace(gains, Kp_i=gains.Kp_i + 5 * gains.Kp_i[::-1], certificate=None)  # couples the axes
 
 
 def drawn(vehicle, vary, runs=2000):
-    variator = Variator(vehicle.airframe, variation_from_toml(vary, "spec"), doublet("roll", 0.4, 0.42, 0.004))
-    return [variator.draw(5, run) for run in range(runs)]
+    sampler = RunSampler(vehicle.airframe, variation_from_toml(vary, "spec"), doublet("roll", 0.4, 0.42, 0.004))
+    return [sampler.draw(5, run) for run in range(runs)]
 
 
-def test_a_run_is_that_flight_whatever_the_stand_flew_before(vehicle):
+def test_a_run_does_not_depend_on_the_runs_flown_before(vehicle):
     plan = plan_of(vehicle, vary="")
-    stand = Stand(plan)
+    runner = FlightRunner(plan)
     for run in (4, 0, 2):
         for index, scenario in enumerate(plan.scenarios):
-            flight = stand.fly(stand.draw(run), "default", index)
+            flight = runner.fly(runner.draw(run), "default", index)
             alone = fly(vehicle.airframe, Autopilot(vehicle.airframe, vehicle.default_gains()), scenario, [3, run, 1])
             assert flight.record.tobytes() == alone.record.tobytes()
             assert flight.truth.tobytes() == alone.truth.tobytes()
@@ -118,7 +118,7 @@ def test_draws_have_the_moments_of_their_distributions(vehicle):
     assert np.abs(motors - np.eye(4)).max() < 4 / np.sqrt(n)
 
 
-def test_what_is_drawn_is_what_flies(vehicle):
+def test_the_flight_uses_the_drawn_values(vehicle):
     own = vehicle.airframe.plant()
     share = own.inertia[0, 1] / np.sqrt(own.inertia[0, 0] * own.inertia[1, 1])
     for draw in drawn(vehicle, VARY, 20):
@@ -133,7 +133,7 @@ def test_what_is_drawn_is_what_flies(vehicle):
         assert thrust == pytest.approx(draw.plant.mass * GRAVITY, rel=1e-12)
 
 
-def test_draws_of_no_vehicle_are_replaced_and_counted_and_a_hopeless_specification_is_refused(vehicle):
+def test_impossible_draws_are_repeated_and_counted_and_an_impossible_specification_is_refused(vehicle):
     wide = "[inertia]\nzz = { uniform = [0.5, 1.5], relative = true }"
     draws = drawn(vehicle, wide, 300)
     for draw in draws:
@@ -156,13 +156,13 @@ def test_draws_of_no_vehicle_are_replaced_and_counted_and_a_hopeless_specificati
         ("mass = ", "not a TOML file"),
     ],
 )
-def test_a_wrong_specification_is_refused_by_the_name_of_its_entry(text, words):
-    with pytest.raises(TuningError) as error:
+def test_a_wrong_specification_is_refused_with_the_name_of_its_entry(text, words):
+    with pytest.raises(InputFileError) as error:
         variation_from_toml(text, "spec.toml")
     assert words in str(error.value)
 
 
-def test_faults_are_those_of_the_scenario_and_those_drawn_and_nothing_of_them_is_left_for_the_next_run(vehicle):
+def test_faults_are_those_of_the_scenario_and_the_drawn_ones_and_do_not_affect_the_next_run(vehicle):
     vary = """
 [[fault]]
 kind = "motor"
@@ -176,14 +176,14 @@ size = 0.9
 at = 1.2
 """
     plan = plan_of(vehicle, vary=vary, faults=["gyro-stuck:roll@1.1+0.02", "loss=0.2@0.5"], axes=["roll"])
-    stand = Stand(plan)
+    runner = FlightRunner(plan)
     motors = set()
     for run in (5, *range(30)):
-        draw = stand.draw(run)
+        draw = runner.draw(run)
         assert [fault.kind for fault in draw.faults] == ["gyro-stuck", "loss", "motor", "gain"]
         assert draw.faults[2].size == draw.values["fault.1.size"]
         motors.add(draw.faults[2].motor)
-        flight = stand.fly(draw, "default", 0)
+        flight = runner.fly(draw, "default", 0)
         scenario = replace(plan.scenarios[0], faults=draw.faults)
         alone = fly(vehicle.airframe, Autopilot(vehicle.airframe, vehicle.default_gains()), scenario, [3, run, 1])
         assert flight.record.tobytes() == alone.record.tobytes()
@@ -191,7 +191,7 @@ at = 1.2
     assert motors == {1, 2, 3, 4}
 
 
-def test_every_gain_set_flies_the_same_vehicles_and_an_unstable_one_survives_never(vehicle, tmp_path):
+def test_every_gain_set_flies_the_same_vehicles_and_an_unstable_one_never_survives(vehicle, tmp_path):
     good = vehicle.default_gains()
     plan = plan_of(vehicle, {"good": good, "bad": unstable(good)}, axes=["pitch"])
     results = run_campaign(plan, tmp_path, 2)
@@ -202,17 +202,18 @@ def test_every_gain_set_flies_the_same_vehicles_and_an_unstable_one_survives_nev
     for name in table.column_names[table.column_names.index("rejected_draws") :]:
         assert good_rows[name].equals(bad_rows[name]), name
     survived = {
-        group.gains: (group.survived, group.survived_share) for group in Results(plan, results).summarise().groups
+        group.gains: (group.survived, group.survived_share)
+        for group in CampaignResults(plan, results).summarise().groups
     }
     assert survived == {"good": (n, wilson(n, n)), "bad": (0, wilson(0, n))}
-    worst = Results(plan, results).summarise().groups[1].worst[0]
+    worst = CampaignResults(plan, results).summarise().groups[1].worst[0]
     assert worst.lost_at_s == min(bad_rows["lost_at_s"].to_pylist())
 
 
-def test_the_summary_is_that_of_the_table(vehicle, tmp_path):
+def test_the_summary_agrees_with_the_results(vehicle, tmp_path):
     plan = plan_of(vehicle, axes=["roll"])
     results = run_campaign(plan, tmp_path, 1)
-    (group,) = Results(plan, results).summarise().groups
+    (group,) = CampaignResults(plan, results).summarise().groups
     figures = np.sort(pq.read_table(results)["J_M_o"].to_numpy())
     value, low, high = group.quantiles["J_M_o"]["0.5"]
     assert value == figures[(len(figures) - 1) // 2]
@@ -220,7 +221,7 @@ def test_the_summary_is_that_of_the_table(vehicle, tmp_path):
     assert group.worst[0].J_M_o == figures[-1]
 
 
-def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campaigns(vehicle, tmp_path):
+def test_the_results_are_the_same_bytes_for_any_workers_and_after_interrupts_and_kills(vehicle, tmp_path):
     plan = plan_of(vehicle, runs=RUNS, axes=["roll"])
     whole = run_campaign(plan, tmp_path / "whole", 1).read_bytes()
     vary = tmp_path / "vary.toml"
@@ -241,8 +242,8 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
     ]
     command += ["--vary", str(vary), "--out", str(out), "--workers", "2", "--json"]
 
-    def begun(parts):
-        # A shell's background jobs, this one perhaps, ignore Ctrl-C, and so do their children.
+    def started(parts):
+        # Background jobs of a shell ignore Ctrl-C, and so do their children.
         heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True, preexec_fn=heed)
         deadline = time.monotonic() + PATIENCE_S
@@ -252,7 +253,7 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
             time.sleep(0.005)
         return process
 
-    process = begun(3)
+    process = started(3)
     process.send_signal(signal.SIGINT)
     _, message = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130
@@ -260,7 +261,7 @@ def test_any_workers_give_the_same_bytes_and_so_do_interrupted_and_killed_campai
     kept = {path: path.stat().st_mtime_ns for path in (out / "parts").glob("[0-9]*.part")}
     assert len(kept) >= 3
 
-    process = begun(len(kept) + 3)
+    process = started(len(kept) + 3)
     workers = [int(pid) for pid in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()]
     assert len(workers) == 2
     process.kill()
@@ -288,7 +289,7 @@ def alive(pid):
 
 @pytest.fixture
 def environment():
-    """Left as it was: a cluster writes the number of threads into it, and tests after this one would inherit it."""
+    """Restores the environment: a cluster sets the number of threads in it, which later tests would inherit."""
     before = dict(os.environ)
     yield
     os.environ.clear()
@@ -324,7 +325,7 @@ print(parts)
 """
 
 
-def test_the_map_is_over_what_matters_and_over_nothing_that_does_not_vary(vehicle, tmp_path):
+def test_the_map_shows_the_most_influential_quantities_and_only_varied_ones(vehicle, tmp_path):
     vary = """
 wind = { north = { normal = [0, 0.1] }, east = { normal = [0, 0.1] } }
 motors = { time_constant = { loguniform = [0.03, 0.5] }, effectiveness = { uniform = [0.99, 1.0] } }
@@ -334,24 +335,24 @@ size = { uniform = [0.5, 5.0] }
 at = 1.1
 """
     plan = plan_of(vehicle, vary=vary, axes=["roll"])
-    results = Results(plan, run_campaign(plan, tmp_path, 1))
+    results = CampaignResults(plan, run_campaign(plan, tmp_path, 1))
     survived = results.column("survived", "default", "roll")
     assert 0.1 < survived.mean() < 0.9
     assert set(choose_map(results)) == {"motors.time_constant", "fault.1.size"}
     assert parse_map(plan, "wind.north,wind.east") == ("wind.north", "wind.east")
     for wrong in ("mass,drag", "wind.north", "wind.north,wind.north"):
         with pytest.raises(
-            SitlError, match=f"--map: got '{wrong}', expected two of those that vary: motors.time_constant"
+            SitlError, match=f"--map: got '{wrong}', expected two varied quantities: motors.time_constant"
         ):
             parse_map(plan, wrong)
 
 
-def test_another_campaign_in_the_same_folder_is_refused_by_what_differs(vehicle, tmp_path):
+def test_another_campaign_in_the_same_folder_is_refused_with_the_difference(vehicle, tmp_path):
     good = vehicle.default_gains()
     run_campaign(plan_of(vehicle, runs=2, axes=["roll"]), tmp_path, 1)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     others = {
-        "seed: 3 there, 4 here": plan_of(vehicle, runs=2, axes=["roll"], seed=4),
+        "seed: 3 in the folder, 4 now": plan_of(vehicle, runs=2, axes=["roll"], seed=4),
         "vary: ": plan_of(vehicle, runs=2, axes=["roll"], vary=""),
         "gains/default.gains.toml differs": plan_of(vehicle, {"default": unstable(good)}, runs=2, axes=["roll"]),
         "airframe.toml differs": plan_of(load_airframe("adam0_nominal"), runs=2, axes=["roll"]),
@@ -362,15 +363,15 @@ def test_another_campaign_in_the_same_folder_is_refused_by_what_differs(vehicle,
         assert words in str(error.value)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     (tmp_path / "spec.toml").unlink()
-    with pytest.raises(SitlError, match="holds results, but no spec"):
+    with pytest.raises(SitlError, match="holds results but no spec"):
         run_campaign(plan_of(vehicle, runs=2, axes=["roll"]), tmp_path, 1)
 
 
-def test_a_run_flown_again_has_the_figures_of_the_table_and_its_log_is_that_flight(vehicle, mimopilot, tmp_path):
+def test_a_replayed_run_has_the_figures_of_the_results_and_its_log_is_the_same_flight(vehicle, mimopilot, tmp_path):
     plan = plan_of(vehicle, runs=12)
     results = run_campaign(plan, tmp_path / "c", 1)
     for row in pq.read_table(results).to_pylist():
-        again = fly_again(tmp_path / "c", row["run"], row["gains"], row["axis"])
+        again = replay_flight(tmp_path / "c", row["run"], row["gains"], row["axis"])
         assert {**again.row, "lost_at_s": None} == {**row, "lost_at_s": None}
         again.compare()
     finished = mimopilot("replay", tmp_path / "c", "--run", 7, "--axis", "pitch", "--out", "w.ulg", "--json")
@@ -383,7 +384,7 @@ def test_a_run_flown_again_has_the_figures_of_the_table_and_its_log_is_that_flig
 
 
 @given(st.integers(1, 5000), st.data())
-def test_wilsons_bounds_are_where_the_score_test_turns(n, data):
+def test_wilsons_bounds_are_the_limits_of_the_score_test(n, data):
     k = data.draw(st.integers(0, n))
     z = ndtri(0.975)
     for bound, end in zip(wilson(k, n), (0, n), strict=True):
@@ -394,7 +395,7 @@ def test_wilsons_bounds_are_where_the_score_test_turns(n, data):
 
 
 @given(st.integers(1, 400), st.sampled_from([0.05, 0.5, 0.95]))
-def test_intervals_of_quantiles_cover_at_least_what_they_say(n, p):
+def test_intervals_of_quantiles_have_at_least_their_nominal_coverage(n, p):
     _, low, high = quantile(np.arange(n, dtype=float), p)
     # The quantile lies between the sorted samples i and i + 1 with the probability of i successes in n.
     first = 0 if np.isnan(low) else int(low) + 1
@@ -411,7 +412,7 @@ def test_the_specification_in_the_readme_can_be_drawn_from(vehicle):
     assert {"mass", "delay", "inertia.xx", "motors.effectiveness.4", "fault.1.motor", "amplitude_deg"} <= set(names)
 
 
-def test_a_mistake_found_by_the_first_draw_takes_no_folder(tmp_path):
+def test_a_mistake_found_by_the_first_draw_creates_no_folder(tmp_path):
     vary = tmp_path / "vary.toml"
     vary.write_text("mass = { uniform = [-2, -1] }\n")
     arguments = ["campaign", "adam0", "--vary", str(vary), "--runs", "3", "--out", str(tmp_path / "out")]

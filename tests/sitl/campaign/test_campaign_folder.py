@@ -1,4 +1,4 @@
-"""What lies in a campaign's folder: parts that are checked, and one campaign at a time."""
+"""The folder of a campaign: its parts are checked, and only one campaign uses it at a time."""
 
 import subprocess
 import sys
@@ -6,8 +6,8 @@ import sys
 import pytest
 from mimopilot.sitl.campaign.execution import run_campaign
 from mimopilot.sitl.campaign.flights import CHUNK, fly_chunk
-from mimopilot.sitl.campaign.plan import LOCK, PARTS, RESULTS, make_plan, settle
-from mimopilot.sitl.campaign.summary import Results
+from mimopilot.sitl.campaign.plan import LOCK, PARTS, RESULTS, make_plan, write_plan_files
+from mimopilot.sitl.campaign.summary import CampaignResults
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.airframe import load_airframe
 
@@ -30,15 +30,15 @@ def flown(tmp_path_factory):
 
 
 def begin(plan, folder, parts):
-    """The folder of a campaign that was interrupted with these parts."""
-    settle(plan, folder)
+    """The folder of an interrupted campaign with these parts."""
+    write_plan_files(plan, folder)
     (folder / PARTS).mkdir()
     for chunk, part in parts.items():
         (folder / PARTS / f"{chunk:07d}.part").write_bytes(part)
     return folder
 
 
-def test_a_damaged_a_doubled_and_a_foreign_part_are_flown_again_and_told(flown, tmp_path, capsys):
+def test_a_damaged_a_duplicate_and_a_foreign_part_are_flown_again_with_a_warning(flown, tmp_path, capsys):
     plan, results, parts = flown
     middle = len(parts[1]) // 2
     flipped = parts[1][:middle] + bytes([parts[1][middle] ^ 4]) + parts[1][middle + 1 :]
@@ -47,13 +47,13 @@ def test_a_damaged_a_doubled_and_a_foreign_part_are_flown_again_and_told(flown, 
     assert run_campaign(plan, folder, 1).read_bytes() == results
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(
-        "parts: flown again: 0000001.part is damaged; 0000002.part is of runs 0 to 63; "
+        "parts: unusable parts are flown again: 0000001.part is damaged; 0000002.part is of runs 0 to 63; "
         "0000003.part is of another campaign"
     )
 
 
 @pytest.mark.parametrize("kind", ["half", "zeros", "empty", "table alone", "the last one of fewer runs"])
-def test_whatever_is_wrong_with_a_part_the_results_are_the_same(flown, tmp_path, capsys, kind):
+def test_any_damage_of_a_part_leaves_the_results_the_same(flown, tmp_path, capsys, kind):
     plan, results, parts = flown
     part = parts[4]
     wrong = {
@@ -68,9 +68,9 @@ def test_whatever_is_wrong_with_a_part_the_results_are_the_same(flown, tmp_path,
     assert "0000004.part is " in capsys.readouterr().err
 
 
-def test_sound_parts_are_not_flown_again(flown, tmp_path, capsys, monkeypatch):
+def test_undamaged_parts_are_not_flown_again(flown, tmp_path, capsys, monkeypatch):
     plan, results, parts = flown
-    monkeypatch.setattr("mimopilot.sitl.campaign.execution._fly", None)
+    monkeypatch.setattr("mimopilot.sitl.campaign.execution._fly_chunks", None)
     assert run_campaign(plan, begin(plan, tmp_path, dict(enumerate(parts))), 1).read_bytes() == results
     assert capsys.readouterr().err == ""
 
@@ -78,21 +78,21 @@ def test_sound_parts_are_not_flown_again(flown, tmp_path, capsys, monkeypatch):
 HOLDER = """
 import sys
 from pathlib import Path
-from mimopilot.sitl.campaign.execution import _alone
-with _alone(Path(sys.argv[1])):
+from mimopilot.sitl.campaign.execution import _folder_lock
+with _folder_lock(Path(sys.argv[1])):
     print("alone", flush=True)
     sys.stdin.read()
 """
 
 
-def test_a_second_campaign_in_a_folder_is_told_until_the_first_has_ended_even_by_a_kill(flown, tmp_path):
+def test_a_second_campaign_in_a_folder_is_refused_until_the_first_ends_or_is_killed(flown, tmp_path):
     plan, results, _ = flown
     command = [sys.executable, "-c", HOLDER, str(tmp_path / "c")]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as first:
         assert first.stdout.readline() == "alone\n"
         with pytest.raises(
             SitlError,
-            match="c: another process is flying a campaign into it; wait until it ends, or give another --out",
+            match="c: another process writes a campaign into this folder; wait for it, or give another --out",
         ):
             run_campaign(plan, tmp_path / "c", 1)
         assert [path.name for path in (tmp_path / "c").iterdir()] == [LOCK]
@@ -100,25 +100,25 @@ def test_a_second_campaign_in_a_folder_is_told_until_the_first_has_ended_even_by
     assert run_campaign(plan, tmp_path / "c", 1).read_bytes() == results
 
 
-def test_damage_between_the_flight_and_the_table_is_told(flown, tmp_path, monkeypatch):
+def test_damage_between_flight_and_merge_is_reported(flown, tmp_path, monkeypatch):
     plan, _, parts = flown
     folder = begin(plan, tmp_path, dict(enumerate(parts)))
     (folder / PARTS / "0000002.part").write_bytes(parts[2][:-1])
-    monkeypatch.setattr("mimopilot.sitl.campaign.execution._missing", lambda *_: [])
+    monkeypatch.setattr("mimopilot.sitl.campaign.execution._find_missing_chunks", lambda *_: ([], []))
     with pytest.raises(SitlError, match=r"0000002\.part is damaged; give the same command again"):
         run_campaign(plan, folder, 1)
 
 
-def test_a_damaged_table_of_results_is_told_or_does_no_harm(flown, tmp_path):
+def test_damaged_results_are_reported_or_read_correctly(flown, tmp_path):
     plan, results, _ = flown
     path = tmp_path / RESULTS
     path.write_bytes(results)
-    sound, told = Results(plan, path).summarise(), 0
+    expected, refused = CampaignResults(plan, path).summarise(), 0
     for place in range(0, len(results), len(results) // 60):
         path.write_bytes(results[:place] + bytes([results[place] ^ 8]) + results[place + 1 :])
         try:
-            assert Results(plan, path).summarise() == sound
+            assert CampaignResults(plan, path).summarise() == expected
         except SitlError as error:
             assert f"{path}: damaged; remove it" in str(error)
-            told += 1
-    assert told > 20
+            refused += 1
+    assert refused > 20

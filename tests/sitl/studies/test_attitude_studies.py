@@ -1,4 +1,4 @@
-"""Chapter 6 on the bench, in small: few seeds, the same rules."""
+"""The attitude studies of chapter 6 with few seeds: the same rules."""
 
 import json
 
@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.sitl.studies.attitude import AUTOTUNE, BEST, BOUND, MIMO, REFINED, SISO, SISO_OWN, experiment, studies
 from mimopilot.sitl.studies.attitude_report import study_sections
-from mimopilot.sitl.studies.attitude_runs import run_once, run_studies
+from mimopilot.sitl.studies.attitude_run import experiment
+from mimopilot.sitl.studies.attitude_statistics import run_once, run_studies
+from mimopilot.sitl.studies.attitude_study import AUTOTUNE, BEST, BOUND, MIMO, REFINED, SISO, SISO_OWN, studies
 from mimopilot.sitl.studies.autotune import autotune, identify_arx, minimum_variance_pid
 from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.sitl.studies.expectations import EFFORT, expectations
@@ -29,11 +30,11 @@ def found():
     return dict(zip(names, run_studies([known[name] for name in names], SEEDS, 2), strict=True))
 
 
-def test_the_command_offers_what_can_be_studied():
+def test_the_command_lists_every_study():
     assert [choice.value for choice in Choice] == [*STUDIES, ALL]
 
 
-def test_studies_take_their_tasks_from_the_printed_tables():
+def test_studies_take_their_values_from_the_printed_tables():
     known = studies()
     flight = PRINTED["adam0_flight_nominal"]
     assert known["adam0"].amplitude_deg == flight["doublet"]["amplitude_deg"]
@@ -44,7 +45,7 @@ def test_studies_take_their_tasks_from_the_printed_tables():
     assert known["adam0-perturbed"].siso_airframe == "adam0_nominal"
 
 
-def test_the_boom_couples_by_forty_per_cent_and_keeps_the_balance():
+def test_the_boom_couples_the_axes_by_forty_per_cent_and_keeps_the_balance():
     plant = load_airframe("adam0_boom").airframe.plant()
     J = plant.inertia
     assert J[0, 1] / np.sqrt(J[0, 0] * J[1, 1]) == pytest.approx(0.40, abs=0.002)
@@ -59,7 +60,7 @@ def test_decoupling_and_effort_are_as_expected(found):
         assert row.met(REFINED), row
 
 
-def test_following_is_near_the_best_possible(found):
+def test_tracking_is_near_the_best_possible(found):
     rows = [row for row in expectations(list(found.values())) if row.over == BEST]
     assert len(rows) == 4
     for row in rows:
@@ -67,24 +68,24 @@ def test_following_is_near_the_best_possible(found):
 
 
 @pytest.mark.parametrize("name", ["adam0-perturbed", "coupled"])
-def test_the_best_on_the_true_plant_keeps_its_limits_and_is_the_best_within_them(found, name):
+def test_the_optimum_on_the_true_plant_is_within_its_limits_and_the_best_method(found, name):
     statistics = found[name]
     for axis in AXES:
-        # 5 % without noise; what brisk gains make of the noise comes on top.
+        # 5 % without noise; noise through high gains adds to it.
         assert statistics.median(BEST, axis, "effort_rms") < EFFORT * statistics.median(SISO, axis, "effort_rms")
         for method in (SISO, MIMO):
             assert statistics.median(BEST, axis, "J_M_o") < statistics.median(method, axis, "J_M_o")
         assert statistics.median(BOUND, axis, "J_M_o") < statistics.median(BEST, axis, "J_M_o")
 
 
-def test_the_own_log_gives_siso_gains_too_but_no_decoupling(found):
+def test_siso_gains_from_the_vehicles_own_log_do_not_decouple(found):
     statistics = found["adam0-perturbed"]
     for axis in AXES:
         assert statistics.median(SISO_OWN, axis, "J_M_o") < statistics.median(SISO, axis, "J_M_o")
         assert statistics.median(SISO_OWN, axis, "offaxis_peak_deg") > 1.5
 
 
-def test_a_run_is_the_same_whatever_the_process_and_what_else_it_did(found):
+def test_a_run_does_not_depend_on_its_process(found):
     statistics = found["coupled"]
     best = {method: statistics.shown.gains[method] for method in (BEST, BOUND)}
     with processes(1) as pool:
@@ -92,7 +93,7 @@ def test_a_run_is_the_same_whatever_the_process_and_what_else_it_did(found):
     assert json.dumps(again) == json.dumps(statistics.runs[1])
 
 
-def test_the_report_has_the_printed_figures_and_the_same_bytes_again(found):
+def test_the_report_has_the_printed_figures_and_is_reproducible(found):
     statistics = found["adam0-perturbed"]
     sections = study_sections(statistics)
     cells = [cell for section in sections for table in section.tables for row in table.rows for cell in row]
@@ -126,7 +127,7 @@ def test_the_arx_fit_finds_a_second_order_model():
     assert b == pytest.approx([0.02, 0.01, 0.0], abs=1e-6)
 
 
-def test_the_per_axis_baseline_flies_but_leaks():
+def test_the_per_axis_baseline_flies_but_does_not_decouple():
     study = studies()["coupled"]
     _, log = experiment(study, study.airframe, 0)
     gains = autotune(log, log.flown)
@@ -135,11 +136,11 @@ def test_the_per_axis_baseline_flies_but_leaks():
     assert (np.diag(gains.Kp_i) > 0).all()
 
 
-def test_the_autotuned_set_is_in_every_study():
+def test_every_study_includes_the_autotuned_gains():
     assert all(AUTOTUNE in study.methods() for study in studies().values())
 
 
-def test_a_benchmark_and_a_report_of_its_own(tmp_path):
+def test_a_benchmark_has_its_own_report(tmp_path):
     found = reproduce("numerical-example", tmp_path)
     assert found.report == tmp_path / "numerical-example.html"
     assert set(found.figures) == {"numerical-example"}

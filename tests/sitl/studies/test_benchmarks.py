@@ -46,7 +46,7 @@ def test_the_initial_controller_as_printed_is_unstable_and_with_its_second_row_n
     assert radius == pytest.approx([1.0083, 0.9968], abs=5e-5)
 
 
-def test_the_closed_loop_is_the_plant_and_the_controller_sample_by_sample():
+def test_the_closed_loop_equals_plant_and_controller_computed_sample_by_sample():
     task, N = lv100(), 60
     rng = np.random.default_rng(3)
     r, u_bar = rng.standard_normal((2, N, 2))
@@ -57,7 +57,7 @@ def test_the_closed_loop_is_the_plant_and_the_controller_sample_by_sample():
     assert u == pytest.approx((r - y) @ Kp.T + TS * np.cumsum(r - y, axis=0) @ Ki.T + u_bar, abs=1e-12)
 
 
-def test_runs_side_by_side_are_the_runs_one_by_one():
+def test_runs_computed_together_equal_runs_computed_one_by_one():
     task = lv100()
     u_bar = excitation(200, "together", np.random.default_rng(0))
     two = np.stack([u_bar, -u_bar], axis=1)
@@ -72,8 +72,8 @@ def test_runs_side_by_side_are_the_runs_one_by_one():
 
 
 @pytest.mark.parametrize("design", ["in turn", "together"])
-def test_one_lv100_experiment_gives_a_controller_close_to_the_best_there_is(design):
-    # The bar: median of 20 seeds at most 0.054 from one experiment of 5000 samples, amplitude 1.
+def test_one_lv100_experiment_gives_a_controller_close_to_the_best_possible(design):
+    # Requirement: median of 20 seeds at most 0.054 from one experiment of 5000 samples, amplitude 1.
     task = lv100()
     plain, refined = [], []
     for seed in range(20):
@@ -87,7 +87,7 @@ def test_one_lv100_experiment_gives_a_controller_close_to_the_best_there_is(desi
         refined.append(task.cost(refine(start, model.plant, task.models).controller))
     assert np.median(refined) <= 0.0535
     assert max(refined) <= 0.058
-    # Not by another route: VRFT by itself does not get there.
+    # Only by refinement: VRFT alone does not reach it.
     assert np.median(plain) > 0.056
 
 

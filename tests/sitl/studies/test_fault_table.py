@@ -1,4 +1,4 @@
-"""The table of faults: its figures by hand, its commands by flying them again."""
+"""The fault table: its figures computed by hand, its commands run again."""
 
 import json
 import shlex
@@ -13,17 +13,18 @@ from mimopilot.sitl.flight.fault_recovery import recovery
 from mimopilot.sitl.flight.scenario import hover
 from mimopilot.sitl.flight.simulator import TRUTH, Flight
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.sitl.studies.faults import Request, fault_table, standard_faults
+from mimopilot.sitl.studies.fault_table import FaultTableRequest, fault_table
+from mimopilot.sitl.studies.standard_faults import standard_faults
 from scipy.stats import binomtest
 
 from tests.conftest import assert_one_clear_line
 
 TS = 0.004
-ADAM0 = Request("adam0", (), "roll", 15.0, 0.42)
+ADAM0 = FaultTableRequest("adam0", (), "roll", 15.0, 0.42)
 
 
 def quiet(*faults):
-    """A flight in which nothing happens, to be changed: 2 s, its rates never the same twice."""
+    """An uneventful flight of 2 s to be modified; its rates never repeat."""
     scenario = replace(hover("roll", 2.0, TS), faults=tuple(map(parse_fault, faults)))
     record, truth = np.zeros(500, RECORD), np.zeros(500, TRUTH)
     record["rates"] = np.arange(500)[:, None]
@@ -89,7 +90,7 @@ def tell(flight, how):
         ("set-point", 225),
     ],
 )
-def test_each_sign_that_the_autopilot_could_see_is_told_when_it_could_be(how, sample):
+def test_each_fault_is_detected_at_the_first_possible_sample(how, sample):
     fault = "stale@0.4" if how == "set-point" else "gyro-noise=1@0.4"
     flight = tell(quiet(fault), how)
     found = recovery(flight, quiet())
@@ -97,7 +98,7 @@ def test_each_sign_that_the_autopilot_could_see_is_told_when_it_could_be(how, sa
     assert found.detected_s == pytest.approx((sample - 100) * TS)
 
 
-def test_short_signs_are_no_detection():
+def test_short_disturbances_are_not_detections():
     flight = quiet("stale@0.4+0.5")
     flight.record["unallocated"][150:174, 0] = 1
     flight.record["unallocated"][174:190, 1] = 1
@@ -117,7 +118,7 @@ def test_the_table_is_the_same_for_any_number_of_workers(table):
     assert fault_table(ADAM0, range(12), workers=2) == table
 
 
-def test_every_fault_of_the_list_is_flown_with_every_seed_and_no_output_is_ever_not_finite(table):
+def test_every_fault_is_flown_with_every_seed_and_all_outputs_are_finite(table):
     assert [row.fault for row in table.rows] == [str(f) for f in standard_faults(load_airframe("adam0").airframe)]
     assert {row.fault.split(":")[0].split("=")[0].split("@")[0] for row in table.rows} == {
         *("motor", "battery", "mass", "delay", "jitter", "loss", "duplicate", "skip", "clock", "link", "stale"),
@@ -133,7 +134,7 @@ def rows(table):
     return {row.fault.split("@")[0] if "+" not in row.fault else row.fault: row for row in table.rows}
 
 
-def test_a_vehicle_without_a_motor_is_always_lost_always_noticed_and_never_survives(table):
+def test_a_vehicle_without_a_motor_is_always_detected_and_lost(table):
     row = rows(table)["motor:3=0"]
     assert (row.survived, row.detected) == (0, 12)
     bounds = binomtest(0, 12).proportion_ci(method="wilson")
@@ -143,7 +144,7 @@ def test_a_vehicle_without_a_motor_is_always_lost_always_noticed_and_never_survi
     assert row.detected_s < 0.5
 
 
-def test_the_sizes_of_what_faults_do_are_ordered_as_their_causes(table):
+def test_larger_faults_cause_larger_deviations(table):
     peak = {name: row.peak_deg for name, row in rows(table).items()}
     for names in (
         ("motor:3=0.9", "motor:3=0.7", "motor:3=0.5", "motor:3=0"),
@@ -160,7 +161,7 @@ def test_the_sizes_of_what_faults_do_are_ordered_as_their_causes(table):
     assert peak["gyro-bias:roll=0.2"] == pytest.approx(np.degrees(0.2 / 6.5), rel=0.03)
 
 
-def test_what_the_autopilot_can_know_it_knows_in_time(table):
+def test_detectable_faults_are_detected_in_time(table):
     found = rows(table)
     known = {"skip=5": "clock", "link@1.1+0.2": "clock", "stale@1.1+1": "set-point", "gyro-stuck@1.1+0.2": "stuck"}
     for name, how in known.items():
@@ -173,7 +174,7 @@ def test_what_the_autopilot_can_know_it_knows_in_time(table):
 
 
 @pytest.mark.parametrize("name", ["motor:3=0", "loss=0.5", "gain:Kp_i=0.25"])
-def test_the_printed_command_flies_the_worst_seed_again(mimopilot, table, name):
+def test_the_printed_command_repeats_the_flight_with_the_worst_seed(mimopilot, table, name):
     row = rows(table)[name]
     program, *words = shlex.split(row.replay)
     assert program == "mimopilot"
@@ -185,7 +186,7 @@ def test_the_printed_command_flies_the_worst_seed_again(mimopilot, table, name):
     assert (found["lost_at_s"] is None) == (name != "motor:3=0")
 
 
-def test_gain_sets_stand_side_by_side_and_the_command_prints_what_the_function_found(mimopilot, tmp_path):
+def test_gain_sets_are_compared_and_the_command_prints_the_same_table(mimopilot, tmp_path):
     own = load_airframe("adam0").default_gains()
     own.save(tmp_path / "one.gains.toml")
     replace(own, Kp_i=0.5 * own.Kp_i).save(tmp_path / "half.gains.toml")
@@ -200,7 +201,7 @@ def test_gain_sets_stand_side_by_side_and_the_command_prints_what_the_function_f
     assert found == json.loads(json.dumps(table.as_json()))
 
 
-def test_two_gain_files_of_one_name_and_a_fault_that_is_not_possible_are_refused(mimopilot, tmp_path):
+def test_two_gain_files_of_one_name_and_an_impossible_fault_are_refused(mimopilot, tmp_path):
     own = load_airframe("adam0").default_gains()
     for folder in ("a", "b"):
         own.save(tmp_path / folder / "x.gains.toml")

@@ -1,4 +1,4 @@
-"""Recordings of the genuine PX4 in its own simulator: what tuning finds in them, and what the bench says of it.
+"""Logs of PX4 in its own simulator: tuning from them, and the same gains in our simulation.
 
 The files hold the experiment of one flight each: 16 s of injected moment an axis, at 250 Hz, a vehicle with and one
 without coupling between roll and pitch. Nobody here wrote the plant that flew.
@@ -39,14 +39,14 @@ def logs():
     return {name: replace(read_log(DATA / f"px4_sih_{name}.mat"), flown=in_px4) for name in ("coupled", "symmetric")}
 
 
-def test_the_off_diagonals_are_the_inertias_on_the_coupled_vehicle_and_none_on_the_other(logs):
+def test_the_off_diagonal_gains_match_the_inertia_on_the_coupled_vehicle_and_vanish_on_the_other(logs):
     J = np.array(load_airframe("px4_sih").airframe.inertia)[:2, :2]
     thesis = spec(inner=(20.0, 0.4, 0))
     coupled, symmetric = (tune(logs[name], thesis) for name in ("coupled", "symmetric"))
     ratios = coupled.Kp_i / np.diag(coupled.Kp_i)[:, None]
     assert ratios == pytest.approx(J / np.diag(J)[:, None], abs=0.02)
     assert np.abs(symmetric.Kp_i[[0, 1], [1, 0]]).max() < 0.02 * symmetric.Kp_i[0, 0]
-    # The integral gain is poorly known, and its interval says so: ten times wider than that of P, relative to it.
+    # The integral gain is poorly known: its relative interval is ten times that of P.
     for gains in (coupled, symmetric):
         wide = np.diag(gains.provenance.standard_deviation["Ki_i"]) / np.diag(gains.Ki_i)
         narrow = np.diag(gains.provenance.standard_deviation["Kp_i"]) / np.diag(gains.Kp_i)
@@ -54,7 +54,7 @@ def test_the_off_diagonals_are_the_inertias_on_the_coupled_vehicle_and_none_on_t
 
 
 def doublets(gains):
-    """RMS to the outer reference model and off-axis standard deviation, deg, of 18 degree doublets on the bench."""
+    """RMS to the outer reference model and off-axis standard deviation, deg, of 18 degree doublets in simulation."""
     body = load_airframe("px4_sih").airframe
     outer = second_order(10, 0.7, 0, TS)
     follow, offaxis = [], []
@@ -69,14 +69,14 @@ def doublets(gains):
     return np.array(follow), np.array(offaxis)
 
 
-def test_the_bench_flies_the_flown_gains_as_px4_did(logs):
+def test_the_simulation_flies_the_flown_gains_as_px4_did(logs):
     follow, offaxis = doublets(logs["coupled"].flown)
-    # PX4 flew 1.1 / 1.4 and 1.08 / 1.18 degrees; its estimate wanders by a degree, which the bench's truth does not.
+    # PX4 flew 1.1 / 1.4 and 1.08 / 1.18 degrees; its estimate drifts by a degree, our true angle does not.
     assert follow == pytest.approx([1.1, 1.4], abs=0.3)
     assert offaxis == pytest.approx([1.08, 1.18], abs=0.1)
 
 
-def test_advised_gains_beat_the_flown_ones_in_following_and_in_decoupling(logs, monkeypatch):
+def test_advised_gains_track_and_decouple_better_than_the_flown_ones(logs, monkeypatch):
     monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 22.5, 25.0))
     monkeypatch.setattr(advisor, "DAMPINGS", (0.7,))
     monkeypatch.setattr(advisor, "DELAYS", (0, 2))

@@ -20,17 +20,17 @@ def test_correlation_based_tuning_needs_eight_experiments(seed):
 
 
 @pytest.mark.parametrize("seed", [100, 101, 102])
-def test_iterative_feedback_tuning_gets_there_in_six_iterations_and_at_most_500_experiments(seed):
+def test_iterative_feedback_tuning_converges_in_six_iterations_and_at_most_500_experiments(seed):
     task = lv100()
     found = run_ift(task, seed)
     assert len(found.costs) == 7
     assert found.experiments <= 500
     assert task.cost(found.controller) <= 0.080
-    # What it measures is what it minimises: J_MR, from 0.88 with the initial controller.
+    # It measures what it minimises: J_MR, from 0.88 with the initial controller.
     assert found.costs[-1] == pytest.approx(task.cost(found.controller), rel=0.1)
 
 
-def test_experiments_are_counted_as_they_are_asked_for():
+def test_every_requested_experiment_is_counted():
     task, asked = lv100(), []
     generator = np.random.default_rng(0)
 
@@ -64,7 +64,7 @@ def test_repeated_tunings_agree_with_table_5_2():
             # The thesis does not print its amplitude: means agree to 15 % or three of its deviations.
             assert abs(mean - figures["mean_1e4"]) < max(0.15 * figures["mean_1e4"], 3 * figures["std_1e4"])
     ratio = gains[1000].std(axis=0) / gains[10_000].std(axis=0)
-    # Ten times the data: a spread less by its root, 3.16.
+    # Ten times the data: the spread falls by the root of ten, 3.16.
     assert np.median(ratio) == pytest.approx(np.sqrt(10), rel=0.2)
 
 
@@ -76,14 +76,14 @@ def test_the_numerical_example_beside_table_5_3(tmp_path):
             np.array(table["MIMO, Table 5.3 as printed"][key]), abs=5.1e-4
         )
     assert table["MIMO"]["J_MR"] < 1e-12
-    # Each axis by itself is the ideal controller of its own element: 0.1/g (z - 0.9048).
+    # Each axis has the ideal controller of its own element: 0.1/g (z - 0.9048).
     assert np.diag(table["SISO"]["B0"]) == pytest.approx([0.1 / 0.09516, 0.1 / 0.04758], rel=1e-3)
     first = found.report.read_bytes()
     assert b"Table 5.3" in first
     assert reproduce("numerical-example", tmp_path).report.read_bytes() == first
 
 
-def test_lv100_has_every_table_and_figure_and_the_same_again():
+def test_lv100_has_every_table_and_figure_and_is_reproducible():
     found = study_lv100(runs=4, seeds=1)
     text = " ".join([section.heading + section.text for section in found.sections])
     text += " ".join(cell for table in found.tables for row in [[table.caption], *table.rows] for cell in row)
@@ -94,7 +94,7 @@ def test_lv100_has_every_table_and_figure_and_the_same_again():
     assert study_lv100(runs=4, seeds=1).sections == found.sections
 
 
-def test_the_command_prints_one_json_object_and_refuses_what_it_does_not_know(mimopilot):
+def test_the_command_prints_one_json_object_and_refuses_an_unknown_study(mimopilot):
     result = mimopilot("reproduce", "numerical-example", "--out", "o", "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["numerical-example"]["table_5_3"]["SISO"]["J_MR"] == pytest.approx(

@@ -11,7 +11,7 @@ from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import PlantResponse
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import load_spec
 
@@ -34,7 +34,7 @@ def flights():
     found = {}
     for name, amplitude in PLANTS.items():
         log = experiment(name, amplitude=amplitude)
-        found[name] = (log, Measured(log), Truth.of(load_airframe(name).airframe))
+        found[name] = (log, PlantEstimates(log), Truth.of(load_airframe(name).airframe))
     return found
 
 
@@ -99,7 +99,7 @@ def flexible(request):
     frequency, gain = request.param
     frame = Frame(frequency_hz=frequency, damping=0.02, gain=gain)
     airframe = load_airframe("adam0").airframe.model_copy(update={"frame": frame})
-    return frequency, Measured(experiment("adam0", airframe=airframe)), Truth.of(airframe)
+    return frequency, PlantEstimates(experiment("adam0", airframe=airframe)), Truth.of(airframe)
 
 
 def test_a_mode_of_the_frame_is_seen_and_what_it_makes_thin_or_unstable_is_not_certified(flexible):
@@ -131,7 +131,7 @@ def test_without_excitation_at_a_mode_its_neighbourhood_is_needed_and_noise_is_n
 def test_a_log_with_roll_in_place_of_pitch_is_refused(flights, name):
     log = flights["adam0"][0]
     twice = dataclasses.replace(log, **{name: np.repeat(getattr(log, name)[:, :1], 2, axis=1)})
-    with pytest.raises(TuningError, match="are one signal"):
+    with pytest.raises(TuningError, match="are the same signal"):
         certify_from_log(twice, log.flown)
 
 
@@ -169,7 +169,7 @@ def test_every_margin_is_the_true_one(flights):
 def test_the_errors_of_the_peak_and_of_the_phase_are_their_spread_over_logs():
     truth = Truth.of(load_airframe("px4_sih").airframe)
     gains = load_airframe("px4_sih").default_gains()
-    found = [certify(gains, Measured(experiment("px4_sih", seed=s)).response, *MODELS).figures for s in range(12)]
+    found = [certify(gains, PlantEstimates(experiment("px4_sih", seed=s)).response, *MODELS).figures for s in range(12)]
     phases = [(f["phase_margin_deg"]["pitch"], f["phase_margin_error_deg"]["pitch"]) for f in found]
     peaks = [(f["Ms"], f["Ms_error"]) for f in found]
     for pairs, true in ((peaks, truth.margins(gains)[0]), (phases, np.mean([phase for phase, _ in phases]))):

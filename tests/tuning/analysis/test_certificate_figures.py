@@ -17,7 +17,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import DRAWS, PlantResponse
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import TuningSpec
 from mimopilot.tuning.statespace import StateSpace
@@ -43,7 +43,7 @@ def defaults(name="adam0"):
 @cache
 def flown(name, frame=None):
     """A flight with a good excitation."""
-    return Measured(experiment(name, airframe=airframe(name, frame), **GOOD.get(name, {})))
+    return PlantEstimates(experiment(name, airframe=airframe(name, frame), **GOOD.get(name, {})))
 
 
 @cache
@@ -111,7 +111,7 @@ def test_a_stronger_and_a_longer_flight_do_not_turn_well_damped_sets_down():
     """Their lowest frequencies are coherent but not linear: the band begins above them."""
     _, damped = random_sets("px4_sih", 12, 11)
     for log in (experiment("px4_sih", amplitude=0.25, bandwidth=60.0), experiment("px4_sih", seconds=40.0)):
-        plant = Measured(log).response
+        plant = PlantEstimates(log).response
         assert plant.known()[0]
         assert plant.known_run()[0] > 0
         assert sum(certify(g, plant, *MODELS).verdict == Verdict.CERTIFIED for g in damped) >= 11
@@ -279,7 +279,7 @@ def grid(end, start=1.0, step=1.02):
 def test_the_errors_are_two_deviations_of_repeated_flights():
     """24 flights with other noise; and their mean is the truth."""
     found = [
-        certify(defaults(), Measured(experiment("adam0", seed, 0.05, seconds=10.0)).response, *MODELS).figures
+        certify(defaults(), PlantEstimates(experiment("adam0", seed, 0.05, seconds=10.0)).response, *MODELS).figures
         for seed in range(24)
     ]
     for axis in ("roll", "pitch"):

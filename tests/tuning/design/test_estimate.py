@@ -13,7 +13,7 @@ from mimopilot.tuning.design.estimate_checks import examine_band, examine_estima
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import align, instruments
 from mimopilot.tuning.experiment import Experiment
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import second_order
 
 from tests.tuning.analysis.test_certificate import experiment
@@ -133,7 +133,7 @@ def test_an_inner_controller_that_cannot_be_inverted_falls_back_loudly(log):
     # The rate loop that the outer gain sees is its reference model: closed form s Kp_o M_i = M_o at low frequency.
     assert np.diag(found.gains.Kp_o) == pytest.approx(4.5, rel=0.15)
     tuned = tune(negatively_damped(log), thesis(refine=False))
-    assert Measured(log).body.least(tuned.Ki_i) > 0
+    assert PlantEstimates(log).body.least(tuned.Ki_i) > 0
     kept, slow = tuned.provenance.warnings[:2]
     assert "the log asks for integral gains that run away" in kept
     assert "to forget where it began" in slow

@@ -9,7 +9,7 @@ from mimopilot.tuning.design.positive_integral import LEAST, with_positive_integ
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.vrft import LoopEstimate
 from mimopilot.tuning.plant.frequency_response import measured_plant
-from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
 from mimopilot.tuning.spec import TuningSpec
 from scipy.optimize import minimize
 

@@ -17,7 +17,7 @@ from mimopilot.tuning.design.constrained_least_squares import descend
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Limits
-from mimopilot.tuning.plant.measured import Measured
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import Manoeuvre, parse_doublet
 from mimopilot.tuning.statespace import StateSpace
@@ -38,7 +38,7 @@ def log():
 @pytest.fixture(scope="module")
 def sets(log):
     siso = tune(log, thesis(method="siso"))
-    allowed = tuple(1.06 * spent for spent in effort(siso, doublet_model(Measured(log), Manoeuvre(**DOUBLET))))
+    allowed = tuple(1.06 * spent for spent in effort(siso, doublet_model(PlantEstimates(log), Manoeuvre(**DOUBLET))))
     task = {**DOUBLET, "effort": allowed}
     return {
         "siso": siso,
@@ -83,7 +83,7 @@ def test_refined_siso_gains_stay_diagonal(sets):
 
 def test_the_model_needs_no_more_effort_than_was_allowed(log, sets):
     allowed = sets["refined"].provenance.details["manoeuvre"]["effort"]
-    needed = effort(sets["refined"], doublet_model(Measured(log), Manoeuvre(**DOUBLET)))
+    needed = effort(sets["refined"], doublet_model(PlantEstimates(log), Manoeuvre(**DOUBLET)))
     assert np.all(np.array(needed) <= np.array(allowed) * 1.001)
 
 
@@ -127,7 +127,7 @@ def test_the_spectral_radius_is_how_fast_a_flight_grows(gains):
 
 
 def test_refined_gains_are_stable_on_the_model_in_both_loops(log, sets):
-    model = doublet_model(Measured(log), Manoeuvre(**DOUBLET))
+    model = doublet_model(PlantEstimates(log), Manoeuvre(**DOUBLET))
     for name in ("refined", "refined siso"):
         assert model_spectral_radius(sets[name], model.plant) < 1
 

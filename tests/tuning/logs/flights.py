@@ -1,4 +1,4 @@
-"""A made-up flight of a rigid body that follows set-points, and writers of logs that hold it."""
+"""A synthetic flight of a rigid body that follows setpoints, and writers of its logs."""
 
 import struct
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from mimopilot.sitl.flight.ulog_writer import HEADER, _declare, _keyed, _message
 
 @dataclass(frozen=True)
 class Flight:
-    """Signals (N, 2) of torque, rad/s, rad, and the time (N,), s; u_bar is what was injected, part of u."""
+    """Signals (N, 2) of torque, rad/s, rad, and the time (N,), s; u_bar is the injected part of u."""
 
     t: np.ndarray
     u: np.ndarray
@@ -21,7 +21,7 @@ class Flight:
 
 
 def make_flight(seconds=8.0, Ts=0.004, start=10.0, still=(0.0, 0.0), inject=lambda t: np.zeros((len(t), 2))):
-    """A flight; for `still` seconds at its begin and its end the vehicle stands on the ground."""
+    """A flight; `still` is the time on the ground before and after it, s."""
     t = start + np.arange(round(seconds / Ts)) * Ts
     ground = (t < start + still[0]) | (t > t[-1] - still[1])
     generator = np.random.default_rng(1)
@@ -175,7 +175,7 @@ COLUMNS = ("t", "u_roll", "u_pitch", "p", "q", "roll", "pitch", "roll_sp", "pitc
 
 
 def table(flight):
-    """The columns of a flight, SI units, by their default names."""
+    """Columns of a flight by their default names, SI units."""
     signals = (flight.t[:, None], flight.u, flight.y_i, flight.y_o, flight.r_o)
     return dict(zip(COLUMNS, np.column_stack(signals).T, strict=True))
 

@@ -1,4 +1,4 @@
-"""Damaged logs: whatever happens to the bytes, there is an experiment or one clear message."""
+"""Damaged logs: any damage leaves an experiment or gives one clear message."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def damaged(content, seed):
         start = generator.integers(len(data))
         del data[start : start + generator.integers(1, 200)]
         return data
-    # Bits flipped in the definitions at the beginning, or anywhere.
+    # Flip bits in the definitions at the beginning, or anywhere.
     span = min(len(data), 1500) if kind == 2 else len(data)
     for _ in range(generator.integers(1, 20)):
         data[generator.integers(span)] ^= 1 << int(generator.integers(8))

@@ -1,4 +1,4 @@
-"""A damaged byte costs the message that it is in, in both formats, and how much was lost is told."""
+"""A damaged byte costs only its own message, in both formats, and the loss is reported."""
 
 import struct
 import tracemalloc
@@ -56,7 +56,7 @@ def test_a_flipped_bit_costs_one_message_at_most(tmp_path, flight, write):
 
 
 @pytest.mark.parametrize(("write", "size"), [(dataflash, 27), (ulog, 33)])
-def test_what_is_skipped_is_counted_and_told_by_everything_that_reads_the_log(tmp_path, flight, write, size):
+def test_skipped_bytes_are_counted_and_reported_by_every_reader_of_the_log(tmp_path, flight, write, size):
     path = tmp_path / "x"
     read, count = write(path, flight)
     whole, data = count(read(path)), bytearray(path.read_bytes())
@@ -65,11 +65,11 @@ def test_what_is_skipped_is_counted_and_told_by_everything_that_reads_the_log(tm
     data[first[700] + 2] = 0xEE
     path.write_bytes(data)
     assert count(read(path)) == whole - 1
-    told = f"damaged: {size} of {len(data)} bytes, in 1 place, are no message and left out"
+    told = f"damaged: {size} of {len(data)} bytes, in 1 place, are not valid messages and ignored"
     assert read_log(path).warnings == (told,)
     assert inspect_log(path).warnings == (told,)
     assert read_log(path).segments == ((0, len(flight.t)),)
-    # Where the log is refused all the same, the damage is told beside the reason.
+    # If the log is refused, the damage is reported beside the reason.
     path.write_bytes(data[: first[750]])
     with pytest.raises(TuningError, match=f"damaged: {size} of"):
         read_log(path)
@@ -87,7 +87,7 @@ def test_the_message_before_a_damaged_one_is_kept(tmp_path, flight, write):
     assert set(first) - set(left) == {first[300]}
 
 
-def test_a_size_that_spans_two_messages_of_a_ulog_is_found_out(tmp_path, flight):
+def test_a_ulog_size_that_spans_two_messages_is_detected(tmp_path, flight):
     path = tmp_path / "x"
     read, count = ulog(path, flight)
     log, data = read(path), bytearray(path.read_bytes())
@@ -99,18 +99,18 @@ def test_a_size_that_spans_two_messages_of_a_ulog_is_found_out(tmp_path, flight)
 
 
 @pytest.mark.parametrize("write", [dataflash, ulog])
-def test_a_file_that_ends_in_a_message_says_so_and_padding_is_no_damage(tmp_path, flight, write):
+def test_a_truncated_file_is_reported_and_padding_is_not_damage(tmp_path, flight, write):
     path = tmp_path / "x"
     read, _ = write(path, flight)
     content = path.read_bytes()
     path.write_bytes(content[:-5])
-    assert read(path).damage == "it ends in the middle of a message: not downloaded completely, or the power was cut"
+    assert read(path).damage == "the file ends inside a message: the download is incomplete or power was lost"
     if write is dataflash:
         path.write_bytes(content + b"\xff" * 512)
         assert read(path).damage == ""
 
 
-def test_the_definition_of_another_message_with_a_wild_length_does_not_take_the_others_along(tmp_path, flight):
+def test_a_definition_with_a_wrong_length_does_not_lose_other_messages(tmp_path, flight):
     rate, angles = ardupilot_messages(flight)
     other = ("XYZ", "Qf", ("TimeUS", "Value"), [rate[3][0][:100], np.zeros(100)])
     data = bytearray(dataflash_bytes([other, rate, angles]))
@@ -121,7 +121,7 @@ def test_the_definition_of_another_message_with_a_wild_length_does_not_take_the_
     assert log.warnings[0].startswith("damaged: 1500 of ")
 
 
-def test_topics_and_parameters_are_those_that_pyulog_reads(tmp_path, flight):
+def test_topics_and_parameters_equal_those_of_pyulog(tmp_path, flight):
     path = write_ulog(
         tmp_path / "x.ulg", px4_topics(flight), {"A": 1.5, "B": -2.0}, [(12.0, "A", 3.0), (13.0, "C", 4.0)]
     )
@@ -155,7 +155,7 @@ def chain(depth, field):
     ],
     ids=["nested", "circle", "array", "twice"],
 )
-def test_a_format_that_no_message_can_have_costs_no_memory_and_is_refused(tmp_path, content):
+def test_an_impossible_format_is_refused_without_allocating_memory(tmp_path, content):
     (tmp_path / "x.ulg").write_bytes(content)
     tracemalloc.start()
     with pytest.raises(TuningError, match="damaged ULog file: messages of t0 would have more than 65535 bytes"):
@@ -165,7 +165,7 @@ def test_a_format_that_no_message_can_have_costs_no_memory_and_is_refused(tmp_pa
     assert peak < 2_000_000  # bytes
 
 
-def test_wide_topics_without_messages_cost_no_memory(tmp_path):
+def test_wide_topics_without_messages_allocate_no_memory(tmp_path):
     (tmp_path / "x.ulg").write_bytes(hostile(b"t0:uint64_t timestamp;uint8_t[65000] q;", subscriptions=300))
     tracemalloc.start()
     with pytest.raises(TuningError, match="lacks vehicle_torque_setpoint"):
@@ -183,18 +183,18 @@ def test_a_topic_with_a_damaged_format_is_named_and_the_others_are_read(tmp_path
     log = read_log(path)
     assert log.r_o is None
     assert log.u == pytest.approx(flight.u, abs=1e-6)
-    assert "the format of vehicle_attitude_setpoint is not known, none of them is read" in log.warnings[0]
+    assert "the format of vehicle_attitude_setpoint is not defined; these topics are not read" in log.warnings[0]
 
 
-def test_a_message_with_a_damaged_format_is_named_beside_what_lacks(tmp_path, flight):
+def test_a_message_with_a_damaged_format_is_named_beside_the_missing_signals(tmp_path, flight):
     data = bytearray(dataflash_bytes(ardupilot_messages(flight)))
     data[data.index(b"Qffff\0")] = ord("X")
     (tmp_path / "x.bin").write_bytes(data)
-    with pytest.raises(TuningError, match=r"lacks message RATE .*the format of RATE is not known or damaged"):
+    with pytest.raises(TuningError, match=r"lacks message RATE .*the format of RATE is unknown or damaged"):
         read_log(tmp_path / "x.bin")
 
 
-def test_fields_that_are_there_instead_are_named(tmp_path, flight):
+def test_the_fields_logged_instead_are_named(tmp_path, flight):
     data = dataflash_bytes(ardupilot_messages(flight)).replace(b"ROut,POut", b"ROvt,POut")
     (tmp_path / "x.bin").write_bytes(data)
     with pytest.raises(TuningError, match=r"message RATE \(ROut, POut\), which has TimeUS, R, P, ROvt, POut;"):

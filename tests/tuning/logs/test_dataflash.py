@@ -1,4 +1,4 @@
-"""ArduPilot logs, written here byte by byte."""
+"""ArduPilot logs, written by the test byte by byte."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def test_angles_at_ten_hertz_alone_are_refused(tmp_path, flight):
         read_log(write(tmp_path / "x.bin", [rate, slow]))
 
 
-def test_without_rate_messages_the_bit_to_set_and_the_slow_stand_in_are_named(tmp_path, flight):
+def test_without_rate_messages_the_bit_to_set_and_the_slow_substitute_are_named(tmp_path, flight):
     stamps = microseconds(flight.t[::25])
     pidr = ("PIDR", "Qf", ("TimeUS", "Act"), [stamps, np.zeros(len(stamps))])
     path = write(tmp_path / "x.bin", [pidr, parameters(LOG_BITMASK=2242524.0)])
@@ -64,7 +64,7 @@ def test_without_rate_messages_the_bit_to_set_and_the_slow_stand_in_are_named(tm
         read_log(path)
 
 
-def test_wild_values_and_times_cost_single_samples(tmp_path, flight):
+def test_outliers_of_values_and_times_cost_single_samples(tmp_path, flight):
     messages = ardupilot_messages(flight)
     rate = messages[0][3]
     rate[0] = rate[0].copy()
@@ -117,7 +117,7 @@ def test_the_waveform_of_the_mixer_axes_is_the_excitation_and_marks_the_experime
     assert not log.u_bar[1760:, 0].any()
 
 
-def test_a_waveform_added_elsewhere_is_no_part_of_the_moment(tmp_path):
+def test_a_waveform_added_elsewhere_is_not_part_of_the_torque(tmp_path):
     flight = make_flight(18.0)
     log = read_log(write(tmp_path / "x.bin", [*ardupilot_messages(flight), *identification(flight, (7, 2))]))
     assert log.u_bar is None
@@ -139,11 +139,11 @@ def test_only_the_time_between_take_off_and_landing_is_used(tmp_path):
     assert log.u == pytest.approx(flight.u[1000 : 1000 + len(log.u)], abs=1e-7)
 
 
-def test_flown_gains_are_left_out_with_the_reason(tmp_path, flight):
+def test_flown_gains_are_not_read_and_the_reason_is_given(tmp_path, flight):
     path = write(tmp_path / "x.bin", [*ardupilot_messages(flight), parameters(ATC_RAT_RLL_P=0.135)])
     recording = open_log(path)
     assert recording.parameters["ATC_RAT_RLL_P"] == pytest.approx(0.135)
-    assert "D acts on the filtered error" in recording.notes[0]
+    assert "ArduPilot filters the error for D" in recording.notes[0]
     assert read_log(path).flown is None
 
 
@@ -155,13 +155,13 @@ def test_logs_of_arducopter_3_are_read_in_their_own_units_and_milliseconds(tmp_p
     assert len(log.segments) == 1
     assert len(log.u) == pytest.approx(len(flight.t), abs=1)
     assert log.u == pytest.approx(flight.u[: len(log.u)], abs=1e-6)
-    # Stamps are cut to whole milliseconds, those of all messages alike.
+    # The stamps of all messages are truncated to milliseconds.
     assert log.y_i == pytest.approx(flight.y_i[: len(log.u)], abs=2e-3)
     assert log.y_o == pytest.approx(flight.y_o[: len(log.u)], abs=5e-4)
     assert "3.3 and older" in open_log(tmp_path / "x.bin").format
 
 
-def test_milliseconds_with_todays_units_are_read_as_such(tmp_path, flight):
+def test_milliseconds_with_current_units_are_read_correctly(tmp_path, flight):
     rate, angles = ardupilot_messages(flight, "ATT")
     milli = [("TimeMS", *names[1:]) for _, _, names, _ in (rate, angles)]
     old = [
@@ -173,7 +173,7 @@ def test_milliseconds_with_todays_units_are_read_as_such(tmp_path, flight):
     assert log.y_i == pytest.approx(flight.y_i, abs=1e-5)
 
 
-def test_events_without_a_time_happen_where_they_stand(tmp_path):
+def test_events_without_a_time_take_that_of_their_place_in_the_log(tmp_path):
     flight = make_flight(20.0)
     path = write(tmp_path / "x.bin", [("EV", "B", ("Id",), [[28]]), *old_ardupilot_messages(flight)])
     whole = path.read_bytes()
@@ -184,10 +184,10 @@ def test_events_without_a_time_happen_where_they_stand(tmp_path):
     assert log.u == pytest.approx(flight.u[-len(log.u) :], abs=1e-6)
 
 
-def test_a_log_of_px4_before_ulog_is_named(tmp_path):
+def test_an_old_px4_log_is_recognised(tmp_path):
     time = ("TIME", "Q", ("StartTime",), [microseconds(np.arange(100) * 0.005)])
     att = ("ATT", "ffffff", ("qw", "Roll", "Pitch", "Yaw", "RollRate", "PitchRate"), [np.zeros(100)] * 6)
-    with pytest.raises(TuningError, match=r"PX4 before ULog \(sdlog2, .px4log\).*1.8 or newer.*sdlog2_dump.py"):
+    with pytest.raises(TuningError, match=r"an old PX4 log \(sdlog2, .px4log\).*1.8 or later.*sdlog2_dump.py"):
         read_log(write(tmp_path / "x.px4log", [time, att]))
 
 
@@ -203,7 +203,7 @@ def firmware(text):
         (
             "APM:Copter V3.4-rc2",
             {"LOG_BITMASK": 32767},
-            "RATE and ATT are needed at 100 Hz.*ArduCopter 4.0 or newer",
+            "RATE and ATT are needed at 100 Hz.*ArduCopter 4.0 or later",
             "so 32767",
         ),
         (
@@ -215,7 +215,7 @@ def firmware(text):
         ("ArduCopter V4.5.7", {"LOG_BITMASK": 65535}, "RATE and ANG.*100 Hz.*clear its other bits", "so 65535"),
     ],
 )
-def test_the_advice_on_a_slow_log_is_not_in_force_already(tmp_path, flight, text, values, advice, never):
+def test_the_advice_on_a_slow_log_names_no_setting_that_is_right_already(tmp_path, flight, text, values, advice, never):
     slow = [
         (name, letters, names, [v[::10] for v in rows]) for name, letters, names, rows in ardupilot_messages(flight)
     ]

@@ -33,7 +33,7 @@ def test_stock_px4_parameters_are_read_with_their_units_and_overall_factor():
     assert gains.moment_scale is None
 
 
-def test_our_own_parameters_come_first():
+def test_mimo_parameters_take_precedence():
     ours = {"MIMO_RP_RR": 0.12, "MIMO_RP_RP": 0.01, "MIMO_D_POLE": 0.5, "MIMO_RMAX_R": 7.0}
     gains = flown_gains(PX4 | ours | {f"MIMO_SCALE_{a}": 2.5 for a in "RPY"}, 0.004)
     assert gains is not None
@@ -45,5 +45,5 @@ def test_our_own_parameters_come_first():
 
 
 @pytest.mark.parametrize("missing", ["MC_ROLLRATE_P", "MC_YAW_P", "MC_RR_INT_LIM", "MC_ROLLRATE_MAX"])
-def test_parameters_that_do_not_describe_a_whole_controller_give_nothing(missing):
+def test_parameters_of_an_incomplete_controller_give_no_gains(missing):
     assert flown_gains({k: v for k, v in PX4.items() if k != missing}, 0.004) is None

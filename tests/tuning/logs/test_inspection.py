@@ -43,7 +43,7 @@ def test_rates_gaps_ranges_and_saturation_are_those_of_the_log(tmp_path, flight)
     assert found.reason is None
 
 
-def test_rates_of_set_points_are_those_of_the_log_though_few_of_them_are_used(tmp_path, flight):
+def test_setpoint_rates_are_those_of_the_log_even_if_few_setpoints_are_used(tmp_path, flight):
     topics = px4_topics(flight)
     slow = {name: values[::10] for name, values in topics[0][2].items()}
     topics[0] = (*topics[0][:2], slow)
@@ -67,7 +67,7 @@ def test_a_log_without_signals_is_as_long_as_its_messages(tmp_path, flight):
     assert found.airborne == ((0.0, pytest.approx(1.996)),)
 
 
-def test_the_band_and_the_strength_of_the_excitation_are_given_for_each_axis(tmp_path):
+def test_band_and_rms_of_the_excitation_are_given_for_each_axis(tmp_path):
     def both(t):
         noise = 0.02 * np.random.default_rng(0).standard_normal(len(t))
         return np.column_stack([0.1 * np.sin(2 * np.pi * 4 * t), noise])
@@ -89,14 +89,12 @@ def test_an_axis_that_is_not_excited_is_the_reason(tmp_path, flight):
     assert found.experiment is not None
 
 
-def test_a_log_without_set_points_and_injection_cannot_be_tuned_from(tmp_path, flight):
+def test_a_log_without_setpoints_and_injection_cannot_be_used_for_tuning(tmp_path, flight):
     columns = {name: values for name, values in table(flight).items() if not name.endswith("_sp")}
     assert "no excitation" in inspect_log(write_csv(tmp_path / "x.csv", columns)).reason
 
 
-def test_the_command_prints_the_signals_and_the_reason_and_ends_well_when_the_log_can_be_read(
-    mimopilot, tmp_path, flight
-):
+def test_the_command_prints_signals_and_reason_and_exits_with_0_when_the_log_can_be_read(mimopilot, tmp_path, flight):
     stamps = microseconds(flight.t[::25])
     pidr = ("PIDR", "Qf", ("TimeUS", "Act"), [stamps, np.zeros(len(stamps))])
     (tmp_path / "x.bin").write_bytes(dataflash_bytes([pidr]))
@@ -130,7 +128,7 @@ def test_the_column_file_is_used_by_inspect_and_by_tune(mimopilot, tmp_path, fli
     assert_one_clear_line(mimopilot("tune", "x.csv", "--out", "x.toml"), "lacks column p and q")
     found = json.loads(mimopilot("inspect", "x.csv", "--columns", "c.toml", "--json").stdout)
     assert found["signals"]["y_i"]["maximum"] == pytest.approx(flight.y_i.max(axis=0).tolist(), rel=1e-6)
-    # With the columns known, the next thing that the log does not say is asked for.
+    # With known columns, the next missing item is requested.
     result = mimopilot("tune", "x.csv", "--columns", "c.toml", "--out", "x.toml")
     assert_one_clear_line(result, "which yaw gains flew", "derivative_cutoff_hz", "--spec")
 

@@ -1,4 +1,4 @@
-"""Columns with a wrong sign or unit, or in each other's place: refused with the line that mends them."""
+"""Wrong signs and units and exchanged columns are refused with the correcting line."""
 
 import itertools
 import tomllib
@@ -10,7 +10,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import SIGNALS, Columns
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.plant.frequency_response import measured_plant
-from mimopilot.tuning.plant.inertia import rigid_body
+from mimopilot.tuning.plant.rigid_body_fit import rigid_body
 
 from tests.tuning.truth import experiment
 
@@ -44,26 +44,26 @@ def refusal(path):
 
 
 def told(message):
-    """The lines of a column file in a refusal."""
+    """The column-file lines in a refusal."""
     return message.split("put into the --columns file: ")[1].split("; ")[0].replace(" }, ", " }\n")
 
 
 def mended(path, message, acceleration):
-    """The log under the lines of its refusal is that of the vehicle."""
+    """Check that the log read with the lines of its refusal is that of the vehicle."""
     lines = message.split("put into the --columns file: ")[1].split("; ")[0].replace(" }, ", " }\n")
     log = read_log(path, Columns.model_validate(tomllib.loads(lines)))
     assert pytest.approx(acceleration, rel=0.15, abs=10) == rigid_body(measured_plant(log)).B
     return log
 
 
-def test_a_true_log_is_read(good, acceleration, tmp_path):
+def test_a_correct_log_is_read(good, acceleration, tmp_path):
     log = read_log(write(tmp_path / "x.csv", good))
     assert log.warnings == ()
     assert pytest.approx(acceleration, rel=0.05, abs=5) == rigid_body(measured_plant(log)).B
 
 
 @pytest.mark.parametrize("name", NAMES[1:])
-def test_a_wrong_sign_names_its_column_and_the_line_mends_it(good, acceleration, tmp_path, name):
+def test_a_wrong_sign_names_its_column_and_the_given_line_corrects_it(good, acceleration, tmp_path, name):
     table = good.copy()
     table[:, NAMES.index(name)] *= -1
     path = write(tmp_path / "x.csv", table)
@@ -74,7 +74,7 @@ def test_a_wrong_sign_names_its_column_and_the_line_mends_it(good, acceleration,
 
 
 @pytest.mark.parametrize("names", [("u_roll", "u_bar_roll"), ("q", "pitch"), ("u_pitch", "u_bar_pitch")])
-def test_two_explanations_that_look_the_same_are_both_told(good, tmp_path, names):
+def test_two_equivalent_explanations_are_both_reported(good, tmp_path, names):
     table = good.copy()
     table[:, [NAMES.index(name) for name in names]] *= -1
     path = write(tmp_path / "x.csv", table)
@@ -89,7 +89,7 @@ SOME = [signals for n in (1, 2, 3) for signals in itertools.combinations(PLACES,
 
 
 @pytest.mark.parametrize("swapped", SOME, ids="+".join)
-def test_exchanged_columns_are_named_and_the_lines_mend_them(good, acceleration, tmp_path, swapped):
+def test_exchanged_columns_are_named_and_the_given_lines_correct_them(good, acceleration, tmp_path, swapped):
     table = good.copy()
     for signal in swapped:
         table[:, PLACES[signal]] = table[:, PLACES[signal][::-1]]
@@ -97,7 +97,7 @@ def test_exchanged_columns_are_named_and_the_lines_mend_them(good, acceleration,
     message = refusal(path)
     assert "roll and pitch are exchanged in" in message
     B = rigid_body(measured_plant(read_log(path, Columns.model_validate(tomllib.loads(told(message)))))).B
-    # Whether all that is left is roll for pitch cannot be told: the vehicle is the same with its axes renamed.
+    # An exchange of roll and pitch in all signals cannot be detected: it only renames the axes.
     renamed = acceleration[::-1, ::-1]
     assert any(np.allclose(B, true, rtol=0.15, atol=10) for true in (acceleration, renamed))
 
@@ -106,32 +106,32 @@ def test_exchanged_columns_are_named_and_the_lines_mend_them(good, acceleration,
 @pytest.mark.parametrize(
     "names", [("p",), ("q",), ("p", "q"), ("roll",), ("roll", "pitch"), ("p", "roll"), ("p", "q", "roll", "pitch")]
 )
-def test_degrees_for_radians_are_refused_with_their_line(good, tmp_path, names, gentle):
+def test_degrees_for_radians_are_refused_with_the_correcting_line(good, tmp_path, names, gentle):
     table = good.copy()
     table[:, 1:] *= gentle
     table[:, [NAMES.index(name) for name in names]] *= DEGREE
     message = refusal(write(tmp_path / "x.csv", table))
-    # One line at least is right, and none is wrong: more come when it is told.
+    # At least one line is right and none is wrong; further ones follow in the next refusal.
     units = {"p": "deg/s", "q": "deg/s", "roll": "deg", "pitch": "deg"}
     named = [name for name in units if f'{name} = {{ column = "{name}", unit = "{units[name]}" }}' in message]
     assert named
     assert set(named) <= set(names)
 
 
-def test_radians_that_are_told_in_degrees_are_refused(good, tmp_path):
+def test_radians_declared_as_degrees_are_refused(good, tmp_path):
     path = write(tmp_path / "x.csv", good)
     columns = Columns.model_validate({name: {"unit": "deg/s"} for name in ("p", "q")})
-    with pytest.raises(TuningError, match=r"57\.3 times what its rate makes of it"):
+    with pytest.raises(TuningError, match=r"57\.3 times the integral of its rate"):
         read_log(path, columns)
 
 
 def test_torque_without_the_injection_rates_of_another_time_and_noise_are_refused(good, tmp_path):
     table = good.copy()
     table[:, PLACES["u"]] -= table[:, PLACES["u_bar"]]
-    assert "does not contain what was injected on" in refusal(write(tmp_path / "x.csv", table))
+    assert "does not contain the torque injected on" in refusal(write(tmp_path / "x.csv", table))
     table = good.copy()
     table[:, PLACES["y_i"]] = np.roll(table[:, PLACES["y_i"]], 125, axis=0)
-    assert "not of one time" in refusal(write(tmp_path / "x.csv", table))
+    assert "from different vehicles or times" in refusal(write(tmp_path / "x.csv", table))
 
 
 def tumble(table, begin, seconds=1.0):
@@ -145,14 +145,14 @@ def tumble(table, begin, seconds=1.0):
     return table
 
 
-def test_what_comes_before_a_tumble_is_used_and_it_is_told(good, tmp_path):
+def test_the_log_before_a_tumble_is_used_and_a_warning_is_given(good, tmp_path):
     log = read_log(write(tmp_path / "x.csv", tumble(good, 10.5)))
     assert log.seconds == pytest.approx(10.5 + 75 / 360 - 1.0, abs=0.1)
-    assert "tumbled at 10.7 s (tilt beyond 75 degrees): only what is 1 s or more before" in log.warnings[0]
+    assert "tumbled at 10.7 s (tilt beyond 75 degrees): only the log until 1 s before" in log.warnings[0]
 
 
 @pytest.mark.parametrize(("name", "begin"), [("q", 10.5), ("p", 10.5), ("pitch", 7.0)])
-def test_a_tumble_hides_no_wrong_sign(good, tmp_path, name, begin):
+def test_a_wrong_sign_is_found_despite_a_tumble(good, tmp_path, name, begin):
     table = tumble(good, begin)
     table[:, NAMES.index(name)] *= -1
     message = refusal(write(tmp_path / "x.csv", table))
@@ -161,7 +161,7 @@ def test_a_tumble_hides_no_wrong_sign(good, tmp_path, name, begin):
     assert f"({axis})" in message
 
 
-def test_every_command_says_the_same(good, tmp_path, mimopilot):
+def test_every_command_gives_the_same_message(good, tmp_path, mimopilot):
     table = good.copy()
     table[:, PLACES["u"]] = table[:, PLACES["u"][::-1]]
     path = write(tmp_path / "x.csv", table)

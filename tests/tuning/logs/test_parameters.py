@@ -1,4 +1,4 @@
-"""Which parameters are the flown ones: those in force when the part that is used begins."""
+"""The flown parameters are those at the beginning of the part that is used."""
 
 from dataclasses import replace
 
@@ -29,13 +29,13 @@ def px4(path, flight, changes):
     return write_ulog(path / "x.ulg", px4_topics(flight, debug_vect=injected(flight)), PX4, changes)
 
 
-def test_a_gain_set_before_the_excitation_is_the_flown_one(tmp_path, flight):
+def test_a_gain_changed_before_the_excitation_is_the_flown_one(tmp_path, flight):
     log = read_log(px4(tmp_path, flight, [(11.0, "MC_YAWRATE_P", 0.7), (14.0, "MC_YAWRATE_P", 0.4)]))
     assert log.flown.yaw.Kp_i == pytest.approx(0.4)
     assert log.warnings == ()
 
 
-def test_a_gain_set_during_the_excitation_is_told_and_did_not_fly(tmp_path, flight):
+def test_a_gain_changed_during_the_excitation_gives_a_warning_and_the_old_value_counts(tmp_path, flight):
     log = read_log(px4(tmp_path, flight, [(17.0, "MC_YAWRATE_P", 0.4), (18.0, "MC_ROLL_P", 5.0)]))
     assert log.flown.yaw.Kp_i == pytest.approx(0.2)
     (warning,) = log.warnings
@@ -45,13 +45,13 @@ def test_a_gain_set_during_the_excitation_is_told_and_did_not_fly(tmp_path, flig
 @pytest.mark.parametrize(
     "change", [(26.0, "MC_YAWRATE_P", 0.4), (17.0, "MC_YAWRATE_P", 0.2), (17.0, "MC_AT_START", 1.0), (17.0, "X", 1.0)]
 )
-def test_what_is_set_afterwards_to_the_same_or_outside_the_loop_is_not_told(tmp_path, flight, change):
+def test_changes_afterwards_to_the_same_value_or_outside_the_loop_give_no_warning(tmp_path, flight, change):
     log = read_log(px4(tmp_path, flight, [change]))
     assert log.flown.yaw.Kp_i == pytest.approx(0.2)
     assert log.warnings == ()
 
 
-def test_the_thrust_curve_that_was_set_later_decides_what_motor_commands_are(tmp_path, flight):
+def test_a_thrust_curve_set_later_decides_whether_commands_are_thrust(tmp_path, flight):
     motors = {"timestamp": microseconds(flight.t), "timestamp_sample": microseconds(flight.t)}
     motors["control"] = np.full((len(flight.t), 4), 0.5, np.float32)
     topics = px4_topics(flight, actuator_motors=motors)
@@ -73,10 +73,10 @@ def test_repeated_parm_messages_are_changes(tmp_path, flight):
     assert warning.endswith("ATC_RAT_YAW_P from 0.2 to 0.4 after 5.0 s")
 
 
-def test_commands_tell_what_is_wrong_with_a_log(mimopilot, tmp_path, flight):
-    still = replace(flight, u=np.column_stack([flight.u[:, 0], np.zeros(len(flight.t))]))  # refused, and so at once
+def test_commands_report_what_is_wrong_with_a_log(mimopilot, tmp_path, flight):
+    still = replace(flight, u=np.column_stack([flight.u[:, 0], np.zeros(len(flight.t))]))
     px4(tmp_path, still, [(17.0, "MC_ROLL_P", 5.0)])
-    for command, begin in (("inspect", "warning: x.ulg: parameters were changed"), ("advise", "x.ulg: ")):
+    for command, begin in (("inspect", "warning: x.ulg: parameters changed"), ("advise", "x.ulg: ")):
         result = mimopilot(command, "x.ulg")
         told = [line for line in result.stderr.splitlines() if "MC_ROLL_P from 6.5 to 5" in line]
         assert len(told) == 1, result.stderr

@@ -48,7 +48,7 @@ def test_a_gap_splits_the_log():
     assert out.segments[1][0] * 0.004 + 1 == pytest.approx(9.1, abs=0.01)
 
 
-def test_of_repeated_stamps_the_last_value_is_kept():
+def test_the_last_value_of_equal_stamps_is_kept():
     t = uniform()
     doubled = np.repeat(t, 2)
     values = np.column_stack([np.arange(len(doubled)), np.arange(len(doubled))]).astype(float)
@@ -77,7 +77,7 @@ def test_three_seconds_are_too_short():
         grid(u=series(t), y_i=series(t), y_o=series(t))
 
 
-def test_one_stamp_far_ahead_costs_one_sample_and_not_all_that_follow():
+def test_one_stamp_far_ahead_costs_only_its_own_sample():
     t = uniform()
     broken = t.copy()
     broken[500] = 1e6
@@ -85,7 +85,7 @@ def test_one_stamp_far_ahead_costs_one_sample_and_not_all_that_follow():
     assert grid(u=series(broken), y_i=series(t), y_o=series(t)).segments == ((0, len(t)),)
 
 
-def test_a_last_stamp_far_ahead_on_every_signal_is_refused_instead_of_filling_the_memory():
+def test_a_last_stamp_far_ahead_on_every_signal_is_refused_without_filling_memory():
     t = uniform()
     t[-1] = 1e13
     with pytest.raises(TuningError, match="damaged time stamps"):
@@ -110,15 +110,15 @@ def test_a_value_repeated_over_rows_is_recognised_as_held(rows):
     assert held_samples(held(uniform(), 0.004 * rows).values) == rows
 
 
-def test_a_coarsely_quantised_signal_is_not_taken_for_a_held_one():
+def test_a_coarsely_quantised_signal_does_not_count_as_held():
     noise = np.round(np.random.default_rng(0).standard_normal((5000, 2)) * 0.7)
     assert held_samples(noise) == 1
-    # At rest for half of the time it is still fresh in every row.
+    # At rest for half of the time every row is still a new value.
     noise[2500:] = 0
     assert held_samples(np.random.default_rng(1).standard_normal((5000, 2)) * (noise != 0)) == 1
 
 
-def test_a_torque_held_at_50_hz_is_refused_although_its_rows_come_at_250():
+def test_a_torque_held_at_50_hz_is_refused_although_logged_at_250_hz():
     t = uniform()
     with pytest.raises(TuningError, match=r"too slow: torque is logged at 250\.0 Hz but .* held for 5 .* 50\.0 Hz"):
         grid(u=held(t, 0.02), y_i=series(t), y_o=series(t))
@@ -130,14 +130,14 @@ def tone(time, hertz):
 
 
 @pytest.mark.parametrize("slow", [0.008, 0.0072])
-def test_slower_angles_bring_every_signal_to_their_rate_through_one_filter(slow):
+def test_slower_angles_decimate_every_signal_to_their_rate_by_the_same_filter(slow):
     t = uniform(20)
     fast = tone(t, 5)
     both = Series(t, fast.values + tone(t, 110).values, "topic")
     out = grid(u=both, y_i=fast, y_o=tone(uniform(20, slow), 5))
     assert out.Ts == pytest.approx(slow, rel=0.01)
     inner = slice(100, -100)
-    # What the slow rate cannot carry is gone from the fast signal, what it can is untouched and not delayed.
+    # Frequencies above the slow rate are removed from the fast signal; those below are neither changed nor delayed.
     time = 1.0 + out.Ts * np.arange(len(out.signals["u"]))
     assert out.signals["u"][inner] == pytest.approx(tone(time, 5).values[inner], abs=0.02)
     assert out.signals["y_i"][inner] == pytest.approx(tone(time, 5).values[inner], abs=0.01)

@@ -1,4 +1,4 @@
-"""PX4 logs of every layout, written here; genuine ones are other people's data."""
+"""PX4 logs of every layout, written by the tests; recorded logs are other people's data."""
 
 import struct
 
@@ -91,7 +91,7 @@ def test_torque_and_rates_of_one_cycle_are_paired_although_published_at_differen
 
 
 @pytest.mark.parametrize("zeros", ["all", "first hundred"])
-def test_where_timestamp_sample_is_zero_the_publication_time_stands_in(tmp_path, flight, zeros):
+def test_the_publication_time_is_used_when_timestamp_sample_is_zero(tmp_path, flight, zeros):
     topics = px4_topics(flight)
     for _, _, fields in topics:
         fields["timestamp"] = microseconds(flight.t)
@@ -105,7 +105,7 @@ def test_where_timestamp_sample_is_zero_the_publication_time_stands_in(tmp_path,
 
 
 @pytest.mark.parametrize("publication", [0.0001, 0.0004, 0.0006])
-def test_excitation_belongs_to_the_cycle_that_published_it_beside_its_torque(tmp_path, publication):
+def test_excitation_belongs_to_the_cycle_that_published_it_with_its_torque(tmp_path, publication):
     flight = make_flight(inject=lambda t: pulses(t, begin=t[0] + 1.0))
     topics = px4_topics(flight, debug_vect=injected(flight, publication))
     log = read_log(write_ulog(tmp_path / "x.ulg", topics))
@@ -113,14 +113,14 @@ def test_excitation_belongs_to_the_cycle_that_published_it_beside_its_torque(tmp
     assert log.u == pytest.approx(flight.u[250:], abs=1e-6)
 
 
-def test_a_set_point_published_between_two_cycles_is_used_by_the_second(tmp_path, flight):
+def test_a_setpoint_published_between_two_cycles_is_used_by_the_second(tmp_path, flight):
     rates = {
         "timestamp": microseconds(flight.t + 0.0025),
         "roll": flight.t.astype(np.float32),
         "pitch": flight.t.astype(np.float32),
     }
     log = read_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight, vehicle_rates_setpoint=rates)))
-    # Torque is published 0.4 ms after its sample: the value of 2.5 ms is there for the next one.
+    # Torque is published 0.4 ms after its sample, so the setpoint at 2.5 ms is used by the next one.
     assert log.r_i[1:, 0] == pytest.approx(flight.t[:-1], abs=1e-5)
 
 
@@ -131,7 +131,7 @@ def test_only_the_first_instance_of_a_topic_counts(tmp_path, flight):
     assert log.y_i == pytest.approx(flight.y_i, abs=1e-6)
 
 
-def test_of_set_points_with_repeated_stamps_the_last_counts(tmp_path, flight):
+def test_the_last_setpoint_of_equal_stamps_counts(tmp_path, flight):
     topics = px4_topics(flight)
     stamps = np.repeat(microseconds(flight.t[::2]), 2)
     roll = np.arange(len(stamps)) * 1e-4
@@ -140,7 +140,7 @@ def test_of_set_points_with_repeated_stamps_the_last_counts(tmp_path, flight):
     assert log.r_o[::2, 0] == pytest.approx(roll[1::2], abs=1e-6)
 
 
-def test_a_dropout_splits_the_log_and_nothing_is_made_up_in_it(tmp_path, flight):
+def test_a_dropout_splits_the_log_and_is_not_filled(tmp_path, flight):
     keep = (flight.t < 13) | (flight.t > 13.164)
     topics = [(name, i, {k: v[keep] for k, v in fields.items()}) for name, i, fields in px4_topics(flight)]
     log = read_log(write_ulog(tmp_path / "x.ulg", topics))
@@ -150,7 +150,7 @@ def test_a_dropout_splits_the_log_and_nothing_is_made_up_in_it(tmp_path, flight)
     assert (log.segments[1][0] - log.segments[0][1]) * PERIOD == pytest.approx(0.16, abs=0.009)
 
 
-def test_the_message_names_the_missing_topic_the_logging_profile_and_the_topics_that_are_there(tmp_path, flight):
+def test_the_message_names_the_missing_topic_the_logging_profile_and_the_logged_topics(tmp_path, flight):
     topics = px4_topics(flight)[1:]
     path = write_ulog(tmp_path / "x.ulg", topics, {"SDLOG_PROFILE": 1.0})
     with pytest.raises(
@@ -169,15 +169,15 @@ def test_default_logging_is_refused_as_too_slow(tmp_path, flight):
         read_log(write_ulog(tmp_path / "x.ulg", topics))
 
 
-def test_the_release_is_read_and_none_is_made_up(tmp_path, flight):
+def test_the_release_is_read_and_not_invented(tmp_path, flight):
     path = write_ulog(tmp_path / "x.ulg", px4_topics(flight))
     assert open_log(path).format == "ULog, PX4 1.13.2"
     path.write_bytes(path.read_bytes().replace(struct.pack("<I", 0x010D02FF), struct.pack("<I", 0x000000FF), 1))
     assert open_log(path).format == "ULog, PX4"
 
 
-@pytest.mark.parametrize(("profile", "advice"), [(17, "to 49 .*it is 17"), (49, "49 and asks for every loop already")])
-def test_the_advice_on_the_logging_profile_is_not_in_force_already(tmp_path, flight, profile, advice):
+@pytest.mark.parametrize(("profile", "advice"), [(17, "to 49 .*it is 17"), (49, "49, which logs every loop")])
+def test_the_advice_on_the_logging_profile_names_no_setting_that_is_right_already(tmp_path, flight, profile, advice):
     path = write_ulog(tmp_path / "x.ulg", px4_topics(flight)[1:], {"SDLOG_PROFILE": profile})
     with pytest.raises(TuningError, match=f"SDLOG_PROFILE (is )?{advice}"):
         read_log(path)

@@ -1,4 +1,4 @@
-"""Logs of what is not a multirotor are refused by name; a VTOL counts while it hovers."""
+"""Logs of other vehicles are refused with the vehicle type; of a VTOL the hover is used."""
 
 import numpy as np
 import pytest
@@ -46,10 +46,10 @@ def px4(path, flight, parameters=(), **status):
         ({"is_rotary_wing": 0, "is_vtol": 1}, "a VTOL in forward flight throughout"),
         ({"vehicle_type": 2, "is_vtol": 1, "system_type": 22}, "a VTOL in forward flight throughout"),
         ({"vehicle_type": 1, "is_vtol": 1, "in_transition_mode": 1}, "a VTOL in forward flight throughout"),
-        ({"system_type": 21}, "a VTOL, and vehicle_status does not say when it hovered"),
+        ({"system_type": 21}, "a VTOL, and vehicle_status does not tell when it hovered"),
     ],
 )
-def test_px4_status_names_what_is_no_multirotor(tmp_path, flight, status, name):
+def test_px4_status_tells_vehicles_that_are_not_multirotors(tmp_path, flight, status, name):
     path = px4(tmp_path, flight, **status)
     with pytest.raises(TuningError, match=f"not a multirotor: {name} .vehicle_status"):
         read_log(path)
@@ -66,13 +66,13 @@ def test_px4_status_names_what_is_no_multirotor(tmp_path, flight, status, name):
         {"vehicle_type": 1, "system_type": 14},
     ],
 )
-def test_multirotors_of_every_release_are_read_whole(tmp_path, flight, status):
+def test_multirotor_logs_of_every_release_are_read_completely(tmp_path, flight, status):
     log = read_log(px4(tmp_path, flight, **status))
     assert log.seconds == pytest.approx(20)
     assert log.warnings == ()
 
 
-def test_the_parameter_stands_in_where_no_status_is_logged(tmp_path, flight):
+def test_the_parameter_is_used_when_no_status_is_logged(tmp_path, flight):
     with pytest.raises(TuningError, match=r"not a multirotor: a rover \(parameter MAV_TYPE is 10\)"):
         read_log(px4(tmp_path, flight, {"MAV_TYPE": 10}))
     assert read_log(px4(tmp_path, flight, {"MAV_TYPE": 2})).warnings == ()
@@ -89,11 +89,11 @@ def test_the_parameter_stands_in_where_no_status_is_logged(tmp_path, flight):
         {"is_rotary_wing": [1] * 14 + [0] * 6, "system_type": 20, "in_transition_mode": [0] * 12 + [1] * 8},
     ],
 )
-def test_of_a_vtol_the_hover_is_used_and_it_is_said(tmp_path, flight, status):
+def test_only_the_hover_of_a_vtol_is_used_with_a_warning(tmp_path, flight, status):
     log = read_log(px4(tmp_path, flight, **status))
     assert log.seconds == pytest.approx(12, abs=0.01)
     assert log.u == pytest.approx(flight.u[: len(log.u)], abs=1e-6)
-    assert log.warnings == ("a VTOL: only the time in which it hovers is used",)
+    assert log.warnings == ("a VTOL: only the time in hover is used",)
 
 
 def ardupilot(path, flight, text, modes=(), **parameters):
@@ -130,7 +130,7 @@ def ardupilot(path, flight, text, modes=(), **parameters):
         ("ArduPlane V4.5.7 (abc)", {"Q_ENABLE": 1}, "a VTOL that never hovered"),
     ],
 )
-def test_ardupilot_firmware_and_frame_name_what_is_no_multirotor(tmp_path, flight, text, parameters, name):
+def test_ardupilot_firmware_and_frame_tell_vehicles_that_are_not_multirotors(tmp_path, flight, text, parameters, name):
     path = ardupilot(tmp_path, flight, text, modes=[(10, 10)], **parameters)
     with pytest.raises(TuningError, match=rf"not a multirotor: {name} \("):
         read_log(path)
@@ -141,7 +141,7 @@ def test_copters_and_unknown_firmware_are_read(tmp_path, flight, text):
     assert read_log(ardupilot(tmp_path, flight, text, FRAME_CLASS=1)).seconds == pytest.approx(20)
 
 
-def test_of_a_quadplane_the_q_modes_are_used(tmp_path, flight):
+def test_only_the_q_modes_of_a_quadplane_are_used(tmp_path, flight):
     path = ardupilot(tmp_path, flight, "ArduPlane V4.6.0", [(10, 17), (15, 19), (22, 10)], Q_ENABLE=1)
     log = read_log(path)
     assert log.seconds == pytest.approx(12, abs=0.01)

@@ -1,4 +1,4 @@
-"""The measured response of an airframe, and its error, against the exact one."""
+"""The measured response of an airframe and its error beside the exact response."""
 
 from dataclasses import replace
 
@@ -31,7 +31,7 @@ def test_the_measured_response_is_that_of_the_airframe(name):
 
 
 @pytest.mark.parametrize(("hz", "gain"), [(12.0, 0.4), (25.0, 0.4), (25.0, 0.8), (30.0, 0.4)])
-def test_a_mode_of_the_frame_is_seen_where_it_is(hz, gain):
+def test_a_frame_mode_is_found_at_its_frequency(hz, gain):
     body = load_airframe("adam0").airframe.model_copy(update={"frame": Frame(frequency_hz=hz, damping=0.02, gain=gain)})
     plant = measured_plant(experiment("adam0", airframe=body))
     exact = linear_plant(body).frequency_response(plant.omega)
@@ -42,7 +42,7 @@ def test_a_mode_of_the_frame_is_seen_where_it_is(hz, gain):
     assert np.median(relative(plant.G_i, exact[:, :2])[top]) < 0.2
     size = np.linalg.norm(plant.G_i, axis=(1, 2))
     assert plant.omega[near][np.argmax(size[near])] == pytest.approx(w, rel=0.02)
-    # A rigid frame's response is a fraction of that there.
+    # The response of a rigid frame is much smaller there.
     rigid = linear_plant(load_airframe("adam0").airframe).frequency_response(np.array([w]))[:, :2]
     assert size[near].max() > 4 * np.linalg.norm(rigid)
 
@@ -61,7 +61,7 @@ def test_the_error_is_that_of_repeated_flights():
             draws = [plant.draw(np.random.default_rng(k)).G_o[band] for plant in plants[:4] for k in range(32)]
             means = np.repeat([plant.G_o[band] for plant in plants[:4]], 32, axis=0)
             claimed = np.sqrt(np.mean(np.abs(np.array(draws) - means) ** 2, axis=0))
-        # Smoothing counts overlapping windows as half as many: it claims a little more than the spread.
+        # Smoothing counts overlapping windows as half as many: the error is slightly above the spread.
         assert 0.6 < np.median(spread / claimed) < 1.25
 
 
@@ -74,7 +74,7 @@ def synthetic(omega, error=0.0, coherence=1.0, K=100.0):
     return PlantResponse(omega, G, G / s, root, reach, coherences, TS)
 
 
-def test_the_deviation_is_that_of_draws():
+def test_the_deviation_is_that_of_drawn_plants():
     omega = np.linspace(2, 20, 10)
     plant = synthetic(omega, 0.1)
     rng = np.random.default_rng(0)
@@ -107,7 +107,7 @@ def test_one_axis_without_coherence_is_not_known():
     assert np.flatnonzero(~plant.known()).tolist() == [3]
 
 
-def test_a_small_hole_does_not_end_the_run_and_a_large_one_does():
+def test_a_small_gap_does_not_end_the_known_band_and_a_large_one_does():
     omega = np.arange(1.0, 60.0)
     for lacking, last in (((19, 22), 59.0), ((19, 30), 19.0), ((40, 56), 40.0)):
         plant = synthetic(omega)
@@ -129,8 +129,8 @@ def test_a_small_hole_does_not_end_the_run_and_a_large_one_does():
     assert nothing.band(0) is None
 
 
-def test_the_response_between_its_frequencies_is_that_of_a_body():
-    """Exact for a body with damping, and near for a vehicle with motors."""
+def test_interpolation_is_exact_for_a_damped_body():
+    """Exact for a damped body, close for a vehicle with motors."""
     omega = np.arange(1.3, 100.0, 1.3)
     K = np.array([[80.0, -8.0], [-7.0, 90.0]])
     s = 1j * omega[:, None, None]
@@ -147,7 +147,7 @@ def test_the_response_between_its_frequencies_is_that_of_a_body():
     assert relative(between.G_i, truth.frequency_response(between.omega)[:, :2]).max() < 0.02
 
 
-def test_the_response_is_carried_on_downwards_as_a_body_that_integrates():
+def test_the_response_is_extended_downwards_as_an_integrating_body():
     plant = synthetic(np.arange(3.0, 30.0), 0.1).extended()
     s = 1j * plant.omega[:, None, None]
     assert plant.omega[0] == pytest.approx(1.0)
@@ -160,11 +160,11 @@ def test_the_response_is_carried_on_downwards_as_a_body_that_integrates():
 def test_a_log_with_roll_in_place_of_pitch_is_refused(name, said):
     log = experiment("adam0", seconds=10.0)
     twice = replace(log, **{name: np.repeat(getattr(log, name)[:, :1], 2, axis=1)})
-    with pytest.raises(TuningError, match=f"roll and pitch {said} are one signal"):
+    with pytest.raises(TuningError, match=f"roll and pitch {said} are the same signal"):
         measured_plant(twice)
 
 
 def test_a_torque_that_does_not_move_both_axes_is_refused():
     log = experiment("adam0", seconds=10.0)
-    with pytest.raises(TuningError, match="not excited: the external signal does not move both moments"):
+    with pytest.raises(TuningError, match="not excited: the external signal does not move both torques"):
         plant_response(replace(log, u=np.repeat(log.u[:, :1], 2, axis=1)), log.u_bar)

@@ -76,7 +76,7 @@ def resonant(w, damping, Ts, n=12000, noise=0.0):
     return x, y, lambda omega: 1 + b[1] * np.exp(-1j * omega * Ts) / np.polyval(a[::-1], np.exp(-1j * omega * Ts))
 
 
-def test_windows_are_wide_where_nothing_is_hidden_and_narrow_about_a_mode():
+def test_windows_are_narrow_around_a_mode_and_wide_elsewhere():
     """A mode of 1 % damping at 157 rad/s in 48 s: windows of 8 % would show its mean."""
     Ts, w = 0.004, 157.0
     x, y, exact = resonant(w, 0.01, Ts, noise=0.05)

@@ -8,7 +8,8 @@ from mimopilot.tuning.law import Filters
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from mimopilot.tuning.plant.frequency_response import measured_plant
-from mimopilot.tuning.plant.pbsid import fit, identify_rates, pbsid, pbsid_by_response
+from mimopilot.tuning.plant.pbsid import pbsid
+from mimopilot.tuning.plant.rates_model import fit, identify_rates, pbsid_by_response
 from mimopilot.tuning.statespace import StateSpace
 
 from tests.paths import DATA
@@ -96,7 +97,7 @@ def test_the_prediction_leaves_the_innovation_and_the_simulation_the_noise():
 
 def test_segments_are_not_joined_across_a_gap():
     u, y, _ = closed_loop_data(6000, noise=1e-5)
-    y[3000:3100] = 1e3  # what is between segments must not matter
+    y[3000:3100] = 1e3  # samples between segments must not matter
     model = pbsid(u, y, TS, order=3, past=6, segments=[(0, 3000), (3100, 6000)])
     assert response_error(model.plant) < 1e-4
 
@@ -121,12 +122,12 @@ def test_windows_orders_and_data_that_cannot_work_are_refused():
 
 @pytest.fixture(scope="module", params=["coupled", "symmetric"])
 def genuine(request):
-    """A flight of the genuine PX4 and its response."""
+    """A PX4 flight and its response."""
     log = read_log(DATA / f"px4_sih_{request.param}.mat")
     return log, measured_plant(log)
 
 
-def test_a_genuine_flight_gets_an_order_that_fits_its_response(genuine):
+def test_a_px4_flight_gets_an_order_that_fits_its_response(genuine):
     log, plant = genuine
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -140,8 +141,8 @@ def test_a_genuine_flight_gets_an_order_that_fits_its_response(genuine):
     assert (found.one_step_percent > 50).all()
 
 
-def test_a_diverging_order_that_is_asked_for_is_refused(genuine):
-    """Whatever the order: its predictor is stable, or it is refused, and nothing overflows."""
+def test_a_given_order_that_diverges_is_refused(genuine):
+    """Any order has a stable predictor or is refused, and nothing overflows."""
     log, plant = genuine
     refused = 0
     for order in (1, 2, 3, 30):
@@ -165,15 +166,15 @@ def test_the_order_by_response_is_that_of_the_plant():
     assert response_error(model.plant) < 0.02
 
 
-def test_a_model_that_is_not_near_the_response_is_refused():
+def test_a_model_that_does_not_fit_the_response_is_refused():
     u, y, _ = closed_loop_data(4000)
     omega = np.linspace(0.3, np.pi / TS, 100)
-    with pytest.raises(TuningError, match=r"no model of order 1 to 12 is near .* \(the best fits by -\d+ %"):
+    with pytest.raises(TuningError, match=r"no model of order 1 to 12 fits .* \(best fit -\d+ %"):
         pbsid_by_response(u, y, TS, omega, -PLANT.frequency_response(omega), np.full((len(omega), 2, 2), 1e-3))
 
 
 def test_a_log_without_any_known_frequency_is_refused(genuine):
     log, plant = genuine
     unknown = replace(plant, root=plant.root * 1e6, coherence=0 * plant.coherence)
-    with pytest.raises(TuningError, match="not excited: the response of the rates is known at no frequency"):
+    with pytest.raises(TuningError, match="not excited: the rate response is known at no frequency"):
         identify_rates(log, unknown)

@@ -1,4 +1,4 @@
-"""What a study contributes to a report."""
+"""The part of a report that one study contributes."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from mimopilot.common.html_report import ReportTable, Section
 
 
 @dataclass(frozen=True)
-class Part:
-    """One study's share.
+class ReportPart:
+    """One study's part of a report.
 
     Attributes
     ----------
     lead : str
-        What was done, in a sentence.
+        One sentence on what was done.
     sections : sequence of Section
     figures : dict
-        What ``--json`` prints.
+        The study's part of the object that ``--json`` prints.
     """
 
     lead: str
@@ -28,5 +28,5 @@ class Part:
 
     @property
     def tables(self) -> list[ReportTable]:
-        """Of all sections, in order."""
+        """The tables of all sections, in order."""
         return [table for section in self.sections for table in section.tables]

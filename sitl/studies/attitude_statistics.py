@@ -1,4 +1,4 @@
-"""Many experiments of the attitude studies on all cores: run k is the same whatever the number of processes."""
+"""Many runs of the attitude studies on all cores; the results do not depend on the number of processes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mimopilot.sitl.studies.attitude import Run, Study, numbers, optimum, run
+from mimopilot.sitl.studies.attitude_run import AttitudeRun, numbers, optimum, run
+from mimopilot.sitl.studies.attitude_study import AttitudeStudy
 from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
@@ -16,20 +17,20 @@ from mimopilot.common.parallel import cores, processes, run_all
 
 
 @dataclass(frozen=True, eq=False)
-class Statistics:
-    """What the runs of a study say.
+class StudyStatistics:
+    """The runs of a study and their statistics.
 
     Attributes
     ----------
-    study : Study
-    shown : Run
-        That of seed 0, for the figures.
+    study : AttitudeStudy
+    shown : AttitudeRun
+        Run with seed 0, for the plots.
     runs : list of dict
         `numbers` of every seed, in order.
     """
 
-    study: Study
-    shown: Run
+    study: AttitudeStudy
+    shown: AttitudeRun
     runs: list[dict[str, Any]]
 
     def values(self, method: str, axis: str, figure: str) -> NDArray[np.float64]:
@@ -50,42 +51,42 @@ class Statistics:
         return {verdict: found.count(verdict) for verdict in sorted(set(found))}
 
 
-def run_once(task: tuple[Study, int, dict[str, Gains]]) -> tuple[Run, dict[str, Any]]:
-    """One run of a study with a seed, beside the best sets, and its `numbers`."""
+def run_once(task: tuple[AttitudeStudy, int, dict[str, Gains]]) -> tuple[AttitudeRun, dict[str, Any]]:
+    """One run of a study with a seed and the best gain sets, and its `numbers`."""
     found = run(*task)
     return found, numbers(found)
 
 
-def _counted(task: tuple[Study, int, dict[str, Gains]]) -> tuple[Run | None, dict[str, Any]]:
-    """`run_once`; flights take long to hand over, and only those of seed 0 are shown."""
+def _counted(task: tuple[AttitudeStudy, int, dict[str, Gains]]) -> tuple[AttitudeRun | None, dict[str, Any]]:
+    """`run_once`, which returns flights for seed 0 only: other flights are not shown and slow to transfer."""
     found, counted = run_once(task)
     return (found if task[1] == 0 else None), counted
 
 
-def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None) -> list[Statistics]:
-    """Every study with every seed.
+def run_studies(chosen: Sequence[AttitudeStudy], seeds: int, workers: int | None = None) -> list[StudyStatistics]:
+    """Run every study with every seed.
 
     Parameters
     ----------
-    chosen : sequence of Study
+    chosen : sequence of AttitudeStudy
     seeds : int
-        Experiments a study.
+        Experiments per study.
     workers : int, optional
-        Processes; by default one a core.
+        Processes; by default one per core.
     """
     from rich.progress import Progress
 
     count = workers or cores()
     best: dict[str, dict[str, Gains]] = {}
-    runs: dict[tuple[str, int], tuple[Run | None, dict[str, Any]]] = {}
+    runs: dict[tuple[str, int], tuple[AttitudeRun | None, dict[str, Any]]] = {}
     with processes(count) as pool, Progress(console=progress_console(), transient=True) as bar:
         shown = bar.add_task("experiments", total=len(chosen) * (seeds + 1))
 
-        def keep_best(study: Study, sets: dict[str, Gains]) -> None:
+        def keep_best(study: AttitudeStudy, sets: dict[str, Gains]) -> None:
             best[study.name] = sets
             bar.advance(shown)
 
-        def keep_run(task: tuple[Study, int, Any], found: tuple[Run | None, dict[str, Any]]) -> None:
+        def keep_run(task: tuple[AttitudeStudy, int, Any], found: tuple[AttitudeRun | None, dict[str, Any]]) -> None:
             runs[task[0].name, task[1]] = found
             bar.advance(shown)
 
@@ -96,5 +97,5 @@ def run_studies(chosen: Sequence[Study], seeds: int, workers: int | None = None)
     for study in chosen:
         first = runs[study.name, 0][0]
         assert first is not None
-        results.append(Statistics(study, first, [runs[study.name, seed][1] for seed in range(seeds)]))
+        results.append(StudyStatistics(study, first, [runs[study.name, seed][1] for seed in range(seeds)]))
     return results

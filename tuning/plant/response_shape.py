@@ -1,4 +1,4 @@
-"""The shape of a vehicle's response: a damped body behind a delay and the lag of its rotors."""
+"""Low-order model of a vehicle's frequency response: a damped rigid body with delay and rotor lag."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-#: What lies between torque and rate besides the body: delays (s), rotor lags (s) and damping (1/s) that are tried.
+#: Grid of the fit: delays (s), rotor lags (s), rate damping (1/s). It covers vehicles from racers to heavy lifters.
 DELAYS = (0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06)
 LAGS = (0.0, 0.015, 0.025, 0.035, 0.05, 0.07, 0.1)
 DAMPINGS = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0)
 
-Shape = tuple[float, float, float]
+#: Delay (s), rotor lag (s), damping (1/s).
+ResponseShape = tuple[float, float, float]
+#: Relative error of a vehicle's response from every such shape.
+SHAPE_ERROR = 0.03
+
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
-SHAPES: tuple[Shape, ...] = tuple(itertools.product(DELAYS, LAGS, DAMPINGS))
+SHAPES: tuple[ResponseShape, ...] = tuple(itertools.product(DELAYS, LAGS, DAMPINGS))
 
 
-def shape_response(omega: Signal, shape: Shape) -> Complex:
+def shape_response(omega: Signal, shape: ResponseShape) -> Complex:
     """exp(-j w delay) / ((1 + j w lag) (j w + damping)) at omega (K,), rad/s."""
     delay, lag, damping = shape
     s = 1j * omega
@@ -27,8 +31,8 @@ def shape_response(omega: Signal, shape: Shape) -> Complex:
     return response
 
 
-def fit_shape(omega: Signal, G: Complex, weight: Signal) -> tuple[Shape, Signal, Signal, float]:
-    """Least squares of G = B times a shape, with a real B.
+def fit_shape(omega: Signal, G: Complex, weight: Signal) -> tuple[ResponseShape, Signal, Signal, float]:
+    """Least-squares fit of G = B times a response shape, with a real B.
 
     Parameters
     ----------
@@ -40,13 +44,13 @@ def fit_shape(omega: Signal, G: Complex, weight: Signal) -> tuple[Shape, Signal,
 
     Returns
     -------
-    shape : Shape
+    shape : ResponseShape
         The best of `SHAPES`: delay and lag (s), damping (1/s).
     B : (2, 2) array, rad/s^2
     power : (2, 2) array
         Inverse variance of each element of B.
     misfit : float
-        Weighted sum of squares that is left.
+        Weighted sum of squares of the residual.
     """
     shapes = np.array([shape_response(omega, shape) for shape in SHAPES])
     power = np.einsum("nk,kij->nij", np.abs(shapes) ** 2, weight)

@@ -1,4 +1,4 @@
-"""The table of faults: every standard fault, many seeds, several gain sets side by side."""
+"""The fault table: every standard fault with many seeds, several gain sets side by side."""
 
 from __future__ import annotations
 
@@ -12,27 +12,23 @@ from typing import Any
 import numpy as np
 from mimopilot.codegen.native import NativeController, NativeLibrary, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
-from mimopilot.sitl.faults.kinds import Fault, parse_fault
+from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.sitl.flight.fault_recovery import Recovery, recovery
 from mimopilot.sitl.flight.scenario import Scenario, make_scenario
 from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
+from mimopilot.sitl.studies.standard_faults import standard_faults
 
-from mimopilot.common.console import print_table, progress_console
+from mimopilot.common.console import progress_console
 from mimopilot.common.intervals import wilson
 from mimopilot.common.parallel import processes, run_all
 
-AT = 1.1  # s: a tenth of a second into the manoeuvre
-TAIL_S = 5.0  # of level flight after it: what is lost in the end shall be lost in the flight
-COLUMNS = (
-    *("fault", "gains", "survived", "95 %", "peak [deg]", "worst", "RMS", "recovered [s]"),
-    *("saturated", "detected [s]", "non-finite"),
-)
+TAIL_S = 5.0  # s of level flight after the manoeuvre: long enough to lose an unstable vehicle in the flight
 
 
 @dataclass(frozen=True)
-class Request:
-    """What is asked: everything that a worker process needs to know.
+class FaultTableRequest:
+    """What to fly: the complete input of a worker process.
 
     Attributes
     ----------
@@ -42,9 +38,9 @@ class Request:
         See `sitl.physics.airframe.AirframeFile.gain_sets`.
     axis : str
     amplitude_deg, period_s : float
-        Of the doublet.
+        Amplitude (deg) and length (s) of the doublet.
     faults : tuple of Fault
-        Each is flown by itself; empty: `standard_faults`.
+        Flown one at a time; empty: `standard_faults`.
     """
 
     airframe: str
@@ -56,8 +52,8 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Row:
-    """One fault under one gain set, over all seeds; medians unless the name says otherwise.
+class FaultTableRow:
+    """One fault with one gain set over all seeds; medians unless stated otherwise.
 
     Attributes
     ----------
@@ -66,23 +62,26 @@ class Row:
     survival_interval : (low, high)
         Wilson's, 95 %.
     peak_deg, worst_peak_deg, rms_deg : float, deg
-        From the flight without faults, see `sitl.flight.fault_recovery.Recovery`; the worst is that of `worst_seed`.
+        Deviation from the flight without faults, see `sitl.flight.fault_recovery.Recovery`; the worst peak is
+        that of `worst_seed`.
     recovered : int
+        Number of flights that recovered.
     recovery_s : float or None, s
-        Of those that recovered.
+        Of these.
     saturated : float
-        Samples.
+        Samples with saturation since the fault.
     detected : int
+        Number of flights in which the fault was detected.
     detected_s : float or None, s
-        Of those that were detected.
+        Of these.
     detected_by : str
-        What told it, by commas.
+        Detectors, separated by commas.
     nonfinite : int
-        Of all seeds together.
+        Non-finite outputs of all seeds together.
     worst_seed : int
-        The one that was lost first, else the one with the largest peak.
+        Seed of the first lost flight, else of the largest peak.
     replay : str
-        The command that flies it again.
+        Command that repeats the worst flight.
     """
 
     fault: str
@@ -105,20 +104,20 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Table:
-    """What was found.
+class FaultTable:
+    """The result: one row per fault and gain set.
 
     Attributes
     ----------
     title : str
-    rows : tuple of Row
+    rows : tuple of FaultTableRow
         By fault, then by gain set.
     lost_without, alarms_without : dict of int
-        Gain set -> of the flights without faults, those that were lost, and those in which something was detected.
+        Gain set -> number of lost flights, and of false alarms, among the flights without faults.
     """
 
     title: str
-    rows: tuple[Row, ...]
+    rows: tuple[FaultTableRow, ...]
     lost_without: dict[str, int]
     alarms_without: dict[str, int]
 
@@ -128,41 +127,14 @@ class Table:
 
     @property
     def nonfinite(self) -> int:
-        """Outputs of all flights that were not finite numbers."""
+        """Number of non-finite outputs in all flights."""
         return sum(row.nonfinite for row in self.rows)
 
 
-def standard_faults(airframe: Airframe) -> tuple[Fault, ...]:
-    """The faults that every vehicle is asked to survive, or to notice, with their sizes."""
-    x, y, z = (0.8 * place for place in airframe.rotors[2].position)
-    load = round(0.11 * airframe.mass, 3)
-    tick = "0.001"  # shorter than a period: one sample
-    texts = (
-        *(f"motor:3={share}@{AT}" for share in (0.9, 0.7, 0.5, 0)),
-        f"battery=0.8@{AT}+0.5",
-        f"mass:{x:.4g},{y:.4g},{z:.4g}={load}@{AT}",
-        *(f"delay={size}@{AT}" for size in (0.02, 0.028, 0.036)),
-        f"jitter=0.02@{AT}",
-        f"loss=0.5@{AT}",
-        f"duplicate=0.5@{AT}",
-        f"skip=5@{AT}",
-        f"clock=0.1@{AT}",
-        f"link@{AT}+0.2",
-        f"stale@{AT}+1",
-        *(f"gyro-stuck@{AT}+{length}" for length in (0.1, 0.2, 0.4)),
-        f"gyro-bias:roll=0.2@{AT}",
-        f"gyro-noise=0.1@{AT}",
-        f"gyro-nan@{AT}+{tick}",
-        f"gyro-nan@{AT}+0.2",
-        *(f"gain:Kp_i={factor}@{AT}" for factor in (0.25, 0.5, 2, 4)),
-    )
-    return tuple(map(parse_fault, texts))
+class FaultFlights:
+    """Flies a vehicle with its gain sets and faults; made once per process."""
 
-
-class Bench:
-    """A vehicle, its gain sets and what is flown with them: made once in each process."""
-
-    def __init__(self, request: Request) -> None:
+    def __init__(self, request: FaultTableRequest) -> None:
         vehicle = load_airframe(request.airframe)
         self.airframe: Airframe = vehicle.airframe
         self.gains = vehicle.gain_sets(request.gains)
@@ -174,13 +146,13 @@ class Bench:
         self.faults = request.faults or standard_faults(self.airframe)
 
     def fly(self, name: str, faults: tuple[Fault, ...], seed: int) -> Flight:
-        """One flight under a gain set."""
+        """One flight with a gain set."""
         gains = self.gains[name]
         autopilot = Autopilot(self.airframe, gains, NativeController(self.libraries[name], gains))
         return fly(self.airframe, autopilot, replace(self.tasks[name], faults=faults), seed)
 
     def fly_all(self, seed: int) -> dict[str, list[Recovery]]:
-        """Gain set -> the flight without faults, then one with each fault."""
+        """Gain set -> recovery in the flight without faults, then in one flight per fault."""
         found = {}
         for name in self.gains:
             sound = self.fly(name, (), seed)
@@ -190,25 +162,25 @@ class Bench:
 
 
 @lru_cache(maxsize=1)
-def _bench(request: Request) -> Bench:
-    return Bench(request)
+def _flights_of(request: FaultTableRequest) -> FaultFlights:
+    return FaultFlights(request)
 
 
-def _fly_all(request: Request, seed: int) -> dict[str, list[Recovery]]:
-    return _bench(request).fly_all(seed)
+def _fly_all(request: FaultTableRequest, seed: int) -> dict[str, list[Recovery]]:
+    return _flights_of(request).fly_all(seed)
 
 
-def fault_table(request: Request, seeds: Sequence[int], workers: int) -> Table:
-    """Fly every fault with every seed under every gain set.
+def fault_table(request: FaultTableRequest, seeds: Sequence[int], workers: int) -> FaultTable:
+    """Fly every fault with every seed and gain set.
 
     Parameters
     ----------
-    request : Request
-        What to fly.
+    request : FaultTableRequest
+        Vehicle, gain sets, manoeuvre and faults.
     seeds : sequence of int
-        Of the measurement noise and of what is random in a fault.
+        Seeds of the measurement noise and of random faults.
     workers : int
-        Processes; the table is the same whatever their number.
+        Number of processes; it does not change the table.
 
     Raises
     ------
@@ -217,8 +189,9 @@ def fault_table(request: Request, seeds: Sequence[int], workers: int) -> Table:
     """
     from rich.progress import Progress
 
-    bench = _bench(request)
-    found: dict[int, dict[str, list[Recovery]]] = {seeds[0]: bench.fly_all(seeds[0])}  # compiles; finds what is wrong
+    flown_by = _flights_of(request)
+    # The first seed compiles and finds wrong input before processes are started.
+    found: dict[int, dict[str, list[Recovery]]] = {seeds[0]: flown_by.fly_all(seeds[0])}
     with Progress(console=progress_console(), transient=True) as bar:
         task = bar.add_task("flying", total=len(seeds), completed=1)
 
@@ -228,32 +201,33 @@ def fault_table(request: Request, seeds: Sequence[int], workers: int) -> Table:
 
         if workers == 1:
             for seed in seeds[1:]:
-                keep(seed, bench.fly_all(seed))
+                keep(seed, flown_by.fly_all(seed))
         else:
             with processes(workers) as executor:
                 run_all(executor, 2 * workers, partial(_fly_all, request), seeds[1:], keep)
-    flown = {name: [found[seed][name] for seed in seeds] for name in bench.gains}
-    paths = dict(zip(bench.gains, request.gains or (None,), strict=True))
+    flown = {name: [found[seed][name] for seed in seeds] for name in flown_by.gains}
+    paths = dict(zip(flown_by.gains, request.gains or (None,), strict=True))
     rows = tuple(
         _row(request, fault, name, paths[name], seeds, [flights[i + 1] for flights in flown[name]])
-        for i, fault in enumerate(bench.faults)
-        for name in bench.gains
+        for i, fault in enumerate(flown_by.faults)
+        for name in flown_by.gains
     )
-    title = f"{bench.airframe.name}, doublet on {request.axis}, {request.amplitude_deg:g} deg, {request.period_s:g} s"
-    return Table(
+    doublet = f"doublet on {request.axis}, {request.amplitude_deg:g} deg, {request.period_s:g} s"
+    title = f"{flown_by.airframe.name}, {doublet}"
+    return FaultTable(
         f"{title}, {len(seeds)} seeds from {seeds[0]}",
         rows,
-        {name: sum(flights[0].lost_at_s is not None for flights in flown[name]) for name in bench.gains},
-        {name: sum(flights[0].detected_s is not None for flights in flown[name]) for name in bench.gains},
+        {name: sum(flights[0].lost_at_s is not None for flights in flown[name]) for name in flown_by.gains},
+        {name: sum(flights[0].detected_s is not None for flights in flown[name]) for name in flown_by.gains},
     )
 
 
 def _row(
-    request: Request, fault: Fault, name: str, path: Path | None, seeds: Sequence[int], found: list[Recovery]
-) -> Row:
+    request: FaultTableRequest, fault: Fault, name: str, path: Path | None, seeds: Sequence[int], found: list[Recovery]
+) -> FaultTableRow:
     survived = sum(one.lost_at_s is None for one in found)
     worst = max(range(len(found)), key=lambda i: _badness(found[i]))
-    return Row(
+    return FaultTableRow(
         fault=str(fault),
         gains=name,
         runs=len(found),
@@ -275,7 +249,7 @@ def _row(
 
 
 def _badness(one: Recovery) -> tuple[float, float]:
-    """Sorts what was lost first to the end, then the larger peaks."""
+    """Sort key: earlier loss is worse, then a larger peak."""
     return -np.inf if one.lost_at_s is None else -one.lost_at_s, one.deviation_peak_deg
 
 
@@ -284,42 +258,10 @@ def _median(values: list[float | None]) -> float | None:
     return float(np.median(there)) if there else None
 
 
-def _replay(request: Request, fault: Fault, path: Path | None, seed: int) -> str:
-    """The command line that flies one flight of the table again."""
+def _replay(request: FaultTableRequest, fault: Fault, path: Path | None, seed: int) -> str:
+    """The command that repeats one flight of the table."""
     words = ["mimopilot", "fly", request.airframe, *(() if path is None else ("--gains", str(path)))]
     words += ["--axis", request.axis, "--amplitude-deg", repr(request.amplitude_deg)]
     words += ["--period-s", repr(request.period_s), "--tail-s", repr(TAIL_S)]
     words += ["--fault", str(fault), "--seed", str(seed)]
     return shlex.join(words)
-
-
-def print_fault_table(table: Table) -> None:
-    """The table, what happened without faults, and how to fly each worst case again."""
-    print_table(table.title, COLUMNS, [_cells(row) for row in table.rows])
-    for name, lost in table.lost_without.items():
-        runs = next(row.runs for row in table.rows if row.gains == name)
-        print(f"without faults, {name}: {lost} of {runs} lost, {table.alarms_without[name]} with a false alarm")
-    print("worst seeds again:")
-    for row in table.rows:
-        print(f"  {row.replay}")
-
-
-def _cells(row: Row) -> list[str]:
-    low, high = row.survival_interval
-
-    def some(value: float | None, count: int) -> str:
-        return "-" if value is None else f"{value:.3f}" + ("" if count == row.runs else f" ({count})")
-
-    return [
-        row.fault,
-        row.gains,
-        f"{row.survived}/{row.runs}",
-        f"{low:.2f}-{high:.2f}",
-        f"{row.peak_deg:.2f}",
-        f"{row.worst_peak_deg:.2f}",
-        f"{row.rms_deg:.2f}",
-        some(row.recovery_s, row.recovered),
-        f"{row.saturated:g}",
-        some(row.detected_s, row.detected) + f" {row.detected_by}".rstrip(),
-        str(row.nonfinite),
-    ]

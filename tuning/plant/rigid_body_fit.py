@@ -1,4 +1,4 @@
-"""The rigid body in a measured response: how fast a unit of torque accelerates roll and pitch."""
+"""Rigid-body fit of a measured response: angular acceleration of roll and pitch per unit of torque."""
 
 from __future__ import annotations
 
@@ -6,28 +6,26 @@ from dataclasses import dataclass
 
 import numpy as np
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.plant.body_shape import fit_shape
 from mimopilot.tuning.plant.frequency_response import PlantResponse
+from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, fit_shape
 from numpy.typing import NDArray
 
-#: Above this a frame bends and filters act, rad/s: it is not the body that is measured.
+#: rad/s. Above it frame modes and filters shape the response.
 UPPER = 60.0
-#: Known frequencies that the fit needs: as many as a log of some five seconds has.
+#: Known frequencies that the fit needs: as many as a log of about five seconds has.
 MIN_FREQUENCIES = 4
-#: Relative error that every frequency has besides its noise: no body is exactly of these shapes.
-SHAPE = 0.03
 
 Signal = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class RigidBody:
-    """Torque to angular acceleration about roll and pitch.
+    """Angular acceleration about roll and pitch per unit of torque (control effectiveness).
 
     Attributes
     ----------
     B : (2, 2) array, rad/s^2
-        For a unit of torque; torque scale times the inverse of the inertia.
+        Torque scale times the inverse of the inertia.
     deviation : (2, 2) array, rad/s^2
         Standard deviation of each element.
     """
@@ -42,8 +40,9 @@ class RigidBody:
         return float(a * d - b * c), float(np.linalg.norm(gradient * self.deviation))
 
     def least(self, gain: Signal) -> Signal:
-        """The least that a term of the rate controller does in any direction: smallest eigenvalue of the symmetric part
-        of B times its gain.
+        """Smallest action of a rate controller term over all directions.
+
+        This is the smallest eigenvalue of the symmetric part of B times the gain.
 
         Parameters
         ----------
@@ -61,8 +60,8 @@ class RigidBody:
 def rigid_body(plant: PlantResponse) -> RigidBody:
     """Fit of G_i = B exp(-j w delay) / ((1 + j w lag) (j w + damping)) with a real B to the known frequencies.
 
-    The shape is common to all elements, so nothing but B can turn a sign: no delay or lag within its range looks like
-    one over a decade of frequency.
+    All elements share the shape, so only B sets the signs: over a decade of frequency no delay or lag in the grid
+    looks like a change of sign.
 
     Raises
     ------
@@ -73,11 +72,11 @@ def rigid_body(plant: PlantResponse) -> RigidBody:
     if np.count_nonzero(use) < MIN_FREQUENCIES:
         raise TuningError(
             f"not excited: the response from torque to rates is known at {np.count_nonzero(use)} frequencies up to "
-            f"{UPPER:g} rad/s, {MIN_FREQUENCIES} are needed; inject a stronger or longer torque"
+            f"{UPPER:g} rad/s, expected {MIN_FREQUENCIES} or more; inject a stronger or longer torque"
         )
     plant = plant.at(use)
     size = np.linalg.norm(plant.G_i, axis=(1, 2))[:, None, None]
-    weight = 1 / (plant.deviation() ** 2 + (SHAPE * size) ** 2)
+    weight = 1 / (plant.deviation() ** 2 + (SHAPE_ERROR * size) ** 2)
     _, B, power, misfit = fit_shape(plant.omega, plant.G_i, weight)
     scale = max(1.0, misfit / (4 * len(plant.omega)))
     return RigidBody(B, np.sqrt(scale / power))

@@ -1,4 +1,4 @@
-"""What one experiment says of its vehicle, each part found when it is first asked for."""
+"""All plant estimates of one experiment, each computed on first use."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from functools import cached_property
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.plant.frequency_response import PlantResponse, measured_plant
-from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
-from mimopilot.tuning.plant.pbsid import RatesModel, identify_rates
+from mimopilot.tuning.plant.rates_model import RatesModel, identify_rates
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
 from mimopilot.tuning.statespace import StateSpace
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
-    """The vehicle of an experiment.
+class PlantEstimates:
+    """Plant estimates of one experiment.
 
     Attributes
     ----------
@@ -26,22 +26,22 @@ class Measured:
 
     @cached_property
     def response(self) -> PlantResponse:
-        """The frequency response; see `tuning.plant.frequency_response.measured_plant`."""
+        """Frequency response; see `tuning.plant.frequency_response.measured_plant`."""
         return measured_plant(self.experiment)
 
     @cached_property
     def body(self) -> RigidBody:
-        """The rigid body in it; see `tuning.plant.inertia.rigid_body`."""
+        """Rigid-body fit of the response; see `tuning.plant.rigid_body_fit.rigid_body`."""
         return rigid_body(self.response)
 
     @cached_property
     def identified(self) -> RatesModel:
-        """A model from torque to rates; see `tuning.plant.pbsid.identify_rates`."""
+        """State space from torque to rates; see `tuning.plant.rates_model.identify_rates`."""
         return identify_rates(self.experiment, self.response)
 
     @cached_property
     def model(self) -> StateSpace | None:
-        """The same without its fits; None where no model is near the response."""
+        """The identified state space alone; None when no model fits the response."""
         try:
             return self.identified.model.plant
         except TuningError:

@@ -1,4 +1,4 @@
-"""Figures of a campaign: envelopes of the responses, distributions of the figures, a map of survival."""
+"""Plots of a campaign: response envelopes, distributions of the figures, map of survival."""
 
 from __future__ import annotations
 
@@ -8,74 +8,74 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from mimopilot.sitl.campaign.draws import Variator
-from mimopilot.sitl.campaign.flights import Stand
-from mimopilot.sitl.campaign.plan import Plan
-from mimopilot.sitl.campaign.summary import Results
-from mimopilot.sitl.campaign.variation import UNITS
+from mimopilot.sitl.campaign.draws import RunSampler
+from mimopilot.sitl.campaign.flights import FlightRunner
+from mimopilot.sitl.campaign.plan import CampaignPlan
+from mimopilot.sitl.campaign.summary import CampaignResults
+from mimopilot.sitl.campaign.variation import VARIED_UNITS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import KINDS
 from mimopilot.sitl.flight.figures import SETPOINT, STYLES
+from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from mimopilot.sitl.flight.scenario import AXES
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from mimopilot.cli.bench import UNITS as FIGURES
-
-ENVELOPE_RUNS = 400  # flown again for the envelopes: the first ones, which are as random as any
-CELLS, A_CELL = 16, 8  # of the map: at most so many on each side, with so many flights in each on average
-POINTS = 300  # of a distribution's curve
-CROSSES = 200  # lost flights that the map shows one by one
-LARGEST = 75.0  # deg, that the envelopes show
-VERMILLION = "#D55E00"
+ENVELOPE_RUNS = 400  # first runs, repeated for the envelopes
+CELLS = 16  # largest number of cells on each side of the map
+FLIGHTS_PER_CELL = 8  # least average number of flights per cell of the map
+POINTS = 300  # points of a distribution curve
+CROSSES = 200  # largest number of lost flights marked in the map
+LARGEST = 75.0  # deg: limit of the angle axis of the envelopes
+VERMILLION = "#D55E00"  # Okabe and Ito's palette for colour blindness
 
 
 @dataclass(frozen=True, eq=False)
-class Sample:
-    """The first runs of a campaign, flown again; memory does not grow with the campaign.
+class EnvelopeSample:
+    """The first runs of a campaign, flown again for the envelopes.
 
     Attributes
     ----------
     angles : dict
         (gain set, index of the scenario) -> (runs, N, 2) array: true roll and pitch, deg.
     survived : dict
-        The same -> (runs,) array.
+        The same key -> (runs,) array.
     """
 
     angles: dict[tuple[str, int], NDArray[np.float32]]
     survived: dict[tuple[str, int], NDArray[np.bool_]]
 
 
-def fly_sample(stand: Stand) -> Sample:
-    """Fly the runs of the envelopes."""
-    plan, runs = stand.plan, min(stand.plan.description.runs, ENVELOPE_RUNS)
+def fly_sample(runner: FlightRunner) -> EnvelopeSample:
+    """Fly the first `ENVELOPE_RUNS` runs again."""
+    plan, runs = runner.plan, min(runner.plan.description.runs, ENVELOPE_RUNS)
     keys = [(name, index) for name in plan.gains for index in range(len(plan.scenarios))]
-    angles = {key: np.empty((runs, len(stand.truth), 2), np.float32) for key in keys}
+    angles = {key: np.empty((runs, len(runner.truth), 2), np.float32) for key in keys}
     survived = {key: np.empty(runs, np.bool_) for key in keys}
     for run in range(runs):
-        draw = stand.draw(run)
+        draw = runner.draw(run)
         for key in keys:
-            flight = stand.fly(draw, *key)
+            flight = runner.fly(draw, *key)
             angles[key][run] = np.degrees(flight.truth["attitude"][:, :2])
             survived[key][run] = flight.crashed_at is None
-    return Sample(angles, survived)
+    return EnvelopeSample(angles, survived)
 
 
-def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) -> Figure:
-    """Responses of all gain sets on one axis: median, 5 to 95 %, and the worst flight; rows are gain sets.
+def envelope_figure(runner: FlightRunner, sample: EnvelopeSample, results: CampaignResults, index: int) -> Figure:
+    """Responses on one axis: median, 5 to 95 %, and the worst flight; one row of panels per gain set.
 
     Parameters
     ----------
-    stand : Stand
-        Flies the worst again.
-    sample : Sample
+    runner : FlightRunner
+        Repeats the worst flight.
+    sample : EnvelopeSample
         From `fly_sample`.
-    results : Results
-        Knows the worst flights.
+    results : CampaignResults
+        Names the worst flight.
     index : int
-        Of the scenario.
+        Index of the scenario.
     """
-    plan = stand.plan
+    plan = runner.plan
     scenario, axis = plan.scenarios[index], plan.scenarios[index].axis
     time = (np.arange(len(scenario.setpoint)) - scenario.window[0]) * scenario.Ts
     figure = Figure(figsize=(9, 0.9 + 2.6 * len(plan.gains)), layout="constrained")
@@ -83,10 +83,10 @@ def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) 
     for row, name, (colour, _) in zip(panels, plan.gains, cycle(STYLES), strict=False):
         angles, survived = sample.angles[name, index], sample.survived[name, index]
         bad = results.worst(name, AXES[axis], 1)[0].run
-        worst = np.degrees(stand.fly(stand.draw(bad), name, index).truth["attitude"][:, :2])
+        worst = np.degrees(runner.fly(runner.draw(bad), name, index).truth["attitude"][:, :2])
         for panel, shown in zip(row, (axis, 1 - axis), strict=True):
             if shown == axis:
-                panel.step(time, np.degrees(scenario.setpoint[:, axis]), where="post", label="set-point", **SETPOINT)
+                panel.step(time, np.degrees(scenario.setpoint[:, axis]), where="post", label="setpoint", **SETPOINT)
             if survived.any():
                 low, median, high = np.percentile(angles[survived, :, shown], (5, 50, 95), axis=0)
                 panel.fill_between(time, low, high, color=colour, alpha=0.3, linewidth=0, label="5 to 95 %")
@@ -98,7 +98,7 @@ def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) 
         row[0].legend(fontsize=8, loc="upper right", ncols=2)
         if not survived.all():
             row[1].set_title(f"{int((~survived).sum())} of {len(survived)} lost: not shown", loc="right", fontsize=8)
-    for panel in panels[0]:  # a vehicle that tumbles must not flatten the other curves; room for the legend
+    for panel in panels[0]:  # a tumbling vehicle must not flatten the other curves; leave space for the legend
         low, high = panel.get_ylim()
         low, high = max(low, -LARGEST), min(high, LARGEST)
         panel.set_ylim(low, high + 0.3 * (high - low))
@@ -109,8 +109,8 @@ def envelope_figure(stand: Stand, sample: Sample, results: Results, index: int) 
     return figure
 
 
-def distribution_figure(results: Results, axis: str) -> Figure:
-    """Share of the flights whose figure is at most x, one curve a gain set; lost flights never are."""
+def distribution_figure(results: CampaignResults, axis: str) -> Figure:
+    """Cumulative distribution of each figure, one curve per gain set; lost flights count as infinite."""
     plan, names = results.plan, ("J_M_o", "offaxis_peak_deg", "peak_deg", "effort_rms")
     figure = Figure(figsize=(9, 6), layout="constrained")
     panels: Any = figure.subplots(2, 2, sharey=True)
@@ -125,40 +125,40 @@ def distribution_figure(results: Results, axis: str) -> Figure:
             panel.step(ordered[at], share, where="post", color=colour, linestyle=style, linewidth=1.8, label=gains)
         if name == "J_M_o":
             panel.set_xscale("log")
-        panel.set_xlabel(FIGURES[name])
+        panel.set_xlabel(FIGURE_LABELS[name])
         panel.set_ylim(0, 1.02)
         panel.grid(alpha=0.3, which="both")
     for row in panels:
-        row[0].set_ylabel("share of flights [-]")
+        row[0].set_ylabel("fraction of flights [-]")
     if panels[0, 0].lines:
         panels[0, 0].legend(fontsize=8, loc="lower right")
     figure.suptitle(f"Distributions, {axis}", x=0.02, ha="left")
     return figure
 
 
-def varied(plan: Plan) -> list[str]:
-    """Columns of the results that are drawn, in their order."""
-    variator = Variator(plan.airframe, plan.description.vary, plan.scenarios[0])
-    return [quantity.name for quantity in variator.quantities]
+def varied(plan: CampaignPlan) -> list[str]:
+    """Columns of the results that vary, in the order in which they are drawn."""
+    sampler = RunSampler(plan.airframe, plan.description.vary, plan.scenarios[0])
+    return [quantity.name for quantity in sampler.quantities]
 
 
-def parse_map(plan: Plan, text: str) -> tuple[str, str]:
+def parse_map(plan: CampaignPlan, text: str) -> tuple[str, str]:
     """The two quantities of a survival map, from NAME,NAME.
 
     Raises
     ------
     SitlError
-        When there are not two of those that vary.
+        When these are not two different quantities that vary.
     """
     known = varied(plan)
     first, _, second = text.partition(",")
     if first == second or not {first, second} <= set(known):
-        raise SitlError(f"--map: got {text!r}, expected two of those that vary: {', '.join(known) or 'none'}")
+        raise SitlError(f"--map: got {text!r}, expected two varied quantities: {', '.join(known) or 'none'}")
     return first, second
 
 
-def choose_map(results: Results) -> tuple[str, str] | None:
-    """The two quantities that have most to do with survival, or with J_M,o where all survive, by rank.
+def choose_map(results: CampaignResults) -> tuple[str, str] | None:
+    """The two quantities with the largest rank correlation with survival, or with J_M,o when all survive.
 
     None when fewer than two vary.
     """
@@ -177,15 +177,15 @@ def choose_map(results: Results) -> tuple[str, str] | None:
 
 
 def _correlation(value: NDArray[Any], other: NDArray[Any]) -> float:
-    """Absolute rank correlation of a quantity, also of its distance from its median."""
+    """Absolute rank correlation of a quantity or of its distance from its median, whichever is larger."""
     if np.ptp(value) == 0 or np.ptp(other.astype(float)) == 0:
         return 0.0
     both = (rankdata(value), rankdata(np.abs(value - np.median(value))))
     return max(abs(float(np.corrcoef(one, other)[0, 1])) for one in both)
 
 
-def survival_figure(results: Results, axis: str, names: tuple[str, str]) -> Figure:
-    """Share of the flights that survived, over two varied quantities; one panel a gain set."""
+def survival_figure(results: CampaignResults, axis: str, names: tuple[str, str]) -> Figure:
+    """Fraction of surviving flights over two varied quantities; one panel per gain set."""
     plan = results.plan
     columns = min(len(plan.gains), 3)
     lines = -(-len(plan.gains) // columns)
@@ -194,7 +194,7 @@ def survival_figure(results: Results, axis: str, names: tuple[str, str]) -> Figu
     image: Any = None
     for panel, gains in zip(panels.flat, plan.gains, strict=False):
         x, y, survived = (results.column(name, gains, axis) for name in (*names, "survived"))
-        cells = int(np.clip(np.sqrt(len(x) / A_CELL), 4, CELLS))
+        cells = int(np.clip(np.sqrt(len(x) / FLIGHTS_PER_CELL), 4, CELLS))
         edges = [_edges(x, cells), _edges(y, cells)]
         all_flights, _, _ = np.histogram2d(x, y, edges)
         good, _, _ = np.histogram2d(x[survived], y[survived], edges)
@@ -210,13 +210,13 @@ def survival_figure(results: Results, axis: str, names: tuple[str, str]) -> Figu
         row[0].set_ylabel(label(plan, names[1]))
     for panel in list(panels.flat)[len(plan.gains) :]:
         panel.set_visible(False)
-    figure.colorbar(image, ax=panels, label="share survived [-]  (white: not flown; x: lost)")
+    figure.colorbar(image, ax=panels, label="fraction survived [-]  (white: not flown; x: lost)")
     figure.suptitle(f"Survived, {axis}", x=0.02, ha="left")
     return figure
 
 
 def _edges(value: NDArray[Any], cells: int) -> NDArray[np.float64]:
-    """Cells over a quantity: its own values where they are few."""
+    """Edges of the cells over a quantity; one cell per value when there are few values."""
     few = np.unique(value)
     if len(few) <= CELLS:
         middle = (few[1:] + few[:-1]) / 2
@@ -225,11 +225,11 @@ def _edges(value: NDArray[Any], cells: int) -> NDArray[np.float64]:
     return np.linspace(value.min(), value.max(), cells + 1)
 
 
-def label(plan: Plan, name: str) -> str:
-    """A varied quantity with its unit."""
+def label(plan: CampaignPlan, name: str) -> str:
+    """Label of a varied quantity, with its unit."""
     if name.startswith("fault."):
         _, number, field = name.split(".")
         kind = plan.description.vary.fault[int(number) - 1].kind
         unit = {"size": KINDS[kind].unit, "motor": "-"}.get(field, "s")
         return f"{kind}: {field} [{unit}]"
-    return f"{name} [{next(unit for start, unit in UNITS.items() if name.startswith(start))}]"
+    return f"{name} [{next(unit for start, unit in VARIED_UNITS.items() if name.startswith(start))}]"

@@ -1,0 +1,158 @@
+"""The studies of chapter 6 of the thesis: vehicle, experiment, reference models and doublets of each."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet
+from mimopilot.sitl.studies.benchmarks import TABLES
+from mimopilot.tuning.reference_model import ReferenceModel, second_order
+
+DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, perturbed log"
+MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same with any effort"
+#: s of hover before a doublet; with a mass at one motor the integrators need longer to trim.
+LEAD_S, TRIM_S = 1.0, 6.0
+
+#: Bandwidth (rad/s), damping, delay (samples).
+Model = tuple[float, float, int]
+
+
+@dataclass(frozen=True)
+class AttitudeStudy:
+    """One vehicle, its experiment, reference models and doublets.
+
+    Attributes
+    ----------
+    name, title : str
+    airframe : str
+    inner, outer : (rad/s, damping, delay in samples)
+        Reference models of the rate and the attitude loop.
+    siso_models : (inner, outer)
+        Reference models of SISO.
+    siso_airframe : str
+        Vehicle on whose log SISO is tuned.
+    amplitude_deg, period_s : float
+        Amplitude (deg) and length (s) of the doublet.
+    lead_s : float
+        Hover before the doublet, s.
+    excitation : (float, float, float)
+        PRBS of the experiment: duration per axis (s), amplitude (normalised torque), bandwidth (rad/s).
+    gains_table : (str, mapping)
+        Name of the thesis' table of gains, and its values.
+    costs_table : (str, axis, mapping)
+        The same for the costs J.
+    offaxis : float or None
+        Largest off-axis peak of MIMO over SISO's; None: the axes are not coupled.
+    """
+
+    name: str
+    title: str
+    airframe: str
+    inner: Model
+    outer: Model
+    siso_models: tuple[Model, Model]
+    siso_airframe: str
+    amplitude_deg: float
+    period_s: float
+    lead_s: float
+    excitation: tuple[float, float, float]
+    gains_table: tuple[str, dict[str, Any]]
+    costs_table: tuple[str, str, dict[str, Any]]
+    offaxis: float | None
+
+    def models(self, method: str, Ts: float) -> tuple[ReferenceModel, ReferenceModel]:
+        """Reference models of rate and attitude loop for the costs of a method: those it was tuned for."""
+        inner, outer = self.siso_models if method in (SISO, SISO_OWN) else (self.inner, self.outer)
+        return second_order(*inner, Ts), second_order(*outer, Ts)
+
+    def doublets(self, Ts: float, **lengths: float) -> list[Scenario]:
+        """The roll and the pitch doublet; `lengths` are passed to `doublet`."""
+        height = float(np.radians(self.amplitude_deg))
+        return [doublet(axis, height, self.period_s, Ts, **({"lead": self.lead_s} | lengths)) for axis in AXES]
+
+    def methods(self) -> list[str]:
+        """Names of all methods, in the order of the tables."""
+        own = [SISO_OWN] if self.siso_airframe != self.airframe else []
+        return [DEFAULT, AUTOTUNE, SISO, *own, MIMO, REFINED, BEST, BOUND]
+
+
+def studies() -> dict[str, AttitudeStudy]:
+    """The studies by name. All are from the thesis' tables but adam0-small and coupled."""
+    printed = json.loads(TABLES.read_text())
+
+    def model(entry: dict[str, Any]) -> Model:
+        return float(entry["omega"]), float(entry["zeta"]), int(entry["delay"])
+
+    def made(
+        name: str, title: str, airframe: str, key: str, gains: str, costs: str, offaxis: float | None, **changes: Any
+    ) -> AttitudeStudy:
+        part = printed[key]
+        models = part.get("reference_models", {"MIMO": part, "SISO": part})
+        inner, outer = (model(models["MIMO"][loop]) for loop in ("inner", "outer"))
+        siso_inner, siso_outer = (model(models["SISO"][loop]) for loop in ("inner", "outer"))
+        prbs = part.get("prbs", printed["adam0_simulation"]["prbs"])
+        task = part["doublet"]
+        number, _, axis = costs.partition(" ")
+        entry = {
+            "name": name,
+            "title": title,
+            "airframe": airframe,
+            "inner": inner,
+            "outer": outer,
+            "siso_models": (siso_inner, siso_outer),
+            "siso_airframe": airframe,
+            "amplitude_deg": float(task["amplitude_deg"]),
+            "period_s": task["period_s"],
+            "lead_s": LEAD_S,
+            "excitation": (float(prbs["seconds_per_axis"]), float(prbs["amplitude"]), float(prbs["bandwidth_rad_s"])),
+            "gains_table": (f"Table {gains}", part[f"table_{gains.replace('.', '_')}"] if gains else {}),
+            "costs_table": (
+                f"Table {number}",
+                axis,
+                part[f"table_{number.replace('.', '_')}_{axis}"] if costs else {},
+            ),
+            "offaxis": offaxis,
+        }
+        return AttitudeStudy(**(entry | changes))
+
+    simulation = made("adam0-sim", "ADAM-0, 10 % coupling", "adam0", "adam0_simulation", "5.4", "", 1 / 3)
+    return {
+        study.name: study
+        for study in (
+            simulation,
+            made("adam0", "ADAM-0, nominal", "adam0_nominal", "adam0_flight_nominal", "6.2", "6.3 roll", None),
+            made(
+                "adam0-perturbed",
+                "ADAM-0, 160 g at motor 3",
+                "adam0_perturbed",
+                "adam0_flight_perturbed",
+                "6.4",
+                "6.5 pitch",
+                1 / 3,
+                siso_airframe="adam0_nominal",
+                lead_s=TRIM_S,
+            ),
+            # The thesis does not print the length of ANT-R's doublet.
+            made("antr", "ANT-R", "antr", "antr_flight", "6.7", "6.8 roll", None, period_s=0.4),
+            replace(
+                simulation,
+                name="adam0-small",
+                title="ADAM-0, 10 % coupling, small doublet",
+                amplitude_deg=8.0,  # no motor saturates: the vehicle is linear
+                gains_table=("", {}),
+            ),
+            replace(
+                simulation,
+                name="coupled",
+                title="ADAM-0 with a boom, 40 % coupling",
+                airframe="adam0_boom",
+                siso_airframe="adam0_boom",
+                amplitude_deg=15.0,  # at 22.5 the motors saturate
+                gains_table=("", {}),
+                offaxis=1 / 5,
+            ),
+        )
+    }

@@ -1,0 +1,44 @@
+"""The fault table as printed by `mimopilot faults`."""
+
+from __future__ import annotations
+
+from mimopilot.sitl.studies.fault_table import FaultTable, FaultTableRow
+
+from mimopilot.common.console import print_table
+
+COLUMNS = (
+    *("fault", "gains", "survived", "95 %", "peak [deg]", "worst", "RMS", "recovered [s]"),
+    *("saturated", "detected [s]", "non-finite"),
+)
+
+
+def print_fault_table(table: FaultTable) -> None:
+    """Print the table, the flights without faults, and the commands that repeat the worst flights."""
+    print_table(table.title, COLUMNS, [_cells(row) for row in table.rows])
+    for name, lost in table.lost_without.items():
+        runs = next(row.runs for row in table.rows if row.gains == name)
+        print(f"without faults, {name}: {lost} of {runs} lost, {table.alarms_without[name]} with a false alarm")
+    print("commands to repeat the worst flights:")
+    for row in table.rows:
+        print(f"  {row.replay}")
+
+
+def _cells(row: FaultTableRow) -> list[str]:
+    low, high = row.survival_interval
+
+    def some(value: float | None, count: int) -> str:
+        return "-" if value is None else f"{value:.3f}" + ("" if count == row.runs else f" ({count})")
+
+    return [
+        row.fault,
+        row.gains,
+        f"{row.survived}/{row.runs}",
+        f"{low:.2f}-{high:.2f}",
+        f"{row.peak_deg:.2f}",
+        f"{row.worst_peak_deg:.2f}",
+        f"{row.rms_deg:.2f}",
+        some(row.recovery_s, row.recovered),
+        f"{row.saturated:g}",
+        some(row.detected_s, row.detected) + f" {row.detected_by}".rstrip(),
+        str(row.nonfinite),
+    ]

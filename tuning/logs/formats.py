@@ -1,0 +1,101 @@
+"""The log formats that can be read, one row each. A new format is one module with a reader, and one row here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+#: Bytes at the beginning of a file from which its format is told: enough for the header line of a CSV file.
+HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class LogFormat:
+    """One log format.
+
+    Attributes
+    ----------
+    name : str
+        As in messages, in the help text and in the README.
+    suffixes : tuple of str
+        Usual endings of file names. The content decides, not the name.
+    matches : callable
+        Whether the first `HEAD_BYTES` bytes of a file are of this format.
+    reader : str
+        ``module:function`` that returns a `tuning.logs.recording.Recording`; imported when first used.
+    takes_columns : bool
+        Whether the user gives the names of the columns: the reader takes a path and `Columns`, else a path only.
+    source : str
+        Where the format is described.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    matches: Callable[[bytes], bool]
+    reader: str
+    takes_columns: bool
+    source: str
+
+
+def _begins_with(magic: bytes) -> Callable[[bytes], bool]:
+    def matches(head: bytes) -> bool:
+        return head.startswith(magic)
+
+    return matches
+
+
+def _is_delimited_text(head: bytes) -> bool:
+    """Whether the first line of a text has more than one cell."""
+    return b"\0" not in head and any(mark in head.partition(b"\n")[0] for mark in (b",", b";", b"\t"))
+
+
+#: The first row that matches reads the file.
+FORMATS = (
+    LogFormat(
+        "PX4 ULog",
+        (".ulg",),
+        _begins_with(b"ULog\x01\x12\x35"),
+        "mimopilot.tuning.logs.ulog:record_ulog",
+        False,
+        "docs.px4.io/main/en/dev_log/ulog_file_format",
+    ),
+    LogFormat(
+        "ArduPilot dataflash",
+        (".bin",),
+        _begins_with(b"\xa3\x95"),
+        "mimopilot.tuning.logs.dataflash:record_dataflash",
+        False,
+        "ArduPilot, libraries/AP_Logger/LogStructure.h",
+    ),
+    LogFormat(
+        "MATLAB",
+        (".mat",),
+        _begins_with(b"MATLAB 5.0 MAT-file"),
+        "mimopilot.tuning.logs.tables:record_matlab",
+        True,
+        "MathWorks, MAT-File Format (R2019b), level 5: versions 5 to 7",
+    ),
+    LogFormat(
+        "CSV",
+        (".csv",),
+        _is_delimited_text,
+        "mimopilot.tuning.logs.tables:record_csv",
+        True,
+        "RFC 4180; semicolons and tabs may separate the cells, too",
+    ),
+)
+
+#: Beginnings of files that are recognised but not read -> what to do instead.
+UNSUPPORTED = {
+    b"MATLAB 7.3 MAT-file": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
+    b"\x89HDF\r\n\x1a\n": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
+    b"FMT,": "an ArduPilot log as text; give the .bin file that it was made from",
+    b"H Product:Blackbox": "a Betaflight log; make a CSV file with blackbox_decode and name its columns with --columns",
+}
+
+SUFFIXES = tuple(suffix for row in FORMATS for suffix in row.suffixes)
+
+
+def known_formats() -> str:
+    """All formats with their file endings, for messages and help texts."""
+    return ", ".join(f"{row.name} ({', '.join(row.suffixes)})" for row in FORMATS)
