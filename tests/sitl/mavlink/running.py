@@ -22,7 +22,7 @@ WAITS = {
 }
 _PATCHES = "".join(f"import {module}; {module}.{name} = {value}; " for (module, name), value in WAITS.items())
 #: The command line with these waits.
-QUICK = (sys.executable, "-c", f"{_PATCHES}import mimopilot; mimopilot.main()")
+QUICK = (sys.executable, "-c", f"{_PATCHES}from mimopilot.cli.main import main; main()")
 
 
 def free_port(kind=socket.SOCK_STREAM):
