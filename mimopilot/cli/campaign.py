@@ -1,4 +1,4 @@
-"""The commands of campaigns."""
+"""Commands of campaigns."""
 
 from __future__ import annotations
 
@@ -7,19 +7,23 @@ from typing import Annotated, Any
 
 import typer
 
-from mimopilot.cli.bench import (
+from mimopilot.cli.options import (
     AirframeArgument,
     AmplitudeOption,
     FaultOption,
     JsonOption,
+    LogOutOption,
     PeriodOption,
+    ScenarioOption,
     SeedOption,
     TailOption,
+    WorkersOption,
 )
+from mimopilot.common.console import json_text, print_json, print_table
 
 
 def register(app: typer.Typer) -> None:
-    """Add the campaigns' commands to the front door."""
+    """Add these commands to the command line."""
     app.command(
         epilog="Example: mimopilot campaign adam0 --gains siso.gains.toml mimo.gains.toml --runs 10000 "
         "--vary vary.toml --out campaign"
@@ -29,21 +33,23 @@ def register(app: typer.Typer) -> None:
 
 def campaign(
     airframe: AirframeArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the results; holds what is done when it is interrupted.")],
+    out: Annotated[Path, typer.Option(help="Folder for the results; what is done is kept when it is interrupted.")],
     more_gains: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
     gains: Annotated[
         list[Path] | None, typer.Option(help="Gains files: --gains FILE [FILE...]; by default the airframe's own.")
     ] = None,
-    runs: Annotated[int, typer.Option(min=1, help="How many; each is flown with every gain set on every axis.")] = 1000,
+    runs: Annotated[
+        int, typer.Option(min=1, help="Number of runs; each is flown with every gain set on every axis.")
+    ] = 1000,
     vary: Annotated[Path | None, typer.Option(help="What varies (TOML), see README; by default the noise.")] = None,
-    scenario: Annotated[str, typer.Option(help="doublet, step, hover, or a scenario file (TOML).")] = "doublet",
+    scenario: ScenarioOption = "doublet",
     axis: Annotated[str | None, typer.Option(help="roll, pitch or both.", show_default="both")] = None,
     amplitude_deg: AmplitudeOption = None,
     period_s: PeriodOption = None,
     tail_s: TailOption = None,
     fault: FaultOption = None,
     seed: SeedOption = 0,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
+    workers: WorkersOption = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a dask scheduler, tcp://HOST:PORT: its workers fly instead.")
     ] = None,
@@ -52,8 +58,7 @@ def campaign(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fly a vehicle that varies, thousands of times, and say with which gains it survives and how well it follows."""
-    from mimopilot.common.console import json_text, print_json, print_table
+    """Fly a vehicle that varies, thousands of times: with which gains it survives, and how well it follows."""
     from mimopilot.common.files import inside, write_atomically
     from mimopilot.common.parallel import cores
     from mimopilot.sitl.campaign.campaign_figures import parse_map
@@ -91,7 +96,7 @@ def campaign(
         return
     print(INTERVALS)
     if summary.rejected:
-        print(f"{summary.rejected} draws of no vehicle that flies were drawn again")
+        print(f"{summary.rejected} impossible draws were repeated")
     print_table("Survived", SURVIVAL_COLUMNS, survival_rows(summary))
     print_table("Figures", FIGURE_COLUMNS, figure_rows(summary))
     print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))
@@ -102,13 +107,12 @@ def _task(scenario: str, axis: str | None, sizes: dict[str, float | None], fault
     """Entries of the plan from the options that say what is flown."""
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.faults.kinds import parse_fault
-    from mimopilot.sitl.flight.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, TAIL_S, read_scenario
+    from mimopilot.sitl.flight.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, TAIL_S, check_not_in_file, read_scenario
 
     named = [str(parse_fault(text)) for text in faults or ()]
-    given = {name: value for name, value in sizes.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in sizes.items() if value is not None}
     if scenario.endswith(".toml"):
-        if axis or given:
-            raise SitlError(f"--axis, --amplitude-deg, --period-s, --tail-s: {scenario} says them; change them there")
+        check_not_in_file(scenario, axis=axis, **sizes)
         task, own = read_scenario(Path(scenario))
         given = {name: getattr(task, name) for name in sizes}
         scenario, axis, named = task.manoeuvre, task.axis, [*map(str, own), *named]
@@ -124,11 +128,10 @@ def replay(
     run: Annotated[int, typer.Option(min=0, help="Which run.")],
     gains: Annotated[str | None, typer.Option(help="Name of the gain set; by default the first.")] = None,
     axis: Annotated[str | None, typer.Option(help="roll or pitch; by default the first.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")] = None,
+    out: LogOutOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fly one run of a campaign again: the same flight, bit for bit. Exit code 1: it is another one here."""
-    from mimopilot.common.console import print_json, print_table
+    """Fly one run of a campaign again: the same flight, bit for bit. Exit code 1: it differs on this machine."""
     from mimopilot.sitl.campaign.replay import replay_flight
     from mimopilot.sitl.flight.flight_log import save_flight
     from mimopilot.sitl.flight.metrics import FIGURE_LABELS
@@ -139,12 +142,13 @@ def replay(
     if as_json:
         print_json(again.row)
     else:
-        rows = [[FIGURE_LABELS.get(name, name), _shown(value)] for name, value in again.row.items()]
+        rows = [[FIGURE_LABELS.get(name, name), _text(value)] for name, value in again.row.items()]
         print_table(f"{again.plan.airframe.name}, run {run} of {folder}", ["figure", "value"], rows)
     again.compare()
 
 
-def _shown(value: Any) -> str:
+def _text(value: object) -> str:
+    """A figure in a table; not a number: none."""
     if isinstance(value, float):
         return "-" if value != value else f"{value:.5g}"
     return str(value)

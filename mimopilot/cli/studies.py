@@ -1,4 +1,4 @@
-"""The commands that use every room."""
+"""Commands of whole experiments: demo, table of faults, reproduction of the thesis."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from mimopilot.cli.bench import AirframeArgument, AxisOption, FaultOption, JsonOption, SeedOption
+from mimopilot.cli.options import AirframeArgument, AxisOption, FaultOption, JsonOption, SeedOption, WorkersOption
 
 
 class Study(StrEnum):
@@ -26,7 +26,7 @@ class Study(StrEnum):
 
 
 def register(app: typer.Typer) -> None:
-    """Add the studies' commands to the front door."""
+    """Add these commands to the command line."""
     app.command(epilog="Example: mimopilot demo --out demo --seed 0")(demo)
     app.command(epilog="Example: mimopilot faults adam0 --gains siso.gains.toml --gains mimo.gains.toml --runs 50")(
         faults
@@ -36,8 +36,8 @@ def register(app: typer.Typer) -> None:
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the log, the gains, the C++ and the report.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    seed: SeedOption = 0,
+    as_json: JsonOption = False,
 ) -> None:
     """The whole way, once: excitation flight, tuning, generated C++, doublets, report."""
     from mimopilot.common.console import print_json
@@ -69,7 +69,7 @@ def faults(
     amplitude_deg: Annotated[float, typer.Option(help="Of the doublet, degrees.")] = 15.0,
     period_s: Annotated[float, typer.Option(help="Length of the whole doublet, s.")] = 0.42,
     seed: SeedOption = 0,
-    workers: Annotated[int | None, typer.Option(min=1, max=1024, help="Processes; by default all cores.")] = None,
+    workers: WorkersOption = None,
     kinds: Annotated[
         bool, typer.Option("--kinds", callback=_print_kinds, is_eager=True, help="List all kinds of faults and end.")
     ] = False,
@@ -100,8 +100,8 @@ def reproduce(
     seeds: Annotated[
         int | None, typer.Option(min=1, help="Experiments of each vehicle, with other noise; 50 by default.")
     ] = None,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; by default one a core.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    workers: WorkersOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Compute the thesis' tables and figures again, beside its own figures."""
     from mimopilot.common.console import print_json

@@ -1,4 +1,4 @@
-"""The commands that speak with a vehicle's parameters."""
+"""Commands on a vehicle's parameters."""
 
 from __future__ import annotations
 
@@ -8,34 +8,38 @@ from typing import Annotated
 
 import typer
 
+from mimopilot.cli.options import (
+    GainsArgument,
+    JsonOption,
+    KeyOption,
+    SystemOption,
+    TimeoutOption,
+    UncertifiedOption,
+    YesOption,
+    warn,
+)
+
 ConnectOption = Annotated[
     str, typer.Option("--connect", help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyACM0,57600.")
 ]
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only read and compare.")]
-YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 ForceArmedOption = Annotated[
     bool, typer.Option("--force-armed", help="Write even to a vehicle that is or becomes armed.")
-]
-TimeoutOption = Annotated[
-    float, typer.Option(min=0.5, max=600, help="Silence after which the vehicle counts as gone, s.")
 ]
 SnapshotOption = Annotated[
     Path | None, typer.Option(help="Where the old values go; by default a new file beside the other one.")
 ]
-KeyOption = Annotated[Path | None, typer.Option(help="Sign with this key: 32 bytes or 64 hexadecimal digits.")]
-SystemOption = Annotated[int, typer.Option(min=0, max=255, help="The vehicle's system number; 0: the one there is.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def register(app: typer.Typer) -> None:
-    """Add these commands to the front door."""
+    """Add these commands to the command line."""
     app.command(epilog="Example: mimopilot upload my.gains.toml --connect udpin:127.0.0.1:14550")(upload)
     app.command(epilog="Example: mimopilot restore my.before-1.params --connect /dev/ttyACM0,57600")(restore)
     app.command(epilog="Example: mimopilot params my.gains.toml --format qgc --out my.params")(params)
 
 
 def upload(
-    gains: Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")],
+    gains: GainsArgument,
     connect: ConnectOption,
     profile: Annotated[
         str, typer.Option(help="mimo: our module. px4-stock, ardupilot-stock: the diagonal, in their controllers.")
@@ -50,9 +54,7 @@ def upload(
     dry_run: DryRunOption = False,
     yes: YesOption = False,
     force_armed: ForceArmedOption = False,
-    uncertified: Annotated[
-        bool, typer.Option("--uncertified", help="Upload gains whose stability is in doubt.")
-    ] = False,
+    uncertified: UncertifiedOption = False,
     drop_off_diagonals: Annotated[
         bool, typer.Option("--drop-off-diagonals", help="Stock profiles: drop off-diagonals of any size.")
     ] = False,
@@ -64,14 +66,12 @@ def upload(
 ) -> None:
     """Put gains on a vehicle: all of them, each read back, or the old ones again.
 
-    Nothing is written to an armed vehicle, nor under a HEARTBEAT older than 1.5 s: a late one is asked for. After the
-    vehicle has stored its values, 2.5 s after the last write, and after another HEARTBEAT, all of them are read once
-    more. Whatever goes wrong until then (Ctrl-C, a vehicle that arms, a value that it refuses, changes or contradicts,
-    a second vehicle with its system number) puts the old values back, the one thing that is also written to an armed
-    vehicle, and ends in exit code 1; where the link is lost, what may be left is told name by name.
+    Nothing is written to an armed vehicle, or after a HEARTBEAT older than 1.5 s: a new one is requested. Once the
+    vehicle has stored its values, 2.5 s after the last write and after another HEARTBEAT, all of them are read again.
+    After any failure until then (Ctrl-C, arming, a value refused, changed or contradicted, a second vehicle with the
+    same system number) the old values are restored, also on an armed vehicle, and the exit code is 1. If the link is
+    lost, every parameter that may hold a new value is listed.
     """
-    import sys
-
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
     from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, upload_with_dialogue
@@ -79,14 +79,22 @@ def upload(
     from mimopilot.tuning.gains_file import load_gains
 
     loaded = load_gains(gains)
-    warning = check_verdict(loaded, allow=uncertified)
-    if warning:
-        print(f"mimopilot: warning: {gains}: {warning}", file=sys.stderr)
+    doubt = check_verdict(loaded, allow=uncertified)
+    warn(gains, [doubt] if doubt else [])
     plan = make_plan(loaded, profile, drop_off_diagonals)
     scale = parse_scale(moment_scale)
     stem = gains.name.removesuffix(".toml").removesuffix(".gains")
     options = LinkOptions(
-        connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, gains.with_name(stem)
+        connect,
+        system,
+        timeout,
+        signing_key,
+        force_armed=force_armed,
+        dry_run=dry_run,
+        yes=yes,
+        as_json=as_json,
+        snapshot=snapshot,
+        stem=gains.with_name(stem),
     )
     upload_with_dialogue(plan, options, loaded, scale)
 
@@ -116,7 +124,18 @@ def restore(
     stem = parameters.with_name(
         re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
     )  # a snapshot's next one is its sister
-    options = LinkOptions(connect, system, timeout, signing_key, force_armed, dry_run, yes, as_json, snapshot, stem)
+    options = LinkOptions(
+        connect,
+        system,
+        timeout,
+        signing_key,
+        force_armed=force_armed,
+        dry_run=dry_run,
+        yes=yes,
+        as_json=as_json,
+        snapshot=snapshot,
+        stem=stem,
+    )
     upload_with_dialogue(plan, options)
 
 
@@ -127,9 +146,7 @@ def params(
         str, typer.Option("--format", help="qgc, mavproxy, missionplanner; for a gains file also c-header, px4-yaml.")
     ] = "qgc",
     out: Annotated[Path | None, typer.Option(help="File to write; by default standard output.")] = None,
-    uncertified: Annotated[
-        bool, typer.Option("--uncertified", help="Write gains whose stability is in doubt.")
-    ] = False,
+    uncertified: UncertifiedOption = False,
     timeout: TimeoutOption = 12.0,
     signing_key: KeyOption = None,
     system: SystemOption = 0,

@@ -235,6 +235,19 @@ def excitation_flight(
     return Scenario("experiment", Ts, np.zeros_like(excitation), excitation, 0, (0, len(excitation)))
 
 
+def check_not_in_file(file: str, **options: object) -> None:
+    """Refuse options that a scenario file defines; None: not given.
+
+    Raises
+    ------
+    SitlError
+        Naming those that were given.
+    """
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
+    if given:
+        raise SitlError(f"{', '.join(given)}: defined in {file}; change it there")
+
+
 def scenario_of(
     name: str,
     axis: str | None,
@@ -262,11 +275,8 @@ def scenario_of(
     SitlError
         When something of a file is given here, too, or a value is out of its range.
     """
-    given = {"axis": axis, "amplitude-deg": amplitude_deg, "period-s": period_s, "tail-s": tail_s}
     if name.endswith(".toml"):
-        doubled = [f"--{option}" for option, value in given.items() if value is not None]
-        if doubled:
-            raise SitlError(f"{', '.join(doubled)}: defined in {name}; change it there")
+        check_not_in_file(name, axis=axis, amplitude_deg=amplitude_deg, period_s=period_s, tail_s=tail_s)
         task = load_scenario(Path(name), Ts)
     else:
         amplitude = AMPLITUDE_DEG if amplitude_deg is None else amplitude_deg
