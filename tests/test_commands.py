@@ -13,6 +13,7 @@ import pytest
 from mimopilot.sitl.physics.airframe import FOLDER
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.ulog_file import open_ulog
+from mimopilot.tuning.reference_model import SecondOrder
 from pyulog import ULog
 
 from tests.conftest import assert_one_clear_line
@@ -114,11 +115,11 @@ def test_models_window_and_specification_are_taken(mimopilot, log, tmp_path):
         "tune", log, "--spec", "spec.toml", "--outer", "8,0.9,2", "--window", "40", "--out", "x.gains.toml"
     )
     assert result.returncode == 0, result.stderr
-    text = (tmp_path / "x.gains.toml").read_text()
-    assert "inner_model = [[25.0, 0.5, 1], [20.0, 0.4, 0]]" in text
-    assert "outer_model = [[8.0, 0.9, 2], [8.0, 0.9, 2]]" in text
-    assert "window = [40, 40]" in text
-    assert "derivative_cutoff_hz = 0.0" in text
+    gains = load_gains(tmp_path / "x.gains.toml")
+    assert gains.provenance.inner_model == (SecondOrder(25.0, 0.5, 1), SecondOrder(20.0, 0.4, 0))
+    assert gains.provenance.outer_model == (SecondOrder(8.0, 0.9, 2),) * 2
+    assert gains.provenance.details["window"] == [40, 40]
+    assert gains.derivative_cutoff_hz == 0.0
 
 
 @pytest.mark.parametrize(

@@ -270,7 +270,7 @@ def sitl(
         str, typer.Option(help="Local address of both; 0.0.0.0: all, and anybody on the network commands the vehicle.")
     ] = "127.0.0.1",
     signing_key: Annotated[
-        Path | None, typer.Option(help="Sign with this key (32 bytes or 64 hexadecimal digits); ignore what is unsigned.")
+        Path | None, typer.Option(help="Sign with this key (32 bytes or 64 hexadecimal digits), refuse unsigned frames.")
     ] = None,
     parameters: Annotated[
         Path | None,
