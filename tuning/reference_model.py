@@ -135,7 +135,8 @@ class SecondOrder:
                 f"reference model: got omega {self.omega} rad/s, damping {self.zeta}, delay {self.delay}; expected "
                 "omega and damping above 0, and a delay of whole samples"
             )
-        object.__setattr__(self, "delay", int(self.delay))
+        for name, kind in (("omega", float), ("zeta", float), ("delay", int)):
+            object.__setattr__(self, name, kind(getattr(self, name)))
 
     @property
     def bandwidth(self) -> float:

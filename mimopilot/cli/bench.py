@@ -270,7 +270,8 @@ def sitl(
         str, typer.Option(help="Local address of both; 0.0.0.0: all, and anybody on the network commands the vehicle.")
     ] = "127.0.0.1",
     signing_key: Annotated[
-        Path | None, typer.Option(help="Sign with this key (32 bytes or 64 hexadecimal digits), refuse unsigned frames.")
+        Path | None,
+        typer.Option(help="Sign with this key (32 bytes or 64 hexadecimal digits), reject unsigned frames."),
     ] = None,
     parameters: Annotated[
         Path | None,
