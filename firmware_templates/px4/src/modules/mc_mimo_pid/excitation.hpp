@@ -40,9 +40,9 @@ struct ExcitationConditions {
 	float sticks[4];        // -1 to 1; all 0 without a remote control
 };
 
-// An axis chosen after 0 requests one run. It starts when the vehicle is ready. It stops early if the vehicle is no longer
-// ready, tilts too far, or a stick moves. An axis already set at the first configure(), such as a parameter left from
-// an earlier flight, requests nothing.
+// An axis chosen after 0 requests one run. It starts when the vehicle is ready. It stops early if the vehicle is no
+// longer ready, tilts too far, or a stick moves. An axis already set at the first configure(), such as a parameter left
+// from an earlier flight, requests nothing.
 class Excitation
 {
 public:
