@@ -1,7 +1,7 @@
-"""The memory layout of the controller's structures, as NumPy sees them.
+"""Memory layout of the controller's structures, as NumPy types.
 
-`GAINS` comes from the parameter table, the others mirror ``core/mimo_pid.hpp``; `codegen.native` checks sizes, offsets
-and the interface hash when a library is loaded.
+`GAINS` comes from the parameter table, the others mirror ``core/mimo_pid.hpp``. `codegen.native` checks sizes, offsets
+and the interface hash when it loads a library.
 """
 
 from __future__ import annotations
@@ -52,24 +52,24 @@ STATE = np.dtype(
 
 
 def to_array(gains: Gains) -> NDArray[np.float32]:
-    """The float32 array that ``mimopilot::Gains`` is in memory, (len(PARAMETERS),)."""
+    """``mimopilot::Gains`` in memory, (len(PARAMETERS),) float32."""
     values = gains.elements()
     return np.array([values[parameter.code] for parameter in PARAMETERS], dtype=np.float32)
 
 
 def offset(row: Row) -> int:
-    """Where a row of the parameter table begins in ``mimopilot::Gains``, bytes."""
+    """Offset of a row of the parameter table in ``mimopilot::Gains``, bytes."""
     before = ROWS[: ROWS.index(row)]
     return GAINS.base.itemsize * sum(len(one.codes) for one in before)
 
 
 def gains_array(gains: Gains | NDArray[np.float32]) -> NDArray[np.float32]:
-    """Gains as the controller takes them, (len(PARAMETERS),) float32.
+    """Gains in the layout of the controller, (len(PARAMETERS),) float32.
 
     Raises
     ------
     CodegenError
-        When an array is of another shape or type.
+        If an array has another shape or type.
     """
     array = gains if isinstance(gains, np.ndarray) else to_array(gains)
     if array.shape != GAINS.shape or array.dtype != np.float32:
@@ -78,12 +78,12 @@ def gains_array(gains: Gains | NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def input_rows(inputs: NDArray[Any]) -> NDArray[Any]:
-    """Rows of `INPUT`, (N,), one after another in memory.
+    """Rows of `INPUT`, (N,), contiguous in memory.
 
     Raises
     ------
     CodegenError
-        When the array is of another shape or type.
+        If the array has another shape or type.
     """
     if inputs.dtype != INPUT or inputs.ndim != 1:
         raise CodegenError(f"inputs: got {inputs.dtype} {inputs.shape}, expected (N,) of codegen.layout.INPUT")

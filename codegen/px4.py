@@ -1,4 +1,4 @@
-"""What PX4 wants to know of every parameter: the entries of a module.yaml."""
+"""The parameters of PX4's module.yaml."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from mimopilot.tuning.parameters import (
     Setting,
 )
 
-#: Our unit -> PX4's; one that is not here is in none of PX4's lists.
+#: Our unit -> PX4's; PX4 does not list our other units.
 _UNITS = {"1/s": "1/s", "s": "s", "rad": "rad", "rad/s": "rad/s", "norm": "norm", "N m": "Nm"}
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One parameter of a module.yaml; numbers are the text that stands there."""
+class YamlEntry:
+    """One parameter of a module.yaml; numbers as the text in the file."""
 
     name: str
     type: str
@@ -37,7 +37,7 @@ class Entry:
 
 
 def yaml_number(value: float) -> str:
-    """Shortest text that YAML reads as a float, and that reads back to float32(value).
+    """Shortest text that YAML reads as a float and that reads back as float32(value).
 
     Examples
     --------
@@ -48,11 +48,11 @@ def yaml_number(value: float) -> str:
     return f"{mantissa if '.' in mantissa else f'{mantissa}.0'}{exponent}{power}"
 
 
-def entries(gains: Gains) -> list[Entry]:
-    """Every parameter of the module, its default from `gains`.
+def entries(gains: Gains) -> list[YamlEntry]:
+    """Every parameter of the module, with its default from `gains`.
 
-    The unit of moment is published where the gains say it. A parameter that is fixed in the firmware has a
-    range of one value.
+    The unit of torque is published if the gains have it. A parameter that is fixed in the firmware has a range of
+    one value.
     """
     values = gains.elements()
     scales = gains.identity()
@@ -63,23 +63,23 @@ def entries(gains: Gains) -> list[Entry]:
     ]
 
 
-def _of_parameter(parameter: Parameter, value: float) -> Entry:
-    fixed = "" if parameter.writable else " Fixed in the firmware: published to be checked."
+def _of_parameter(parameter: Parameter, value: float) -> YamlEntry:
+    fixed = "" if parameter.writable else " Fixed in the firmware, for checking only."
     low, high = (parameter.minimum, parameter.maximum) if parameter.writable else (value, value)
     return _entry(parameter, value, low, high, False, fixed)
 
 
-def _of_setting(setting: Setting) -> Entry:
+def _of_setting(setting: Setting) -> YamlEntry:
     return _entry(setting, setting.default, setting.minimum, setting.maximum, setting.integer, "")
 
 
-def _entry(source: Parameter | Setting, default: float, low: float, high: float, integer: bool, more: str) -> Entry:
+def _entry(source: Parameter | Setting, default: float, low: float, high: float, integer: bool, note: str) -> YamlEntry:
     def text(value: float) -> str:
         return str(int(value)) if integer else yaml_number(value)
 
-    digits = min(max(3 - math.floor(math.log10(high)), 2), 4)  # steps of about a ten-thousandth of the range
+    digits = min(max(3 - math.floor(math.log10(high)), 2), 4)  # a step is about a ten-thousandth of the range
     unit = f" In {source.unit}." if source.unit else ""
-    return Entry(
+    return YamlEntry(
         name=source.name,
         type="int32" if integer else "float",
         unit=_UNITS.get(source.unit, ""),
@@ -89,5 +89,5 @@ def _entry(source: Parameter | Setting, default: float, low: float, high: float,
         decimal=digits + 1,
         increment=yaml_number(10.0**-digits),
         short=source.description,
-        long=f"{source.description}.{unit}{more}",
+        long=f"{source.description}.{unit}{note}",
     )

@@ -1,4 +1,4 @@
-"""Rendering the template tree: output trees look like ``firmware_templates/``."""
+"""Rendering the templates: an output tree has the layout of ``firmware_templates/``."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, Row, Shape
 
 from mimopilot.common.files import inside, read_text, sha256, write_atomically
 
-#: What defines the C interface, beside the parameter table.
+#: These and the parameter table define the C interface.
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
 MANIFEST = "manifest.json"
 MANIFEST_SCHEMA = 1
 
 
 def generator_version() -> str:
-    """Version of mimopilot that stands in generated files."""
+    """Version of mimopilot for generated files."""
     try:
         return version("mimopilot")
     except PackageNotFoundError:
@@ -41,35 +41,35 @@ def generator_version() -> str:
 
 
 def interface_hash() -> int:
-    """First 32 bits of the SHA-256 of what defines the C interface: two headers and the members of the gains."""
+    """First 32 bits of the SHA-256 of the C interface: two headers and the members of the gains."""
     members = "".join(f"{row.member}{row.dimensions};" for row in ROWS).encode()
     digest = hashlib.sha256(b"".join((TEMPLATES / name).read_bytes() for name in INTERFACE) + members)
     return int.from_bytes(digest.digest()[:4], "big")
 
 
 def render(gains: Gains, target: str = "native", **options: str) -> dict[str, str]:
-    """Every file of an output tree, by its path in that tree; the same gains give the same bytes.
+    """Render every file of an output tree; the same gains give the same bytes.
 
     Parameters
     ----------
     gains : Gains
-        What to emit.
+        The gains to emit.
     target : str
-        Name of a target, see `codegen.targets`.
+        Name of a target; see `codegen.targets`.
     **options : str
         Options of the target, such as ``px4_api``.
 
     Returns
     -------
     dict
-        Relative path (with ``/``) -> content, the manifest included.
+        Relative path (with ``/``) -> content, including the manifest.
 
     Raises
     ------
     CodegenError
-        When the target or the value of an option is unknown.
+        If the target or an option's value is unknown.
     TuningError
-        When a gain is out of its parameter's range.
+        If a gain is out of its parameter's range.
     """
     kind = find_target(target)
     chosen = kind.chosen(options)
@@ -135,7 +135,7 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
 
 
 def _validity() -> Iterator[str]:
-    """C++ conditions of `tuning.parameters.Valid`, for every element that has one."""
+    """C++ conditions of `tuning.parameters.Valid`, for every element with a bound."""
     for row in ROWS:
         for i, _ in enumerate(row.codes):
             member = f"gains.{row.member}" + (f"[{i}]" if row.shape is Shape.AXES else "")
@@ -159,29 +159,29 @@ def _manifest(files: dict[str, str], gains: Gains, target: str) -> str:
 
 
 def write_tree(files: dict[str, str], folder: Path, force: bool = False) -> list[str]:
-    """Write a rendered tree: changed files only, each atomically; nothing is ever deleted.
+    """Write a rendered tree: only changed files, each atomically. Never deletes a file.
 
     Parameters
     ----------
     files : dict
-        What `render` returned.
+        Result of `render`.
     folder : Path
-        The root of the tree; created when it is missing.
+        Root of the tree; created if missing.
     force : bool
-        Write even into a folder, or over a file, that mimopilot did not make.
+        Also write into a folder, or over a file, that mimopilot did not generate.
 
     Returns
     -------
     list of str
-        The paths that were written.
+        Paths of the written files.
 
     Raises
     ------
     OSError
-        When `folder` is no folder, or a link lies below it where a file or folder of the tree belongs.
+        If `folder` is not a folder, or a link is in the place of a file or folder of the tree.
     CodegenError
-        When a file's place is taken or cannot be written, or, without `force`, something that mimopilot did not
-        generate is there. In all cases nothing has been written.
+        If a file's place is taken or not writable, or, without `force`, holds something that mimopilot did not
+        generate. In all cases nothing has been written.
     """
     paths = [inside(folder, name) for name in files]
     if not force:
@@ -192,15 +192,15 @@ def write_tree(files: dict[str, str], folder: Path, force: bool = False) -> list
             raise CodegenError(f"{path}: is {kind}, expected a file or nothing; give --out another folder")
         parent = next(parent for parent in path.parents if parent.exists())
         if not parent.is_dir() or not os.access(parent, os.W_OK | os.X_OK):
-            raise CodegenError(f"{parent}: cannot be written to; give --out a folder that can")
+            raise CodegenError(f"{parent}: cannot be written to; give --out a writable folder")
     return [name for path, (name, content) in zip(paths, files.items(), strict=True) if write_atomically(path, content)]
 
 
 def _check_ours(files: dict[str, str], folder: Path) -> None:
-    """Refuse a folder without a manifest of ours, and a file that its manifest does not list."""
+    """Refuse a folder without a mimopilot manifest, and a file that the manifest does not list."""
     if not folder.is_dir() or not any(folder.iterdir()):
         return
-    hint = "give --out another folder, or --force to write all the same"
+    hint = "give --out another folder, or --force to write anyway"
     try:
         manifest = json.loads(read_text(folder / MANIFEST, "manifest"))
         ours = {MANIFEST, *manifest["files"]} if manifest["generator"].startswith("mimopilot ") else set()

@@ -1,4 +1,4 @@
-"""What can be generated: every folder of ``firmware_templates/`` with a ``target.toml`` is a target."""
+"""The targets: every folder of ``firmware_templates/`` with a ``target.toml``."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ class Target:
     Attributes
     ----------
     name : str
-        As the command line calls it.
+        Name on the command line.
     help : str
-        A few words for the command line.
+        Short help for the command line.
     folders : tuple of str
-        Folders of ``firmware_templates`` that the tree is made of; ``package`` is the root of the output.
+        Folders of ``firmware_templates`` to render; ``package`` goes to the root of the output.
     folder : str
-        The one that is its own.
+        The target's own folder.
     contents, usage : str
-        What stands of it in the README of the tree; empty: nothing.
+        Its texts in the README of the tree; may be empty.
     options : mapping
-        Option -> its values, the default first.
+        Option -> values, the default first.
     """
 
     name: str
@@ -44,12 +44,12 @@ class Target:
     options: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def chosen(self, options: Mapping[str, str]) -> dict[str, str]:
-        """Value of every option; those that are not given have their default.
+        """Value of every option; the default if it is not given.
 
         Raises
         ------
         CodegenError
-            When a value is unknown. Options of other targets are ignored.
+            If a value is unknown. Options of other targets are ignored.
         """
         for name, value in options.items():
             values = self.options.get(name, (value,))
@@ -60,7 +60,7 @@ class Target:
 
 @lru_cache(maxsize=1)
 def targets() -> dict[str, Target]:
-    """Every target by its name."""
+    """All targets, by name."""
     found = {}
     for path in sorted(TEMPLATES.glob(f"*/{DESCRIPTION}")):
         table = read_toml(path, "target")
@@ -71,12 +71,12 @@ def targets() -> dict[str, Target]:
 
 
 def find_target(name: str) -> Target:
-    """A target by its name.
+    """The target of this name.
 
     Raises
     ------
     CodegenError
-        When there is none; lists those that there are.
+        If there is none; lists the known ones.
     """
     if name not in targets():
         raise CodegenError(f"target: got {name!r}, expected one of {', '.join(sorted(targets()))}")

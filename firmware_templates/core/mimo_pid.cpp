@@ -1,5 +1,5 @@
-// Bit-exactness: every multiplication and addition below must round by itself, in the order written.
-// Compilers may fuse or reorder them unless told not to, and flight stacks often tell them to.
+// Bit-exactness: each multiplication and addition below must round on its own, in the order written.
+// Compilers may fuse or reorder them unless told not to, and flight stacks often allow both.
 #ifdef __clang__
 #pragma STDC FP_CONTRACT OFF
 #elif defined(__GNUC__)
@@ -17,7 +17,7 @@ namespace mimopilot {
 
 namespace {
 
-// Size and time are budgeted: the attributes and expectations below are what makes the step short and the rest small.
+// Code size and step time have a budget: the attributes below keep step() fast and the rest small.
 
 constexpr float kTwoPi = 6.2831855F;
 constexpr float kPi = 3.1415927F;
@@ -27,7 +27,7 @@ constexpr float kPi = 3.1415927F;
 	return __builtin_expect(static_cast<long>(condition), 0L) != 0L;
 }
 
-// A range test on the bits: infinity and NaN stand above all numbers there, whatever the optimisation flags.
+// Compares bit patterns: there, infinity and NaN exceed every number, whatever the optimisation flags.
 bool within(float value, float limit)
 {
 	uint32_t bits;
@@ -46,7 +46,7 @@ float clamp(float value, float limit)
 
 float row(const float (&gain)[2], float roll, float pitch) { return gain[0] * roll + gain[1] * pitch; }
 
-// Shortest way round: the difference of two angles within 4 pi needs at most four turns.
+// Wraps to -pi to pi. Two angles within 4 pi differ by at most four turns.
 float wrap(float angle)
 {
 	if (unlikely(__builtin_fabsf(angle) > kPi)) {
@@ -74,7 +74,7 @@ float wrap(float angle)
 	return valid(gains);
 }
 
-// The outer loop: rate set-points r.
+// Attitude controller: rate setpoint r.
 [[gnu::noinline]] void outer_loop(const Gains &gains, const State &state, float (&r)[kAxes])
 {
 	const float roll = state.setpoint[0] - state.attitude[0];
@@ -91,7 +91,7 @@ struct Axes {
 	float yaw;
 };
 
-// What the inner loop works on.
+// Inputs of the rate controller.
 struct Signals {
 	Axes rates_setpoint;
 	Axes error;
@@ -107,7 +107,7 @@ struct Signals {
 	};
 }
 
-// The terms of v on one axis.
+// Terms of v on one axis.
 struct Terms {
 	float proportional;
 	float derivative;
@@ -150,7 +150,7 @@ float sum(const Terms &terms, float integral)
 	for (int j = 0; j < kAxes; j++) { v[j] = sum(inner_loop(gains, x, j), integral[j]); }
 }
 
-// Takes an input that is within its range; keeps the last good value otherwise. True: invalid for too long.
+// Accepts a value within its range, otherwise holds the last valid one. True: invalid for too long.
 [[gnu::always_inline]] inline bool accept(float value, float limit, float &held, int32_t &age, uint32_t &fault_count)
 {
 	if (unlikely(!within(value, limit))) {
@@ -206,7 +206,7 @@ float sum(const Terms &terms, float integral)
 	return failed;
 }
 
-// NaN means that nothing is injected; anything else out of range is a fault.
+// NaN means no excitation; any other value out of range is a fault.
 float accept_excitation(float value, uint32_t &fault_count)
 {
 	if (!within(value, kMaxExcitation)) {
@@ -218,7 +218,7 @@ float accept_excitation(float value, uint32_t &fault_count)
 	return value;
 }
 
-// An input has been invalid for too long: damp the rates that are still measured, leave the failed axes alone.
+// An input was invalid for too long: only damp the rates still measured. An axis without its rate gets no torque.
 [[gnu::cold, gnu::noinline]] void damp_rates(State &state, int32_t failed, const Input &input, Output &output)
 {
 	const Gains &gains = state.gains;
@@ -238,8 +238,8 @@ float accept_excitation(float value, uint32_t &fault_count)
 	}
 }
 
-// The whole controller, with anti-windup for each output. The integral is within its limit from the period before,
-// and never a negative zero: adding nothing to it changes no bit.
+// Normal operation, with anti-windup per axis. The integral is within its limit from the last period and is never -0,
+// so a zero increment keeps its bits.
 void control(State &state, const Input &input, Output &output)
 {
 	const Gains &gains = state.gains;
@@ -289,7 +289,7 @@ void control(State &state, const Input &input, Output &output)
 		state.gains = gains;
 
 	} else {
-		state.gains.period = 1.0F;  // all other gains and limits are zero: so is the moment
+		state.gains.period = 1.0F;  // all other gains and limits are 0, so the torque is 0
 	}
 
 	return accepted;

@@ -3,12 +3,12 @@
 //   r_i(k) = sat_rate( Kp_o (r_o(k) - y_o(k)) )
 //   e(k)   = r_i(k) - y_i(k)
 //   d(k)   = a d(k-1) + (1-a) (y_i(k) - y_i(k-1)) / Ts
-//   I(k)   = I(k-1) + Ts Ki e(k)                        with anti-windup, see step()
+//   I(k)   = I(k-1) + Ts Ki e(k)                        anti-windup: not further into saturation
 //   v(k)   = Kp e(k) + I(k) - Kd d(k) + Kff r_i(k)
 //   u(k)   = sat( v(k) + u_bar(k) )
 //
 // Single precision, fixed period, no heap, no exceptions, no library calls: the same bits on every
-// IEEE 754 target. Angles are aeronautical (roll, pitch, yaw), axes body FRD.
+// IEEE 754 target. Angles are Euler angles (roll, pitch, yaw), axes body FRD.
 #pragma once
 
 #include <stdint.h>
@@ -18,26 +18,26 @@
 namespace mimopilot {
 
 constexpr int kAxes = 3;            // roll, pitch, yaw
-constexpr int32_t kHoldSamples = 25;  // an invalid input is replaced by its last good value for so long
-constexpr float kMaxRate = 100.0F;    // rad/s, range of a credible body rate
-constexpr float kMaxAngle = 12.566371F;  // rad, 4 pi, range of a credible angle or set-point
-constexpr float kMaxExcitation = 1.0F;   // range of a credible injected moment
+constexpr int32_t kHoldSamples = 25;  // an invalid input is held at its last valid value this long
+constexpr float kMaxRate = 100.0F;    // rad/s, a larger rate is invalid
+constexpr float kMaxAngle = 12.566371F;  // rad, 4 pi, a larger angle is invalid
+constexpr float kMaxExcitation = 1.0F;   // a larger excitation is invalid
 constexpr float kMaxGain = 1.0e6F;       // no gain or limit may be larger
 
 struct Input {
 	float attitude_setpoint[kAxes];  // rad
 	float attitude[kAxes];           // rad
 	float rates[kAxes];              // rad/s
-	float excitation[kAxes];         // u_bar, dimensionless, added to the controller's output
-	int32_t saturation[kAxes];       // sign of the moment that the allocator could not give in the last period
-	int32_t armed;                   // 0: the integrators are zero
-	int32_t landed;                  // not 0: the integrators are held
+	float excitation[kAxes];         // u_bar, normalised torque, added to the controller output
+	int32_t saturation[kAxes];       // sign of the unallocated torque of the last period
+	int32_t armed;                   // 0: integrators are zero
+	int32_t landed;                  // not 0: integrators are held
 };
 
 struct Output {
-	float moment[kAxes];           // u, dimensionless
+	float moment[kAxes];           // u, normalised torque
 	float rates_setpoint[kAxes];   // r_i, rad/s
-	int32_t fault;                 // bit 0-2 attitude set-point, 3-5 attitude, 6-8 rate: invalid for too long
+	int32_t fault;                 // bit 0-2 attitude setpoint, 3-5 attitude, 6-8 rate: invalid for too long
 	uint32_t fault_count;          // invalid input samples since reset
 };
 
@@ -45,22 +45,22 @@ struct State {
 	Gains gains;
 	float integral[kAxes];
 	float derivative[kAxes];
-	float setpoint[kAxes];  // last good inputs
+	float setpoint[kAxes];  // last valid inputs
 	float attitude[kAxes];
 	float rates[kAxes];
-	int32_t age[3 * kAxes];  // samples since the last good one: set-point, attitude, rate
+	int32_t age[3 * kAxes];  // samples since the last valid one: setpoint, attitude, rate
 	uint32_t fault_count;
 };
 
-// Controller at rest. Returns false, and leaves the state without effect (moment 0), when the gains are refused.
+// Resets the controller. Returns false if the gains are refused; the torque then stays 0.
 bool initialise(State &state, const Gains &gains);
 
-// Replaces the gains; the integrators are re-seated so that the output is continuous, within their limits.
-// Returns false, and changes nothing, when a number is not finite, too large, or out of its range.
+// Replaces the gains. Sets the integrators, within their limits, so that the output does not jump.
+// Returns false and changes nothing if a value is not finite, too large, or out of its range.
 bool set_gains(State &state, const Gains &gains);
 
-// One control period. When an input has been invalid for more than kHoldSamples the controller only damps the
-// measured rates, u = -Kp y_i - Kd d, integrators frozen; an axis whose rate is the invalid input gets 0.
+// One control period. If an input is invalid for more than kHoldSamples, the controller only damps the measured
+// rates, u = -Kp y_i - Kd d, and holds the integrators. An axis without a valid rate gets 0.
 void step(State &state, const Input &input, Output &output);
 
 }  // namespace mimopilot

@@ -1,10 +1,10 @@
-// What a board gives to main.cpp. The versions there do nothing and never arm; define your own in another file.
+// What main.cpp needs of a board. Its weak defaults do nothing and never arm; define yours in another file.
 #pragma once
 
 #include "../core/mimo_pid.hpp"
 
-// Called once a period, before the step: sensors, set-points, saturation of the allocator, armed and landed.
+// Called every period before the step: read sensors, setpoints, allocator saturation, armed and landed.
 void read_board(mimopilot::Input &input);
 
-// Called once a period, after the step: moments to the allocator and the motors.
+// Called every period after the step: pass the torque to allocator and motors.
 void write_board(const mimopilot::Output &output);

@@ -1,4 +1,4 @@
-// The controller on a bare Cortex-M4F: one step a period, timed by SysTick.
+// The controller on a bare Cortex-M4F: one step per period, timed by SysTick.
 #include <stdint.h>
 
 #include "../core/gains.hpp"
@@ -6,9 +6,9 @@
 
 namespace {
 
-constexpr float kCoreClock = 16.0e6F;  // Hz; reset leaves an STM32F4 on its internal oscillator
+constexpr float kCoreClock = 16.0e6F;  // Hz; after reset an STM32F4 runs on this oscillator
 constexpr uint32_t kReload = static_cast<uint32_t>(mimopilot::kGains.period * kCoreClock + 0.5F) - 1U;
-static_assert(kReload < (1U << 24), "SysTick counts 24 bits: divide the clock");
+static_assert(kReload < (1U << 24), "SysTick has 24 bits: lower the clock");
 
 volatile uint32_t periods = 0;
 

@@ -1,5 +1,5 @@
-// Runs the rows of inputs.bin through the controller and writes outputs.bin, both as the structures are in
-// memory. Through semihosting: in an emulator, or on a board with a debugger.
+// Steps the controller once per row of inputs.bin and writes outputs.bin; a row is the structure's bytes.
+// Uses semihosting: run it in an emulator, or on a board with a debugger.
 #include <stdio.h>
 
 #include "../core/gains.hpp"

@@ -1,4 +1,4 @@
-// Start-up of a Cortex-M4F: vector table, FPU, memory, main. The clock stays as reset leaves it.
+// Start-up of a Cortex-M4F: vector table, FPU, memory, main. The clock keeps its reset setting.
 #include <stdint.h>
 
 #ifdef MIMO_PID_SEMIHOSTING
@@ -19,7 +19,7 @@ extern uint32_t bss_end[];
 int program(void) __asm__("main");  // ISO C++ forbids calling main by its name
 
 #ifdef MIMO_PID_SEMIHOSTING
-void initialise_monitor_handles(void);  // of newlib: opens the host's console
+void initialise_monitor_handles(void);  // newlib: opens the host's console
 #endif
 
 [[noreturn]] void reset(void);
@@ -40,7 +40,7 @@ uintptr_t words(const uint32_t *first, const uint32_t *last)
 	return (reinterpret_cast<uintptr_t>(last) - reinterpret_cast<uintptr_t>(first)) / sizeof(uint32_t);
 }
 
-// The exceptions of the core; a board appends its interrupts. A fault stops here, for the debugger to see.
+// Core exceptions only; a board appends its interrupts. A fault loops in stop(), where a debugger sees it.
 __attribute__((section(".vectors"), used)) const Vector vectors[] = {
 	reinterpret_cast<Vector>(stack_top),
 	reset,

@@ -1,4 +1,4 @@
-// How a program calls the controller: level set-point, vehicle rolled by 0.1 rad, ten periods.
+// Runs ten control periods with a level setpoint and the vehicle rolled by 0.1 rad.
 #include <stdio.h>
 
 #include "../core/gains.hpp"

@@ -1,7 +1,7 @@
 /* C interface of the controller, for host programs and foreign-function callers.
  *
- * Structures cross this boundary as plain bytes whose layout is that of core/mimo_pid.hpp; a caller
- * checks it first with mimo_pid_interface_hash() and mimo_pid_layout(). */
+ * Structures are passed as plain bytes, laid out as in core/mimo_pid.hpp. A caller first checks the
+ * layout with mimo_pid_interface_hash() and mimo_pid_layout(). */
 #pragma once
 
 #include <stdint.h>
@@ -10,7 +10,7 @@
 extern "C" {
 #endif
 
-/* Which number mimo_pid_layout() returns, in bytes. */
+/* Selects what mimo_pid_layout() returns. */
 enum mimo_pid_layout_item {
 	MIMO_PID_SIZEOF_GAINS,
 	MIMO_PID_SIZEOF_INPUT,
@@ -33,7 +33,7 @@ int32_t mimo_pid_layout(int32_t item);
 /* The gains that this library was generated with. */
 void mimo_pid_default_gains(float *gains);
 
-/* Return 1, or 0 when the gains are refused. See core/mimo_pid.hpp. */
+/* Return 1, or 0 if the gains are refused. See core/mimo_pid.hpp. */
 int32_t mimo_pid_initialise(uint8_t *state, const float *gains);
 int32_t mimo_pid_set_gains(uint8_t *state, const float *gains);
 

@@ -1,4 +1,4 @@
-// Runs the test vectors through the controller and compares every bit. Returns 0 when all are equal.
+// Runs the test vectors through the controller and compares every bit. Returns 0 if all are equal.
 #include <stdio.h>
 #include <string.h>
 
@@ -7,8 +7,8 @@
 
 int main()
 {
-	static_assert(sizeof(kVectorInputs[0]) == sizeof(mimopilot::Input), "vectors are of another interface");
-	static_assert(sizeof(kVectorOutputs[0]) == sizeof(mimopilot::Output), "vectors are of another interface");
+	static_assert(sizeof(kVectorInputs[0]) == sizeof(mimopilot::Input), "vectors do not fit the interface");
+	static_assert(sizeof(kVectorOutputs[0]) == sizeof(mimopilot::Output), "vectors do not fit the interface");
 
 	mimopilot::State state;
 

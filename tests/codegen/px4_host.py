@@ -1,6 +1,6 @@
-"""The emitted PX4 module, compiled against the stand-ins beside this file and driven line by line.
+"""The emitted PX4 module, compiled against stubs of PX4 and driven by text commands.
 
-The stand-ins carry the names and types that the module uses of PX4. They are not PX4, and this is no PX4 build.
+The stubs have the PX4 names and types that the module uses. They are not PX4, and this is no PX4 build.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import yaml
 from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.toolchain import WARNINGS, find_compiler
 
-STAND_INS = Path(__file__).parent / "px4_stand_ins"
+STUBS = Path(__file__).parent / "px4_stubs"
 STANDARD = {"crtp": "-std=gnu++14", "descriptor": "-std=gnu++17"}
-#: What PX4 compiles its modules with, where it could matter here.
+#: PX4's compiler flags for modules, where they could matter here.
 PX4_FLAGS = (
     "-O2",
     "-fno-signed-zeros",
@@ -33,7 +33,7 @@ PX4_FLAGS = (
     "-Wframe-larger-than=2048",
     "-Wno-unused-parameter",
 )
-#: PX4's own parameters that the module reads, with their defaults.
+#: PX4's own parameters that the module reads, with defaults.
 PX4_PARAMETERS = {
     "MPC_MAN_TILT_MAX": 35.0,
     "MPC_MAN_Y_MAX": 150.0,
@@ -62,7 +62,7 @@ def definitions(files: dict[str, str]) -> dict[str, dict]:
 
 
 def parameters_header(entries: dict[str, dict]) -> str:
-    """What PX4's build makes of every module.yaml: an enum, the types and the default values."""
+    """What PX4's build generates from module.yaml: an enum, types and defaults."""
     kinds = {name: entry["type"] == "float" for name, entry in entries.items()} | dict.fromkeys(PX4_PARAMETERS, True)
     values = {name: entry["default"] for name, entry in entries.items()} | PX4_PARAMETERS
     names = list(kinds)
@@ -95,7 +95,7 @@ def parameters_header(entries: dict[str, dict]) -> str:
 
 
 def build(gains, api: str, folder: Path) -> Path:
-    """Emit, compile with our warnings as errors and PX4's flags, and link with the host program."""
+    """Emit, compile with PX4's flags and warnings as errors, and link with the host program."""
     files = render(gains, "px4", px4_api=api)
     write_tree(files, folder / "tree")
     (folder / "generated").mkdir(exist_ok=True)
@@ -103,12 +103,12 @@ def build(gains, api: str, folder: Path) -> Path:
     module = folder / "tree/px4/src/modules/mc_mimo_pid"
     core = folder / "tree/core"
     includes = [f"-I{module}", f"-I{core}"]
-    for path in (folder / "generated", STAND_INS / api, STAND_INS / "common"):
+    for path in (folder / "generated", STUBS / api, STUBS / "common"):
         includes += ["-isystem", str(path)]
     common = [find_compiler(), STANDARD[api], *PX4_FLAGS, *includes]
     jobs = {core / "mimo_pid.cpp": ["-fno-fast-math", "-fno-reciprocal-math", "-fno-associative-math", *WARNINGS]}
     jobs |= {path: [*WARNINGS, "-Wno-unused-parameter"] for path in sorted(module.glob("*.cpp"))}
-    jobs[STAND_INS / "host.cpp"] = ["-Wall", "-fexceptions", "-frtti"]
+    jobs[STUBS / "host.cpp"] = ["-Wall", "-fexceptions", "-frtti"]
     objects = []
     for source, flags in jobs.items():
         objects.append(folder / f"{source.stem}.o")
@@ -127,15 +127,15 @@ class Transcript:
     Attributes
     ----------
     out : (N,) array of `OUT`
-        What was published after each gyro sample that made the module publish.
+        Published values after each gyro sample with a publication.
     ticks : list of bool
-        For each gyro sample given: whether the module published.
+        For each gyro sample: whether the module published.
     log : list of str
-        What the module said.
+        Log messages of the module.
     exits : list of int
-        What each of start, stop and status returned.
+        Return values of start, stop and status.
     other : list of str
-        The rest.
+        Remaining lines.
     """
 
     out: np.ndarray

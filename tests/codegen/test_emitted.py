@@ -1,4 +1,4 @@
-"""What is emitted, as its user builds and runs it: checked, sanitised, fuzzed, on this machine and on the target."""
+"""The emitted code, as a user builds it: static analysis, sanitisers, fuzzing, host and target."""
 
 import subprocess
 import sys
@@ -30,7 +30,7 @@ def sources(tree):
     return sorted(path for folder in ("core", "native", "cortex_m4") for path in (tree / folder).glob("*.cpp"))
 
 
-def test_both_makefiles_build_every_file_with_all_warnings_as_errors_and_run(tree):
+def test_both_makefiles_build_with_warnings_as_errors_and_run(tree):
     for folder in ("native", "cortex_m4"):
         text = (tree / folder / "Makefile").read_text()
         for flag in WARNINGS:
@@ -47,7 +47,7 @@ def test_the_host_and_the_target_print_the_same_example(tree):
     assert printed[0] == printed[1]
 
 
-def test_the_test_on_the_target_fails_when_one_bit_is_wrong(tree):
+def test_the_test_on_the_target_fails_if_one_bit_is_wrong(tree):
     vectors = tree / "native" / "test_vectors.hpp"
     head, outputs = vectors.read_text().split("kVectorOutputs")
     at = outputs.index("0x") + 9
@@ -57,8 +57,8 @@ def test_the_test_on_the_target_fails_when_one_bit_is_wrong(tree):
     assert "1 of 256 rows differ" in result.stdout
 
 
-def test_the_firmware_steps_once_a_period_and_calls_its_board(tree):
-    # A board that counts periods and ends the emulation, telling whether the controller answered its error.
+def test_the_firmware_steps_once_per_period_and_calls_the_board_functions(tree):
+    # A board that ends the emulation after 250 periods, with success if each torque opposed the error.
     (tree / "board.cpp").write_text("""
 #include "cortex_m4/board.hpp"
 namespace {
@@ -102,7 +102,7 @@ target_link_libraries(test_main mimo_pid)
 
 
 @pytest.mark.parametrize("target", ["host", "cortex-m4"])
-def test_the_cmake_library_serves_host_and_target(tree, tmp_path, target):
+def test_the_cmake_library_builds_for_host_and_target(tree, tmp_path, target):
     (tmp_path / "CMakeLists.txt").write_text(CMAKE)
     options = [f"-DTREE={tree}"]
     if target == "cortex-m4":
@@ -130,7 +130,7 @@ def test_cppcheck_finds_nothing(tree):
     assert (result.returncode, result.stderr) == (0, "")
 
 
-def test_cppcheck_would_find_a_mistake(tree):
+def test_cppcheck_finds_an_inserted_error(tree):
     core = tree / "core" / "mimo_pid.cpp"
     right = "i < 3 * kAxes; i++) { state.age[i]"
     assert right in core.read_text()
@@ -147,14 +147,14 @@ def test_clang_tidy_finds_nothing(tree):
     assert "error:" not in result.stdout
 
 
-def test_the_vectors_run_clean_under_the_sanitisers(tree):
+def test_the_sanitisers_report_nothing_on_the_test_vectors(tree):
     flags = "-std=c++17 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all"
     result = run("make", "-s", "-C", tree / "native", "test", "example", f"CXXFLAGS={flags}")
     assert result.returncode == 0, result.stderr
     assert "0 of 256 rows differ" in result.stdout
 
 
-def test_no_function_of_the_core_has_an_unbounded_or_large_frame(tree):
+def test_no_function_of_the_core_has_an_unbounded_or_large_stack_frame(tree):
     for compiler in (find_compiler(), "arm-none-eabi-g++"):
         target = CORTEX_M4_FLAGS if "arm" in compiler else ()
         flags = ("-std=c++11", "-O2", "-Wstack-usage=256", "-Werror", "-c", "-o", tree / "core.o")
@@ -162,7 +162,7 @@ def test_no_function_of_the_core_has_an_unbounded_or_large_frame(tree):
         assert result.returncode == 0, result.stderr
 
 
-def test_a_million_wild_steps_with_gain_changes_stay_finite_and_within_their_limits(gains):
+def test_a_million_steps_with_invalid_inputs_and_gain_changes_stay_finite_and_limited(gains):
     rng = np.random.default_rng(7)
     wild = np.array([np.nan, np.inf, -np.inf, 1e38, -1e38, 3e38, 1e-40, -1e-45, 0.0, -0.0, 12.5, 100.0], np.float32)
     controller = NativeController(load_native(gains), gains)

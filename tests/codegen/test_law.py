@@ -1,4 +1,4 @@
-"""The law that tuning knows against the compiled C++: a parameter that the analysis forgets is a failure here."""
+"""The control law in tuning agrees with the compiled C++, for every parameter."""
 
 import dataclasses
 
@@ -12,10 +12,10 @@ from mimopilot.tuning.parameters import PARAMETERS, ROWS, Shape
 from tests.conftest import coupled_gains
 
 INPUTS = ("attitude_setpoint", "attitude", "rates", "excitation")
-#: Periods of the signals, and those at which the response is compared: from 0.5 to 120 Hz of a 250 Hz loop.
+#: Samples per period, and the lines at which responses are compared: 0.5 to 120 Hz of a 250 Hz loop.
 SAMPLES = 2000
 LINES = np.unique(np.geomspace(4, 960, 24).round().astype(int))[-20:]
-#: Small enough that no limit acts, large enough for single precision.
+#: Small enough to reach no limit, large enough for single precision.
 AMPLITUDE = 1e-3
 
 
@@ -25,7 +25,7 @@ def library():
 
 
 def compiled_response(library, gains):
-    """Response of the compiled C++, (lines, 6, 12): rate setpoint and torque from `INPUTS`, by multisines."""
+    """Response of the compiled C++ to multisines, (lines, 6, 12): rate setpoint and torque from `INPUTS`."""
     phases = np.random.default_rng(0).uniform(0, 2 * np.pi, len(LINES))
     k = np.arange(2 * SAMPLES)
     signal = np.sum(np.cos(2 * np.pi * np.outer(LINES, k) / SAMPLES + phases[:, None]), axis=0) * AMPLITUDE
@@ -43,7 +43,7 @@ def compiled_response(library, gains):
 
 
 def perturbed(gains, code):
-    """The set with one element changed by much; a set that is not changed is of no use."""
+    """The gains with one element changed considerably."""
     value = gains.elements()[code]
     changed = {"TS": 0.0025, "D_POLE": 0.8}.get(code, 1.5 * value + 0.013)
     if code.startswith(("RMAX", "UMAX", "IMAX")):
@@ -52,28 +52,28 @@ def perturbed(gains, code):
 
 
 def distance(library, gains):
-    """How far the compiled code is from the law; see `difference`."""
+    """`difference` of the compiled code to the law."""
     omega = 2 * np.pi * LINES / SAMPLES / gains.Ts
     law = response(gains, omega)
     return difference(compiled_response(library, gains), law)
 
 
 def difference(other, law):
-    """The largest difference, over the largest response of that output to that kind of input."""
+    """Largest difference, relative to the largest response of that output to that kind of input."""
     size = np.abs(law).reshape(len(LINES), 6, 4, 3).max(axis=(0, 3), keepdims=True)
     size = np.broadcast_to(size, (len(LINES), 6, 4, 3)).reshape(law.shape)
     return np.max(np.abs(other - law) / np.where(size > 0, size, 1.0))
 
 
 @pytest.mark.parametrize("code", [parameter.code for parameter in PARAMETERS])
-def test_the_law_has_the_response_of_the_compiled_code_whatever_parameter_is_changed(library, code):
+def test_the_law_and_the_compiled_code_respond_alike_when_any_parameter_changes(library, code):
     gains = perturbed(coupled_gains(), code)
     assert gains.elements()[code] != coupled_gains().elements()[code]
     assert distance(library, gains) < 1e-5
 
 
-def test_a_law_that_forgets_a_parameter_is_told_apart():
-    """Of the test above: each element that is no limit changes the response by far more than its tolerance."""
+def test_each_parameter_changes_the_response_far_beyond_the_tolerance():
+    """So the test above detects a law that omits a parameter; limits do not act there."""
     omega = 2 * np.pi * LINES / SAMPLES / 0.004
     start = response(coupled_gains(), omega)
     for parameter in PARAMETERS:
@@ -82,12 +82,12 @@ def test_a_law_that_forgets_a_parameter_is_told_apart():
 
 
 def test_every_gain_matrix_is_a_term_of_the_law():
-    """The attitude controller's matrix and those of `TERMS` are all the matrices there are."""
+    """`Kp_o` of the attitude controller and those in `TERMS` are all the matrices."""
     assert {row.key for row in ROWS if row.shape is Shape.MATRIX} == {"Kp_o", *(term.matrix for term in TERMS.values())}
     filters = {row.key for row in ROWS if row.shape in (Shape.POLE, Shape.SCALAR)}
     assert {field.name for field in dataclasses.fields(Filters)} == filters
 
 
-def test_rows_follow_one_another_in_memory():
+def test_rows_are_contiguous_in_memory():
     sizes = [4 * len(row.codes) for row in ROWS]
     assert [offset(row) for row in ROWS] == list(np.cumsum([0, *sizes[:-1]]))

@@ -1,4 +1,4 @@
-"""The files of the PX4 target: module.yaml by PX4's rules, start-up scripts, and the golden directories."""
+"""The files of the PX4 target: module.yaml by PX4's rules, start-up scripts, golden directories."""
 
 import dataclasses
 import difflib
@@ -24,11 +24,11 @@ from tests.codegen.px4_host import PX4_FLAGS, definitions
 GOLDEN = Path(__file__).parent / "golden"
 MODULE = "px4/src/modules/mc_mimo_pid"
 PLAIN = ("attitude", "excitation", "sticks")
-#: The units that PX4's validators accept, of those that we could need.
+#: Units that PX4's validator accepts and we could need.
 PX4_UNITS = {"1/s", "s", "rad", "rad/s", "rad/s^2", "deg", "deg/s", "Hz", "Nm", "norm"}
 
 
-def test_every_parameter_of_the_module_is_in_its_yaml_with_the_gains_as_defaults(gains):
+def test_the_yaml_has_every_parameter_with_the_gains_as_defaults(gains):
     entries = definitions(render(gains, "px4"))
     values = gains.elements()
     for parameter in PARAMETERS:
@@ -40,14 +40,14 @@ def test_every_parameter_of_the_module_is_in_its_yaml_with_the_gains_as_defaults
     assert set(entries) == {p.name for p in (*PARAMETERS, *IDENTITY, *EXCITATION)} | {"MIMO_EN"}
 
 
-def test_the_yaml_keeps_the_rules_that_px4s_validators_do_not_all_check(gains):
+def test_the_yaml_keeps_px4s_rules_even_those_its_validator_does_not_check(gains):
     text = render(gains.with_elements({"RD_RP": 1e-5, "RD_PR": -2.5e-7}), "px4")[f"{MODULE}/module.yaml"]
     (group,) = yaml.safe_load(text)["parameters"]
     for name, entry in group["definitions"].items():
         assert re.fullmatch("[A-Z][A-Z0-9_]{0,15}", name)
         assert entry.keys() <= {
             *("description", "type", "unit", "default", "min", "max", "decimal", "increment"),
-        }, name  # a volatile key of any value would mark it volatile
+        }, name  # any value of a volatile key marks it volatile
         assert len(entry["description"]["short"]) <= 70 and "\n" not in entry["description"]["short"]
         assert len(entry["description"]["long"]) > len(entry["description"]["short"])
         number = {"float": float, "int32": int}[entry["type"]]
@@ -63,7 +63,7 @@ def test_the_yaml_keeps_the_rules_that_px4s_validators_do_not_all_check(gains):
     assert "1.0e-05" in text and "-2.5e-07" in text
 
 
-def test_off_diagonal_gains_may_be_negative_and_what_is_fixed_has_one_value(gains):
+def test_off_diagonal_gains_may_be_negative_and_fixed_parameters_have_one_value(gains):
     entries = definitions(render(gains, "px4"))
     for parameter in PARAMETERS:
         entry = entries[parameter.name]
@@ -73,20 +73,20 @@ def test_off_diagonal_gains_may_be_negative_and_what_is_fixed_has_one_value(gain
             assert entry["min"] == entry["default"] == entry["max"]
 
 
-def test_gains_that_do_not_say_their_unit_of_moment_publish_none(gains):
+def test_gains_without_a_unit_of_torque_publish_none(gains):
     files = render(dataclasses.replace(gains, moment_scale=None), "px4")
     assert not [name for name in definitions(files) if "SCALE" in name]
     assert "MIMO_SCALE" not in files[f"{MODULE}/parameters.hpp"]
 
 
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
-def test_a_yaml_number_reads_back_as_a_float_of_the_same_bits(value):
+def test_a_yaml_number_reads_back_as_a_float_with_the_same_bits(value):
     read = yaml.safe_load(yaml_number(value))
     assert type(read) is float
     assert np.float32(read).tobytes() == np.float32(value).tobytes()
 
 
-def test_the_defaults_script_sets_every_gain_and_the_rates_that_the_module_needs(gains):
+def test_the_defaults_set_every_gain_the_gyro_rate_and_the_log_profile(gains):
     files = render(gains, "px4")
     lines = files["px4/sd_card/etc/config.txt"].splitlines()
     defaults = dict(line.split()[2:] for line in lines if line.startswith("param set-default"))
@@ -98,21 +98,21 @@ def test_the_defaults_script_sets_every_gain_and_the_rates_that_the_module_needs
     assert files["px4/airframe/mimo_defaults.txt"] in files["px4/sd_card/etc/config.txt"]
 
 
-def test_the_stock_controllers_stop_only_after_ours_has_started(gains):
+def test_the_stock_controllers_stop_only_after_the_module_has_started(gains):
     script = render(gains, "px4")["px4/sd_card/etc/extras.txt"]
     order = [script.index(word) for word in ("set +e", "MIMO_EN 1", "mc_mimo_pid start", "then\n\t\tmc_rate", "set -e")]
     assert order == sorted(order)
     assert subprocess.run(["sh", "-n"], input=script, text=True, check=False).returncode == 0
 
 
-def test_the_module_needs_no_px4_library_and_the_core_no_fast_math(gains):
+def test_cmake_needs_no_px4_library_and_disables_fast_math_for_the_core(gains):
     cmake = render(gains, "px4")[f"{MODULE}/CMakeLists.txt"]
     assert "DEPENDS" not in re.sub("#.*", "", cmake)
     for flag in ("-fno-fast-math", "-fno-reciprocal-math", "-fno-associative-math"):
         assert flag in cmake
 
 
-def test_the_core_says_so_when_px4s_flags_reach_it(gains, tmp_path):
+def test_the_core_refuses_to_compile_with_px4s_flags(gains, tmp_path):
     files = render(gains, "px4")
     for name in ("mimo_pid.cpp", "mimo_pid.hpp"):
         (tmp_path / name).write_text(files[f"core/{name}"])
@@ -122,7 +122,7 @@ def test_the_core_says_so_when_px4s_flags_reach_it(gains, tmp_path):
 
 
 @pytest.mark.parametrize("name", PLAIN)
-def test_what_needs_no_px4_includes_none(name):
+def test_files_independent_of_px4_include_no_px4_header(name):
     folder = TEMPLATES / MODULE
     for path in (folder / f"{name}.hpp", folder / f"{name}.cpp"):
         included = set(re.findall(r"#include [<\"](.*)[>\"]", path.read_text()))
@@ -131,19 +131,19 @@ def test_what_needs_no_px4_includes_none(name):
     subprocess.run([find_compiler(), *flags, str(folder / f"{name}.cpp")], check=True)
 
 
-def test_an_unknown_interface_is_refused(gains):
+def test_an_unknown_px4_interface_is_refused(gains):
     with pytest.raises(CodegenError, match="px4-api: got 'v9', expected one of crtp, descriptor"):
         render(gains, "px4", px4_api="v9")
 
 
 def templated(api, gains):
-    """The files of px4/ that are not plain copies of a template."""
+    """The files of px4/ rendered from a template."""
     files = render(gains, "px4", px4_api=api)
     return {name: text for name, text in files.items() if (TEMPLATES / f"{name}.jinja").is_file() and "px4/" in name}
 
 
 @pytest.mark.parametrize("api", targets()["px4"].options["px4_api"])
-def test_the_rendered_files_are_the_golden_ones(gains, api, request):
+def test_the_rendered_files_match_the_golden_files(gains, api, request):
     files = templated(api, gains)
     folder = GOLDEN / f"px4-{api}"
     if request.config.getoption("--update-golden"):
@@ -158,10 +158,10 @@ def test_the_rendered_files_are_the_golden_ones(gains, api, request):
             kept.get(name, "").splitlines(), files.get(name, "").splitlines(), f"golden/{name}", name, lineterm=""
         )
     ]
-    assert not difference, "\n".join(["run pytest --update-golden if this is meant:", *difference])
+    assert not difference, "\n".join(["run pytest --update-golden if intended:", *difference])
 
 
-def test_the_interfaces_differ_in_the_module_alone(gains):
+def test_the_px4_interfaces_differ_only_in_the_module_and_its_readme(gains):
     crtp, descriptor = (render(gains, "px4", px4_api=api) for api in ("crtp", "descriptor"))
     different = {name for name in crtp if crtp[name] != descriptor[name]}
     assert different == {f"{MODULE}/mc_mimo_pid.cpp", f"{MODULE}/mc_mimo_pid.hpp", "px4/README.md", "manifest.json"}

@@ -1,4 +1,4 @@
-"""What the emitted PX4 module publishes for what it is fed, in both dialects, against stand-ins (no PX4 build)."""
+"""Topics that the emitted PX4 module publishes, for both PX4 interfaces, with stubs of PX4."""
 
 import dataclasses
 
@@ -31,7 +31,7 @@ def program(request, programs):
 
 
 def text(*values):
-    """Numbers as the host program reads them back to the same bits."""
+    """Numbers as text that the host program reads back with the same bits."""
     return " ".join("nan" if np.isnan(v) else float(np.float32(v)).hex() for v in values)
 
 
@@ -49,7 +49,7 @@ def assert_same_bits(got, expected):
     assert got.tobytes() == np.ascontiguousarray(expected).tobytes()
 
 
-def test_a_random_flight_gives_the_bits_of_the_native_library(program, gains):
+def test_a_random_flight_gives_the_same_bits_as_the_native_library(program, gains):
     rng = np.random.default_rng(7)
     commands, rows = list(AIRBORNE), []
     row = np.zeros(1, INPUT)[0]
@@ -77,7 +77,7 @@ def test_a_random_flight_gives_the_bits_of_the_native_library(program, gains):
         commands.append(f"gyro 4000 {text(*row['rates'])}")
         rows.append((row.copy(), np.float32(move), np.isnan(wanted_q[0])))
     out = drive(program, commands).out
-    rows = rows[len(rows) - len(out) :]  # it watches for the other controllers first
+    rows = rows[len(rows) - len(out) :]  # it checks for other controllers first
     assert len(out) == 1499
     inputs = np.array([r for r, _, _ in rows], INPUT)
     inputs["attitude"], inputs["attitude_setpoint"] = out["angles"], out["wanted"]
@@ -87,14 +87,14 @@ def test_a_random_flight_gives_the_bits_of_the_native_library(program, gains):
     expected = native_outputs(gains, inputs)
     assert_same_bits(out["torque"], expected["moment"])
     assert_same_bits(out["rates"], expected["rates_setpoint"])
-    # The rows reach what they are meant to reach.
+    # Saturation, invalid setpoints and unallocated torque occur.
     assert (np.abs(expected["moment"]) >= [1.0, 0.9, 0.8]).any(axis=1).sum() > 20
     assert np.isnan(out["wanted"]).any(axis=1).sum() > 20
     assert np.isfinite(out["torque"]).all()
     assert len(np.unique(inputs["saturation"], axis=0)) > 20
 
 
-def test_the_angles_are_those_of_the_quaternions(program):
+def test_the_angles_match_the_quaternions(program):
     rng = np.random.default_rng(3)
     commands, expected = list(AIRBORNE), []
     for _ in range(200):
@@ -106,12 +106,12 @@ def test_the_angles_are_those_of_the_quaternions(program):
     for row, (vehicle, wanted) in zip(out, expected[1:], strict=True):
         np.testing.assert_allclose(row["angles"], vehicle, atol=2e-6)
         assert row["wanted"][2] == pytest.approx(wanted[2], abs=2e-6)
-        # The thrust points where the set-point wants it, at the vehicle's own heading.
+        # The thrust axis is the setpoint's, at the vehicle's own heading.
         axis = Rotation.from_euler("ZYX", [vehicle[2], row["wanted"][1], row["wanted"][0]]).apply([0, 0, 1])
         np.testing.assert_allclose(axis, Rotation.from_euler("ZYX", wanted[::-1]).apply([0, 0, 1]), atol=2e-6)
 
 
-def test_fields_that_are_not_set_poison_nothing(program):
+def test_fields_that_are_nan_leave_the_output_finite(program):
     unset = [
         "setpoint 1 0 0 0 nan nan nan nan",
         "sticks 1 nan nan nan nan",
@@ -122,7 +122,7 @@ def test_fields_that_are_not_set_poison_nothing(program):
     assert (out["thrust"][:, 2] == np.float32(-0.5)).all()
 
 
-def test_a_setpoint_that_ends_is_held_for_25_samples_and_then_only_the_rates_are_damped(program):
+def test_an_invalid_setpoint_is_held_for_25_samples_and_then_only_the_rates_are_damped(program):
     tilted = f"setpoint {text(*quaternion(0.2, 0, 0), 0, 0, 0, -0.5)}"
     lost = "setpoint nan nan nan nan 0 0 0 -0.5"
     out = drive(program, [*AIRBORNE, tilted, STEP, STEP, lost, *[STEP] * 40]).out
@@ -146,25 +146,25 @@ def test_integrators_are_zero_when_disarmed_and_held_on_the_ground(program, gain
     assert (np.abs(on[-1]) > 0).all()
 
 
-def test_an_axis_whose_moment_is_not_given_does_not_wind_up(program):
+def test_an_axis_with_unallocated_torque_does_not_wind_up(program):
     turning = ["gyro 4000 -0.3 -0.3 -0.3"] * 10
     integral = drive(program, [*AIRBORNE, STEP, "alloc 0 0.1 0 -0.1", *turning]).out["integral"]
     assert (integral[:, 0] == 0).all()
     assert (np.diff(integral[:, 1:], axis=0) > 0).all()
 
 
-def test_time_that_repeats_or_goes_back_makes_no_step(program):
+def test_a_timestamp_that_repeats_or_goes_back_makes_no_step(program):
     odd = ["gyro 0 0.1 0 0", "gyro -4000 0.1 0 0", "gyro 8000 0.1 0 0", "gyro 7000 0.1 0 0", "gyro 1000 0.1 0 0"]
     result = drive(program, [*AIRBORNE, STEP, STEP, *odd, STEP, "status"])
     assert result.ticks[1:] == [False, True, False, False, True, True, True, True]
-    # Repeated, back, too long, too short; 8000 us after going back is 4000 us after the last good one.
+    # Repeated, back, too long, too short; 8000 us after going back is 4000 us after the last valid one.
     assert "4 bad sample times" in result.log[0]
 
 
 @pytest.mark.parametrize(
     ("interval", "started"), [(4000, True), (4100, True), (3850, True), (4300, False), (3700, False), (1250, False)]
 )
-def test_it_starts_only_when_the_gyro_keeps_the_period_of_the_gains(program, interval, started):
+def test_it_starts_only_if_the_gyro_keeps_the_period_of_the_gains(program, interval, started):
     result = drive(program, [f"gyro_interval {interval}", *AIRBORNE])
     assert result.exits == [0 if started else -1]
     assert started == (not any("IMU_GYRO_RATEMAX" in line for line in result.log))
@@ -176,13 +176,13 @@ def test_it_does_not_start_without_a_gyro(program):
     assert "no vehicle_angular_velocity" in result.log[0]
 
 
-def test_it_takes_over_when_both_stock_controllers_have_stopped(program):
+def test_it_takes_over_after_both_stock_controllers_have_stopped(program):
     commands = [*AIRBORNE, "stock 1 1 1", STEP, STEP, "stock 0 1 1", STEP, STEP, "stock 0 0 1", STEP, STEP, STEP]
     result = drive(program, commands)
     assert result.ticks[1:] == [False] * 5 + [True] * 2
 
 
-def test_setpoints_still_arrive_when_the_stock_controllers_withdrew_their_topic(program):
+def test_setpoints_arrive_after_the_stock_controllers_unadvertised_the_topic(program):
     tilted = f"setpoint {text(*quaternion(0.2, 0, 0), 0, 0, 0, -0.5)}"
     out = drive(program, [*AIRBORNE, "stock 1 1 1", STEP, "stock 0 0 0", STEP, STEP, tilted, STEP, STEP]).out
     assert out["rates"][-1, 0] == pytest.approx(6.0 * 0.2, rel=1e-4)
@@ -194,7 +194,7 @@ def test_it_can_be_stopped_and_started_again(program):
     assert result.ticks[1:] == [False, True, False, False, False, True]
 
 
-def test_new_gains_act_within_a_second_without_a_bump(program, gains):
+def test_new_gains_take_effect_within_a_second_without_a_jump(program, gains):
     changed = gains.with_elements({"RP_RR": 0.25, "AP_PP": 3.0})
     rates, rng = [], np.random.default_rng(2)
     commands = [*AIRBORNE, STEP]
@@ -215,7 +215,7 @@ def test_new_gains_act_within_a_second_without_a_bump(program, gains):
     assert_same_bits(out["torque"], np.concatenate([before, controller.run(inputs[change:])])["moment"])
 
 
-def test_gains_out_of_their_range_are_refused_by_name_and_the_old_ones_fly_on(program, gains):
+def test_gains_out_of_range_are_refused_by_name_and_the_old_ones_stay(program, gains):
     wrong = ["param MIMO_RP_RR 99", "param MIMO_RP_PP 0.2"]
     result = drive(program, [*AIRBORNE, STEP, *wrong, *["gyro 4000 0.1 0.1 0.1"] * 300])
     inputs = np.zeros(300, INPUT)
@@ -224,7 +224,7 @@ def test_gains_out_of_their_range_are_refused_by_name_and_the_old_ones_fly_on(pr
     assert any("MIMO_RP_RR is not within 0.0001 to 5" in line for line in result.log)
 
 
-def test_a_reset_heading_turns_the_setpoint_with_it(program):
+def test_a_heading_reset_rotates_the_setpoint(program):
     step = quaternion(0, 0, 0.5)
     wanted = f"setpoint {text(*quaternion(0.1, 0, 0), 0, 0, 0, -0.5)}"
     reset = f"attitude {text(*step)} 1 {text(*step)}"
@@ -237,7 +237,7 @@ def test_a_reset_heading_turns_the_setpoint_with_it(program):
 
 
 def excited(program, *events, axis=3, seconds=0.2, mode=HOLD_MODE, steps=600, settings=()):
-    """A flight with an excitation asked for in the air; events: (sample, command)."""
+    """A flight with an excitation requested in the air; events: (sample, command)."""
     setup = [f"param MIMO_EX_DUR {seconds}", "param MIMO_EX_HMIN 2", "param MIMO_EX_HMAX 9", *settings]
     commands = [*AIRBORNE[:2], *setup, *AIRBORNE[2:], f"mode 1 0 1 1 {mode}", *[STEP] * 300]
     commands += [f"param MIMO_EX_AX {axis}"]
@@ -255,7 +255,7 @@ def active(result):
     return (result.out["excitation"][:, :2] != 0).any(axis=1)
 
 
-def test_the_excitation_runs_once_on_roll_then_pitch_and_is_logged(program, gains):
+def test_the_excitation_runs_once_on_roll_then_pitch_and_is_published(program, gains):
     result = excited(program)
     x, y, code = result.out["excitation"].T
     roll, pitch, pause = (np.flatnonzero(code == value) for value in (0, 1, 2))
@@ -268,7 +268,7 @@ def test_the_excitation_runs_once_on_roll_then_pitch_and_is_logged(program, gain
     assert set(np.abs(y[pitch])) == {amplitude} and not y[np.setdiff1d(np.arange(len(y)), pitch)].any()
     assert set(code) == {-1, 0, 1, 2}
     assert "finished" in last_end(result)
-    # It is the excitation input of the core.
+    # The core gets the same excitation.
     inputs = np.zeros(len(x), INPUT)
     inputs["excitation"], inputs["armed"] = np.column_stack([x, y, 0 * x]), 1
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
@@ -301,19 +301,19 @@ def test_the_excitation_stops_at_once(program, event, reason):
     assert reason in last_end(result)
 
 
-def test_the_axis_set_to_zero_stops_the_excitation(program):
+def test_setting_the_axis_to_zero_stops_the_excitation(program):
     result = excited(program, (300, "param MIMO_EX_AX 0"), seconds=10)
     assert 50 <= np.count_nonzero(active(result)) <= 600 and not active(result)[-1]
     assert "cancelled" in last_end(result)
 
 
-def test_after_a_stop_it_does_not_begin_again_by_itself(program):
+def test_a_stopped_excitation_does_not_restart(program):
     result = excited(program, (350, "land 1 0"), (360, "land 0 0"), seconds=10, steps=2000)
     assert not active(result)[300 + 351 :].any() and active(result)[300 + 340]
 
 
 @pytest.mark.parametrize("event", [f"mode 0 0 1 1 {HOLD_MODE}", "mode 1 0 1 1 2", "land 1 0", "land 0 1"])
-def test_it_waits_until_the_vehicle_is_ready(program, event):
+def test_the_excitation_waits_until_the_vehicle_is_ready(program, event):
     ready = 1000
     back = f"mode 1 0 1 1 {HOLD_MODE}" if event.startswith("mode") else "land 0 0"
     result = excited(program, (0, event), (ready, back), steps=1100)
@@ -321,24 +321,24 @@ def test_it_waits_until_the_vehicle_is_ready(program, event):
     assert active(result)[299 + ready]
 
 
-def test_an_axis_that_was_set_before_the_start_excites_nothing(program):
+def test_an_axis_set_before_the_start_excites_nothing(program):
     commands = ["param MIMO_EX_AX 3", *AIRBORNE, *[STEP] * 600]
     assert not active(drive(program, commands)).any()
 
 
 @pytest.mark.parametrize("setting", ["MIMO_EX_AMP nan", "MIMO_EX_AMP 0.9", "MIMO_EX_HMIN 0", "MIMO_EX_HMAX 1"])
-def test_settings_that_make_no_sense_are_refused(program, setting):
+def test_invalid_excitation_settings_are_refused(program, setting):
     result = excited(program, settings=[f"param {setting}"])
     assert not active(result).any()
     assert "refused" in last_end(result)
 
 
 def pulses(signs):
-    """Lengths of the whole pulses between changes of sign."""
+    """Lengths of the complete pulses between sign changes."""
     return np.diff(np.flatnonzero(np.diff(signs)))
 
 
-def test_the_pulses_are_those_of_the_tuning_rooms_prbs(programs):
+def test_the_pulses_have_the_distribution_of_tunings_prbs(programs):
     for shortest, longest in ((10, 60), (1, 3), (7, 7)):
         lengths = []
         for seed in range(5):
@@ -361,7 +361,7 @@ def by_sticks(program, *commands, attitude=1):
     return drive(program, [*AIRBORNE, f"mode 1 1 0 {attitude} 15", "sticks 1 0 0 0 0", *[STEP] * 300, *commands])
 
 
-def test_sticks_command_the_tilt_that_px4_would(program):
+def test_sticks_command_the_same_tilt_as_in_px4(program):
     tilt = np.radians(PX4_PARAMETERS["MPC_MAN_TILT_MAX"])
     for roll, pitch in ((0.5, 0.0), (0.0, 0.5), (1.0, 1.0), (-0.3, 0.6)):
         out = by_sticks(program, f"sticks 1 {roll} {pitch} 0 0", STEP, STEP).out
@@ -373,7 +373,7 @@ def test_sticks_command_the_tilt_that_px4_would(program):
         assert np.sign(out["rates"][-1, 0]) == np.sign(roll) or roll == 0
 
 
-def test_the_throttle_is_hover_in_the_middle_and_zero_until_the_motors_have_spooled_up(program):
+def test_centre_throttle_is_hover_thrust_and_thrust_is_zero_until_spool_up_ends(program):
     out = by_sticks(program, "sticks 1 0 0 0 1", STEP, STEP, "sticks 1 0 0 0 -1", STEP, STEP).out
     thrust = -out["thrust"][:, 2]
     assert (thrust[:240] == 0).all()
@@ -382,7 +382,7 @@ def test_the_throttle_is_hover_in_the_middle_and_zero_until_the_motors_have_spoo
     assert thrust[-1] == pytest.approx(0.08, abs=1e-6)
 
 
-def test_the_yaw_stick_turns_and_the_heading_is_held_after_it(program):
+def test_the_yaw_stick_commands_a_rate_and_then_the_heading_is_held(program):
     out = by_sticks(program, "sticks 1 0 0 0.5 0", STEP, STEP).out
     assert out["rates"][-1, 2] == pytest.approx(0.5 * np.radians(PX4_PARAMETERS["MPC_MAN_Y_MAX"]), rel=1e-5)
     turned = f"attitude {text(*quaternion(0, 0, 0.4))} 0 1 0 0 0"
@@ -392,31 +392,31 @@ def test_the_yaw_stick_turns_and_the_heading_is_held_after_it(program):
     assert out["rates"][-1, 2] > 0.1
 
 
-def test_the_heading_follows_while_the_throttle_is_at_the_bottom(program):
+def test_the_heading_is_not_held_at_minimum_throttle(program):
     turned = f"attitude {text(*quaternion(0, 0, 0.4))} 0 1 0 0 0"
     for throttle, heading in ((-1, 0.4), (0, 0.0)):
         out = by_sticks(program, f"sticks 1 0 0 0 {throttle}", turned, STEP, STEP).out
         assert out["wanted"][-1, 2] == pytest.approx(heading, abs=1e-5)
 
 
-def test_a_reset_heading_moves_the_heading_that_the_sticks_hold(program):
+def test_a_heading_reset_shifts_the_held_heading(program):
     step = quaternion(0, 0, 0.4)
     out = by_sticks(program, f"attitude {text(*step)} 1 {text(*step)}", STEP, STEP).out
     assert out["wanted"][-1, 2] == pytest.approx(0.4, abs=1e-5)
 
 
-def test_the_lowest_throttle_on_the_ground_is_zero(program):
+def test_minimum_throttle_on_the_ground_is_zero_thrust(program):
     out = by_sticks(program, "sticks 1 0 0 0 -1", "land 1 0", STEP, STEP).out
     assert out["thrust"][-1, 2] == pytest.approx(0, abs=1e-6)
 
 
-def test_acro_flies_as_stabilized_and_says_so(program):
+def test_acro_flies_as_stabilized_with_an_error_message(program):
     result = by_sticks(program, "sticks 1 0.5 0 0 0", STEP, STEP, attitude=0)
     assert sum("Acro flies as Stabilized" in line for line in result.log) == 1
     assert result.out["wanted"][-1, 0] == pytest.approx(0.5 * np.radians(35), abs=1e-3)
 
 
-def test_other_gains_compile_and_fly_their_own_numbers(gains, tmp_path):
+def test_other_gains_use_their_own_values_and_period(gains, tmp_path):
     other = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, Ts=0.002), moment_scale=None)
     program = build(other, "crtp", tmp_path)
     start = ["gyro_interval 2000", *AIRBORNE, *["gyro 2000 0.1 -0.2 0.3"] * 20]

@@ -1,4 +1,4 @@
-"""The emitted tree: what is in it, that it is deterministic, and that it compiles and passes its own test."""
+"""The emitted tree: its files, the same bytes each time, compilation, and its own test."""
 
 import dataclasses
 import json
@@ -25,7 +25,7 @@ def read_tree(folder):
     return {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_the_same_gains_give_the_same_bytes_and_nothing_is_rewritten(gains, tmp_path):
+def test_the_same_gains_give_the_same_bytes_and_no_file_is_rewritten(gains, tmp_path):
     assert write_tree(render(gains), tmp_path / "x") == list(render(gains))
     stamps = {p: p.stat().st_mtime_ns for p in (tmp_path / "x").rglob("*")}
     assert write_tree(render(gains), tmp_path / "x") == []
@@ -34,7 +34,7 @@ def test_the_same_gains_give_the_same_bytes_and_nothing_is_rewritten(gains, tmp_
 
 
 @pytest.mark.parametrize("target", targets())
-def test_the_output_tree_looks_like_the_template_tree(gains, target):
+def test_the_output_tree_has_the_layout_of_the_template_tree(gains, target):
     files = render(gains, target)
     expected = {"manifest.json"}
     for path in (p for folder in targets()[target].folders for p in (TEMPLATES / folder).rglob("*") if p.is_file()):
@@ -47,13 +47,13 @@ def test_the_output_tree_looks_like_the_template_tree(gains, target):
     assert set(files) == expected
 
 
-def test_the_manifest_holds_the_hash_of_every_file(gains):
+def test_the_manifest_lists_the_hash_of_every_file(gains):
     files = render(gains)
     manifest = json.loads(files.pop("manifest.json"))
     assert manifest["files"] == {name: sha256(content) for name, content in files.items()}
 
 
-def test_nothing_generated_speaks_of_this_machine(gains, tmp_path):
+def test_no_generated_file_names_this_machine(gains, tmp_path):
     text = "\n".join(content for target in targets() for content in render(gains, target).values())
     for word in (str(tmp_path), str(Path.cwd()), str(TEMPLATES), os.uname().nodename):
         assert word not in text
@@ -62,13 +62,13 @@ def test_nothing_generated_speaks_of_this_machine(gains, tmp_path):
 FOREIGN = {
     "another file": {"mine.txt": "keep"},
     "a manifest of another program": {"manifest.json": '{"generator": "theirs", "files": {}}'},
-    "a manifest that is no JSON": {"manifest.json": "keep"},
+    "a manifest that is not JSON": {"manifest.json": "keep"},
     "a manifest of another shape": {"manifest.json": "[1]"},
 }
 
 
 @pytest.mark.parametrize("case", FOREIGN)
-def test_a_folder_of_others_is_not_touched_unless_forced(gains, tmp_path, case):
+def test_a_folder_with_foreign_files_is_not_changed_unless_forced(gains, tmp_path, case):
     for name, text in FOREIGN[case].items():
         (tmp_path / name).write_text(text)
     with pytest.raises(CodegenError, match=r"did not generate.*--force"):
@@ -78,7 +78,7 @@ def test_a_folder_of_others_is_not_touched_unless_forced(gains, tmp_path, case):
     assert read_tree(tmp_path) == FOREIGN[case] | render(gains)
 
 
-def test_a_file_of_others_in_a_folder_of_ours_is_not_overwritten_unless_forced(gains, tmp_path):
+def test_a_foreign_file_in_a_generated_folder_is_not_overwritten_unless_forced(gains, tmp_path):
     write_tree(render(gains), tmp_path)
     mine = tmp_path / "px4/src/CMakeLists.txt"
     mine.parent.mkdir(parents=True)
@@ -90,7 +90,7 @@ def test_a_file_of_others_in_a_folder_of_ours_is_not_overwritten_unless_forced(g
     assert "px4/src/CMakeLists.txt" in write_tree(render(gains, "px4"), tmp_path, force=True)
 
 
-def test_a_tree_of_ours_takes_another_target_and_keeps_what_was_added(gains, tmp_path):
+def test_another_target_is_added_to_a_generated_tree_and_foreign_files_stay(gains, tmp_path):
     write_tree(render(gains), tmp_path)
     (tmp_path / "notes.txt").write_text("keep")
     write_tree(render(gains, "px4"), tmp_path)
@@ -98,21 +98,21 @@ def test_a_tree_of_ours_takes_another_target_and_keeps_what_was_added(gains, tmp
 
 
 @pytest.mark.parametrize("taken", ["core", "manifest.json", "native/Makefile"])
-def test_nothing_is_written_when_a_place_is_taken(gains, tmp_path, taken):
+def test_nothing_is_written_when_a_path_is_taken(gains, tmp_path, taken):
     blocked = tmp_path / "x" / taken
     if "." in taken or taken.endswith("Makefile"):
         blocked.mkdir(parents=True)
     else:
         blocked.parent.mkdir(parents=True)
-        blocked.write_text("a file where a folder must be")
+        blocked.write_text("a file in place of a folder")
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(CodegenError, match="give --out"):
         write_tree(render(gains), tmp_path / "x", force=True)
     assert sorted(tmp_path.rglob("*")) == before
 
 
-def test_a_folder_that_cannot_be_written_to_is_refused_before_anything_is_written(gains, tmp_path, monkeypatch):
-    # Root may write everywhere, so the answer of the operating system is made up.
+def test_a_folder_that_is_not_writable_is_refused_before_anything_is_written(gains, tmp_path, monkeypatch):
+    # Root may write everywhere, so the answer of the system is simulated.
     monkeypatch.setattr("mimopilot.codegen.render.os.access", lambda path, mode: Path(path).name != "core")
     (tmp_path / "x" / "core").mkdir(parents=True)
     with pytest.raises(CodegenError, match="core: cannot be written to; give --out"):
@@ -138,7 +138,7 @@ def test_no_link_is_followed_out_of_the_tree(gains, tmp_path, force, name, targe
     assert {path: path.is_file() and path.read_bytes() for path in tmp_path.rglob("*")} == before
 
 
-def test_a_device_or_a_pipe_in_a_files_place_is_refused_before_anything_is_written(gains, tmp_path):
+def test_a_device_or_a_pipe_in_place_of_a_file_is_refused_before_anything_is_written(gains, tmp_path):
     (tmp_path / "native").mkdir()
     os.mkfifo(tmp_path / "native/Makefile")
     with pytest.raises(CodegenError, match="native/Makefile: is a device or a pipe"):
@@ -191,7 +191,7 @@ def test_no_optimisation_flag_changes_a_bit(gains, tmp_path, flags):
 
 
 @pytest.mark.parametrize("flags", FAST_MATH)
-def test_fast_math_is_refused_by_the_code_itself(gains, tmp_path, flags):
+def test_the_core_refuses_to_compile_with_fast_math(gains, tmp_path, flags):
     write_tree(render(gains), tmp_path / "x")
     result = make(tmp_path / "x", "test", CXXFLAGS=f"-std=c++17 {flags}")
     assert result.returncode != 0
@@ -233,12 +233,12 @@ def test_a_literal_reads_back_to_the_same_bits(value):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e39])
-def test_no_literal_is_emitted_for_a_number_that_is_not_finite(value):
+def test_a_number_that_is_not_finite_is_refused_as_a_literal(value):
     with pytest.raises(CodegenError, match="correct the gains file"):
         float_literal(value)
 
 
-def test_parameter_names_fit_a_vehicle():
+def test_parameter_names_are_valid_on_a_vehicle():
     table = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
     assert len({p.name for p in table}) == len(table)
     for parameter in table:
@@ -247,7 +247,7 @@ def test_parameter_names_fit_a_vehicle():
         assert parameter.minimum < parameter.maximum
 
 
-def test_a_gain_out_of_its_range_is_refused_by_name(gains):
+def test_a_gain_out_of_range_is_refused_by_name(gains):
     with pytest.raises(TuningError, match=r"MIMO_RP_RR: got 99 s, expected 0.0001 to 5"):
         render(gains.with_elements({"RP_RR": 99.0}))
 
@@ -255,13 +255,13 @@ def test_a_gain_out_of_its_range_is_refused_by_name(gains):
 @pytest.mark.parametrize(
     ("name", "reason"),
     [
-        ("MIMO_RATE_P_ROLL_", "a name of 17 characters"),
+        ("MIMO_RATE_P_ROLL_", "has 17 characters"),
         ("MIMO_RP_RR", "two parameters"),
         ("2_MIMO", "expected a letter"),
         ("mimo_rp", "expected a letter"),
     ],
 )
-def test_a_name_that_a_vehicle_would_garble_is_refused(gains, monkeypatch, name, reason):
+def test_a_name_that_is_invalid_on_a_vehicle_is_refused(gains, monkeypatch, name, reason):
     odd = dataclasses.replace(EXCITATION[0], name=name)
     monkeypatch.setattr("mimopilot.tuning.parameters.EXCITATION", (odd,))
     with pytest.raises(TuningError, match=f"{name}: {reason}"):
@@ -270,4 +270,4 @@ def test_a_name_that_a_vehicle_would_garble_is_refused(gains, monkeypatch, name,
 
 def test_an_unknown_target_is_refused(gains):
     with pytest.raises(CodegenError, match="expected one of cortex-m4, native, px4"):
-        render(gains, "toaster")
+        render(gains, "unknown")

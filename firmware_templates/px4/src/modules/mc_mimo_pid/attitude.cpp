@@ -45,7 +45,7 @@ void setpoint_angles(const float (&q_d)[4], float heading, float (&roll_pitch_ya
 		return;
 	}
 
-	// The body's z axis, in NED and then turned into the heading's frame: (sin pitch cos roll, -sin roll, cos pitch cos roll).
+	// Body z axis in NED, then rotated into the heading frame: (sin pitch cos roll, -sin roll, cos pitch cos roll).
 	const float north = 2.0F * (q_d[1] * q_d[3] + q_d[0] * q_d[2]);
 	const float east = 2.0F * (q_d[2] * q_d[3] - q_d[0] * q_d[1]);
 	const float down = 1.0F - 2.0F * (q_d[1] * q_d[1] + q_d[2] * q_d[2]);

@@ -4,12 +4,12 @@ namespace mimopilot {
 
 namespace {
 
-constexpr float kStickMove = 0.1F;
+constexpr float kStickMove = 0.1F;       // of -1 to 1
 constexpr float kMaxAmplitude = 0.5F;
 constexpr float kMaxTilt = 1.0F;         // rad
 constexpr int32_t kMaxSamples = 1000000;
 
-// A range test, not isfinite: it catches NaN too, and survives every optimisation flag.
+// A range test rejects NaN too; optimisation flags may remove isfinite.
 bool between(float value, float low, float high) { return value >= low && value <= high; }
 bool between(int32_t value, int32_t low, int32_t high) { return value >= low && value <= high; }
 
@@ -27,7 +27,7 @@ void Prbs::restart(uint32_t seed, int32_t hold_min, int32_t hold_max)
 {
 	_state = (seed + 1U) * 2654435769U;
 
-	if (_state == 0U) { _state = 1U; }  // the one value that xorshift cannot leave
+	if (_state == 0U) { _state = 1U; }  // xorshift never leaves 0
 
 	_hold_min = hold_min;
 	_hold_max = hold_max;
@@ -142,7 +142,7 @@ void Excitation::begin(Phase phase)
 	_phase = phase;
 	_left = phase == Phase::Pause ? _settings.pause : _settings.duration;
 
-	// Each axis has a sequence of its own, that begins with a whole pulse.
+	// Each axis has its own sequence, starting with a whole pulse.
 	const uint32_t seed = 2U * static_cast<uint32_t>(_settings.seed) + (phase == Phase::Pitch ? 1U : 0U);
 	_prbs.restart(seed, _settings.hold_min, _settings.hold_max);
 }

@@ -1,12 +1,12 @@
-// The excitation experiment: a pseudo-random binary moment, added after the controller, on roll, on pitch, or on
-// one after the other. No PX4 in here: it is compiled and tested on any machine.
+// The excitation: a pseudo-random binary torque, added to the controller output on roll, on pitch, or on roll and
+// then pitch. Needs no PX4, so that any machine can compile and test it.
 #pragma once
 
 #include <stdint.h>
 
 namespace mimopilot {
 
-// Two values of alternating sign, each held for a random number of samples, hold_min to hold_max, both included.
+// Alternates between +1 and -1, each held for a random number of samples from hold_min to hold_max inclusive.
 class Prbs
 {
 public:
@@ -25,7 +25,7 @@ private:
 
 struct ExcitationSettings {
 	int32_t axis;       // 0 none, 1 roll, 2 pitch, 3 roll then pitch
-	float amplitude;    // dimensionless moment
+	float amplitude;    // normalised torque
 	int32_t hold_min;   // samples
 	int32_t hold_max;   // samples
 	int32_t duration;   // samples on each axis
@@ -40,9 +40,9 @@ struct ExcitationConditions {
 	float sticks[4];        // -1 to 1; all 0 without a remote control
 };
 
-// Choosing an axis asks for one run. It begins when the vehicle is ready, and ends by itself or when the vehicle is no
-// longer ready, tilts too far, or a stick moves; another run needs axis 0 first. What was chosen before the
-// first configure(), such as a parameter left from an earlier flight, asks for nothing.
+// An axis chosen after 0 requests one run. It starts when the vehicle is ready. It stops early if the vehicle is no
+// longer ready, tilts too far, or a stick moves. An axis already set at the first configure(), such as a parameter left
+// from an earlier flight, requests nothing.
 class Excitation
 {
 public:
@@ -68,8 +68,8 @@ private:
 	End _end{End::None};
 	bool _configured{false};
 	int32_t _chosen{0};  // axis of the last configure()
-	int32_t _left{0};    // samples of this phase
-	float _sticks[4]{};  // where they were at the beginning
+	int32_t _left{0};    // samples, this phase
+	float _sticks[4]{};  // at the start
 };
 
 }  // namespace mimopilot

@@ -1,11 +1,11 @@
-// The controller has a fixed period: these watch whether the gyro keeps it.
+// The controller has a fixed period: check that the gyro keeps it.
 #pragma once
 
 #include <stdint.h>
 
 namespace mimopilot {
 
-// True when `samples` intervals from `first` to `last` (us) last one period (s) each on average, to 5 %.
+// True if the mean of `samples` intervals from `first` to `last` (us) is one period (s), to 5 %.
 inline bool keeps_period(uint64_t first, uint64_t last, uint32_t samples, float period)
 {
 	if (samples == 0U || last <= first) { return false; }
@@ -19,8 +19,8 @@ class SampleClock
 public:
 	explicit SampleClock(float period) : _period(static_cast<uint64_t>(1.0e6F * period + 0.5F)) {}
 
-	// False: the time is not later than the last one, so there is no new sample. An interval outside
-	// 0.5 to 1.5 periods is counted as a fault.
+	// False: the time is not later than the last, so this is no new sample. Counts that, and an interval
+	// outside 0.5 to 1.5 periods, as a fault.
 	bool advance(uint64_t timestamp)
 	{
 		if (_last != 0U && timestamp <= _last) {

@@ -8,7 +8,7 @@ namespace {
 
 constexpr float kDeadzone = 0.1F;
 
-// A stick that is not there, NaN, is in the middle.
+// A missing stick, NaN, counts as centred.
 float valid(float stick) { return stick >= -1.0F && stick <= 1.0F ? stick : 0.0F; }
 
 float thrust_curve(const StickSettings &settings, float throttle)
@@ -31,7 +31,7 @@ StickSetpoint Sticks::setpoint(const StickSettings &settings, const StickInput &
 
 	_holding = true;
 
-	// The sticks point to where the vehicle goes: their direction is that of the tilt, their length its angle.
+	// As in PX4: the stick vector's direction is the direction of tilt, its length the tilt angle.
 	float roll = valid(input.roll);
 	float pitch = -valid(input.pitch);
 	const float length = sqrtf(roll * roll + pitch * pitch);

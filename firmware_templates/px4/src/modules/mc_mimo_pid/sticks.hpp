@@ -1,5 +1,5 @@
-// Sticks to an attitude set-point, for the modes in which a pilot commands angles: this module replaces the attitude
-// controller, which makes them otherwise.
+// Makes the attitude setpoint from the sticks in Stabilized mode, as mc_att_control does, which this module
+// replaces.
 #pragma once
 
 namespace mimopilot {
@@ -7,7 +7,7 @@ namespace mimopilot {
 struct StickSettings {
 	float tilt_max;      // rad, full roll or pitch stick
 	float yaw_rate_max;  // rad/s, full yaw stick
-	float thrust_min;    // throttle at the bottom, middle and top, 0 to 1
+	float thrust_min;    // at bottom, middle and top throttle, 0 to 1
 	float thrust_hover;
 	float thrust_max;
 };
@@ -28,10 +28,10 @@ struct StickSetpoint {
 class Sticks
 {
 public:
-	// Hold the heading that the vehicle has at the next setpoint().
+	// The next setpoint() holds the heading it is given.
 	void release() { _holding = false; }
 
-	// The estimator's heading was reset by this angle.
+	// The estimator reset its heading by this, rad.
 	void shift(float angle) { _heading += angle; }
 
 	// The heading is held while the yaw stick is centred and the throttle is not at the bottom.

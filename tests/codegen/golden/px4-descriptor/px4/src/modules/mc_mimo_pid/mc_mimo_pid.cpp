@@ -13,10 +13,10 @@ using namespace mimopilot;
 
 namespace {
 
-constexpr float kRadian = 0.017453293F;  // of a degree
+constexpr float kRadian = 0.017453293F;  // rad/deg
 constexpr char kExcitationName[] = "MIMO_EXC";
 
-// An optional field of a topic: NaN means that it is not set.
+// An optional field of a topic: NaN means not set.
 float optional(float value) { return PX4_ISFINITE(value) ? value : 0.0F; }
 
 const char *describe(Excitation::Phase phase)
@@ -53,7 +53,7 @@ const char *describe(Excitation::End end)
 	}
 }
 
-// Whether the gyro is published once a control period, watched for a second.
+// Whether the gyro publishes once per control period, measured for a second.
 bool gyro_keeps_period()
 {
 	uORB::Subscription gyro{ORB_ID(vehicle_angular_velocity)};
@@ -64,7 +64,7 @@ bool gyro_keeps_period()
 	px4_usleep(1000000);
 
 	if (!seen || !gyro.copy(&last)) {
-		PX4_ERR("no vehicle_angular_velocity; not started");
+		PX4_ERR("not started: no vehicle_angular_velocity");
 		return false;
 	}
 
@@ -72,7 +72,7 @@ bool gyro_keeps_period()
 
 	if (!keeps_period(first.timestamp_sample, last.timestamp_sample, samples, kGains.period)) {
 		const double seconds = 1e-6 * static_cast<double>(last.timestamp_sample - first.timestamp_sample);
-		PX4_ERR("the gyro comes at %.1f Hz, the gains are for %.1f Hz; set IMU_GYRO_RATEMAX and reboot. Not started",
+		PX4_ERR("not started: gyro rate is %.1f Hz, gains are for %.1f Hz; set IMU_GYRO_RATEMAX and reboot",
 			static_cast<double>(samples) / seconds, 1.0 / static_cast<double>(kGains.period));
 		return false;
 	}
@@ -112,7 +112,7 @@ void McMimoPid::update_parameters()
 	const mimo_pid_parameter *const wrong = _parameters.gains(gains);
 
 	if (wrong != nullptr) {
-		PX4_ERR("%s is not within %g to %g: all gains stay as they were", wrong->name,
+		PX4_ERR("%s is not within %g to %g: no gain changed", wrong->name,
 			static_cast<double>(wrong->minimum), static_cast<double>(wrong->maximum));
 
 	} else if (memcmp(&gains, &_state.gains, sizeof(gains)) != 0) {
@@ -149,8 +149,8 @@ void McMimoPid::Run()
 	perf_end(_cycle_perf);
 }
 
-// One controller at a time: this one publishes nothing while another owns the torque or the rate set-point. When the
-// other has stopped, it takes over within two samples.
+// Only one controller at a time: do not publish while another one advertises the torque or rate setpoint.
+// Takes over within two samples after the other has stopped.
 bool McMimoPid::take_over()
 {
 	if (!_in_control) {
@@ -158,7 +158,7 @@ bool McMimoPid::take_over()
 		_in_control = free && _topics_free;
 		_topics_free = free;
 
-		// mc_att_control also withdrew this topic as it stopped; its other publishers do not renew it.
+		// mc_att_control unadvertised this topic when it stopped; other publishers do not advertise it again.
 		if (_in_control) { _vehicle_attitude_setpoint_pub.advertise(); }
 	}
 
@@ -173,7 +173,7 @@ void McMimoPid::update_inputs()
 	if (_vehicle_control_mode_sub.update(&_control_mode)) {
 		const bool refused = _control_mode.flag_control_rates_enabled && !_control_mode.flag_control_attitude_enabled;
 
-		if (refused && !_mode_refused) { PX4_ERR("no rate modes: Acro flies as Stabilized, off-board rates are ignored"); }
+		if (refused && !_mode_refused) { PX4_ERR("no rate modes: Acro flies as Stabilized, Offboard rates are ignored"); }
 
 		_mode_refused = refused;
 	}
@@ -254,7 +254,7 @@ void McMimoPid::update_setpoint()
 
 	setpoint_angles(_q_d, _input.attitude[2], _input.attitude_setpoint);
 
-	// The outer loop adds its P to an angle: this angle makes it add the yaw rate that is wanted.
+	// Yaw rate feed-forward: the attitude controller's gain turns this angle into the yaw rate setpoint.
 	const float gain = _state.gains.yaw_kp_o;
 
 	if (gain > 0.1F) { _input.attitude_setpoint[2] += fminf(fmaxf(_yaw_rate / gain, -1.5F), 1.5F); }
@@ -351,7 +351,7 @@ void McMimoPid::publish(const vehicle_angular_velocity_s &angular_velocity, cons
 	thrust.timestamp = hrt_absolute_time();
 	_vehicle_thrust_setpoint_pub.publish(thrust);
 
-	// Last, because the allocator runs when the torque arrives.
+	// Last, because the torque setpoint triggers the allocator.
 	vehicle_torque_setpoint_s torque{};
 	memcpy(torque.xyz, output.moment, sizeof(torque.xyz));
 	torque.timestamp_sample = angular_velocity.timestamp_sample;
@@ -383,10 +383,11 @@ int McMimoPid::task_spawn(int argc, char *argv[])
 
 int McMimoPid::print_status()
 {
-	PX4_INFO("%s, %u bad inputs, %u bad sample times", _in_control ? "in control" : "waits until the other controllers stop",
+	PX4_INFO("%s, %u bad inputs, %u bad sample times",
+		 _in_control ? "in control" : "waiting for the other controllers to stop",
 		 static_cast<unsigned>(_output.fault_count), static_cast<unsigned>(_clock.faults()));
 
-	if (_output.fault != 0) { PX4_INFO("only damping: inputs are missing, bits 0x%x", static_cast<unsigned>(_output.fault)); }
+	if (_output.fault != 0) { PX4_INFO("only damping rates: invalid inputs 0x%x", static_cast<unsigned>(_output.fault)); }
 
 	PX4_INFO("excitation %s, last one: %s", describe(_excitation.phase()), describe(_excitation.end()));
 	const float *const gains = &_state.gains.kp_o[0][0];
@@ -409,8 +410,8 @@ int McMimoPid::print_usage(const char *reason)
 		R"DESCR_STR(
 ### Description
 Cascaded P + PID attitude controller with full 2x2 gains for roll and pitch, generated by mimopilot. It replaces
-mc_att_control and mc_rate_control: start it, and stop them when it has started. It refuses to start when the gyro
-does not come at the rate that its gains are for.
+mc_att_control and mc_rate_control: start it, then stop both of them. It does not start if the gyro rate is not the
+one its gains are for.
 
 )DESCR_STR");
 

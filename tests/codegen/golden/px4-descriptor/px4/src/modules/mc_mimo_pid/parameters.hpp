@@ -14,8 +14,8 @@ class MimoParameters : public ModuleParams
 public:
 	explicit MimoParameters(ModuleParams *parent) : ModuleParams(parent) {}
 
-	// The gains that are set. Returns null, or the first parameter whose value is out of its range: PX4 stores any.
-	// The period is that of the firmware.
+	// Reads the gains. Returns null, or the first parameter out of its range, because PX4 stores any value.
+	// The period is fixed in the firmware.
 	const mimo_pid_parameter *gains(mimopilot::Gains &gains) const
 	{
 		const float values[MIMO_PID_PARAMETER_COUNT] = {
@@ -63,7 +63,7 @@ public:
 			if (!(values[i] >= parameter.minimum && values[i] <= parameter.maximum)) { return &parameter; }
 		}
 
-		static_assert(sizeof(values) == sizeof(gains), "the parameter table is Gains as an array");
+		static_assert(sizeof(values) == sizeof(gains), "the parameter table must fit Gains");
 		memcpy(&gains, values, sizeof(gains));
 		return nullptr;
 	}
@@ -84,7 +84,7 @@ public:
 
 	int32_t excitation_mode() const { return _mimo_ex_mode.get(); }
 
-	// What PX4's own controllers use in the modes that a pilot flies by angles.
+	// PX4's own parameters for Stabilized mode.
 	float tilt_max() const { return _mpc_man_tilt_max.get(); }          // deg
 	float yaw_rate_max() const { return _mpc_man_y_max.get(); }         // deg/s
 	float thrust_min() const { return _mpc_manthr_min.get(); }

@@ -1,4 +1,4 @@
-// Feeds topics to the emitted module and prints what it publishes, floats as 32-bit words. Reads one command a line.
+// Publishes topics for the emitted module and prints what it publishes, floats as 32-bit words. One command a line.
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -68,7 +68,7 @@ namespace {
 template<typename T>
 void publish(const orb_metadata *meta, const T &message)
 {
-	// Never unadvertised: these publishers outlive the module.
+	// Never unadvertised, because these publishers outlive the module.
 	static uORB::Publication<T> *const publication = new uORB::Publication<T>(meta);
 	publication->publish(message);
 }
@@ -102,7 +102,7 @@ void words(const float *values, int count)
 	}
 }
 
-// torque, rate set-point, integral, excitation, thrust; then the angles as the module's own functions see them.
+// torque, rate setpoint, integral, excitation, thrust; then the angles from the module's own functions.
 void print_published()
 {
 	const auto torque = last<vehicle_torque_setpoint_s>(ORB_ID(vehicle_torque_setpoint));
@@ -270,7 +270,7 @@ void execute(Line &line)
 
 }  // namespace
 
-// Time passes, and the gyro goes on.
+// The gyro publishes while time passes.
 int px4_usleep(unsigned microseconds)
 {
 	const uint64_t end = now + microseconds;

@@ -1,4 +1,4 @@
-// As after PX4 v1.17.
+// PX4 after v1.17.
 #pragma once
 
 #include <string.h>

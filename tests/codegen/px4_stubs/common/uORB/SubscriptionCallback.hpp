@@ -5,7 +5,7 @@
 
 namespace uORB {
 
-extern px4::WorkItem *scheduled;  // defined by the host program: who runs when the gyro is published
+extern px4::WorkItem *scheduled;  // defined by the host program: runs when the gyro publishes
 
 class SubscriptionCallbackWorkItem : public Subscription
 {

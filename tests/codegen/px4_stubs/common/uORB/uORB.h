@@ -14,7 +14,7 @@ struct orb_metadata {
 
 namespace uORB {
 
-// What a topic holds: its last message.
+// A topic and its last message.
 struct Node {
 	std::vector<uint8_t> message;
 	unsigned generation{0};

@@ -1,6 +1,6 @@
 #pragma once
 
-// Defined by the host program: what a module says is part of what is tested.
+// Defined by the host program, because tests check the module's messages.
 extern "C" void px4_log(const char *level, const char *format, ...) __attribute__((format(printf, 2, 3)));
 
 #define PX4_INFO(...) px4_log("INFO", __VA_ARGS__)

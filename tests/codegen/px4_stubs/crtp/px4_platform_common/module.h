@@ -1,4 +1,4 @@
-// As up to PX4 v1.17.
+// PX4 up to v1.17.
 #pragma once
 
 #include <string.h>

@@ -4,7 +4,7 @@
 
 #include <vector>
 
-// Generated from module.yaml by the test, as PX4's build does: enum px4::params, its types, APPLY_ALL.
+// The test generates it from module.yaml, as PX4's build does: enum px4::params, its types, APPLY_ALL.
 #include "generated_parameters.hpp"
 
 class ModuleParams
@@ -59,12 +59,12 @@ private:
 	int32_t _value{static_cast<int32_t>(px4::values()[static_cast<int>(p)])};
 };
 
-#define STAND_IN_TYPE(...) __VA_ARGS__
-#define STAND_IN_SKIP(...)
-#define STAND_IN_DECLARE(pair) STAND_IN_TYPE pair;
-#define STAND_IN_UPDATE(pair) STAND_IN_SKIP pair.update();
+#define STUB_TYPE(...) __VA_ARGS__
+#define STUB_SKIP(...)
+#define STUB_DECLARE(pair) STUB_TYPE pair;
+#define STUB_UPDATE(pair) STUB_SKIP pair.update();
 #define DEFINE_PARAMETERS(...) \
-	APPLY_ALL(STAND_IN_DECLARE, __VA_ARGS__) \
+	APPLY_ALL(STUB_DECLARE, __VA_ARGS__) \
 protected: \
-	void updateParamsImpl() final { APPLY_ALL(STAND_IN_UPDATE, __VA_ARGS__) } \
+	void updateParamsImpl() final { APPLY_ALL(STUB_UPDATE, __VA_ARGS__) } \
 private:
