@@ -18,6 +18,8 @@ from mimopilot.tuning.errors import TuningError
 #: Before every code in a parameter's name.
 PREFIX = "MIMO_"
 AXES = ("roll", "pitch", "yaw")
+#: The axes that the matrices couple.
+ROLL_PITCH = AXES[:2]
 AXIS_LETTERS = "RPY"
 AXIS_NAMES = dict(zip(AXIS_LETTERS, AXES, strict=True))
 #: Longest name that MAVLink and PX4 carry.

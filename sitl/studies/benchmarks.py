@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mimopilot.tuning.design.refine import model_reference_cost
+from mimopilot.tuning.design.refine_on_model import model_reference_cost
 from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace

@@ -12,9 +12,9 @@ from mimopilot.sitl.flight.scenario import doublet, excitation_flight
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.mixer import allocate
-from mimopilot.tuning.analysis.compiled_doublet import allocated
+from mimopilot.tuning.analysis.compiled_doublet import allocate_commands
 from mimopilot.tuning.analysis.doublet_prediction import doublet_model
-from mimopilot.tuning.design.cascade import NO_MOTORS, tune
+from mimopilot.tuning.design.cascade import MOTORS_UNKNOWN, tune
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.motors import fit_motors, rotor_lag, saturation_warnings
@@ -90,7 +90,7 @@ def test_commands_are_those_of_the_flown_allocator(roll, pitch, collective):
     flown, unallocated = np.zeros(4), np.zeros(3)
     allocate(np.array([roll, pitch, 0.0]), collective, allocation, flown, unallocated)
     predicted = np.zeros(4)
-    share = allocated(allocation.mixer[:, :2] @ np.array([roll, pitch]), np.full(4, collective), predicted)
+    share = allocate_commands(allocation.mixer[:, :2] @ np.array([roll, pitch]), np.full(4, collective), predicted)
     assert predicted == pytest.approx(flown, abs=1e-7)
     if abs(share - 1) > 1e-6 and roll * pitch != 0:
         assert bool(unallocated[:2].any()) == (share < 1)
@@ -107,7 +107,7 @@ def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axi
     assert flight.record["commands"][slice(*task.window), :4].min() == 0  # a motor stood
 
     def deviation_deg(model):
-        angles, _ = model.fly(GainStack.of(gains))
+        angles, _ = model.simulate(GainStack.of(gains))
         return np.degrees(np.sqrt(np.mean((angles[axis, 0, :, axis] - flown) ** 2)))
 
     model = doublet_model(Measured(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
@@ -120,7 +120,7 @@ def test_the_drawn_out_switch_of_the_integral_hardly_changes_a_doublet(logs):
     log = logs["adam0_nominal"]
     model = doublet_model(Measured(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
     stack = GainStack.of(tune(log, thesis()))
-    sharp, soft = model.fly(stack)[0], model.fly(stack, 0.05)[0]
+    sharp, soft = model.simulate(stack)[0], model.simulate(stack, 0.05)[0]
     assert 0 < np.degrees(np.abs(soft - sharp).max()) < 0.5
 
 
@@ -145,8 +145,8 @@ def test_commands_are_read_at_any_rate_and_only_where_they_are_thrust_fractions(
 
 def test_a_tuning_says_that_it_does_not_know_the_motors(logs):
     log, spec = logs["adam0_nominal"], thesis(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
-    assert NO_MOTORS in tune(dataclasses.replace(log, motors=None), spec).provenance.warnings
-    assert NO_MOTORS not in tune(log, spec).provenance.warnings
+    assert MOTORS_UNKNOWN in tune(dataclasses.replace(log, motors=None), spec).provenance.warnings
+    assert MOTORS_UNKNOWN not in tune(log, spec).provenance.warnings
 
 
 def test_motors_at_their_ends_are_told_with_the_amplitude_that_avoids_it():

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.estimation.instrumental_variables import AXES, excited_stretches
+from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.logs.columns import SIGNALS
 from mimopilot.tuning.logs.recording import Recording
+from mimopilot.tuning.parameters import ROLL_PITCH as AXES
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.inertia import RigidBody, rigid_body
 from numpy.typing import NDArray

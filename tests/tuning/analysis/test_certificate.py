@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 from mimopilot.sitl.physics.airframe import Frame, load_airframe
-from mimopilot.tuning.analysis.certificate import certify, large_again
+from mimopilot.tuning.analysis.beyond_band import find_structural_mode
+from mimopilot.tuning.analysis.certificate import certify
 from mimopilot.tuning.certificate import Thresholds, Verdict
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError
@@ -117,14 +118,14 @@ def test_a_mode_of_the_frame_is_seen_and_what_it_makes_thin_or_unstable_is_not_c
             assert found.verdict in (Verdict.UNSTABLE, Verdict.NOT_CERTIFIED)
         elif truth.margins(gains, 500)[0] > 2.6:
             assert found.verdict not in (Verdict.CERTIFIED, Verdict.THIN)
-        again = large_again(gains, measured.response)
+        again = find_structural_mode(gains, measured.response)
         named += again is not None and abs(again[0] / omega - 1) < 0.05
     assert named >= 10
 
 
 def test_without_excitation_at_a_mode_its_neighbourhood_is_needed_and_noise_is_no_mode(flights):
     _, measured, _ = flights["adam0"]
-    assert large_again(load_airframe("adam0").default_gains(), measured.response) is None
+    assert find_structural_mode(load_airframe("adam0").default_gains(), measured.response) is None
 
 
 @pytest.mark.parametrize("name", ["y_i", "y_o"])

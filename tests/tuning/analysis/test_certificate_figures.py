@@ -9,8 +9,10 @@ import control
 import numpy as np
 import pytest
 from mimopilot.sitl.physics.airframe import Frame, load_airframe
-from mimopilot.tuning.analysis.certificate import DENSE, GROWING, certify, large_again, loop_above, sensitivity_peak
+from mimopilot.tuning.analysis.beyond_band import find_structural_mode, loop_gain_above
+from mimopilot.tuning.analysis.certificate import UNSTABLE_RADIUS, certify
 from mimopilot.tuning.analysis.closed_loop import cascade_loop, model_spectral_radius
+from mimopilot.tuning.analysis.stability_figures import GRID_STEP, sensitivity_peak
 from mimopilot.tuning.certificate import Thresholds, Verdict
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError
@@ -158,7 +160,7 @@ def test_a_loop_whose_peak_lies_between_two_frequencies_is_not_certified():
     )
     assert truth("adam0").spectral_radius(gains) > 1
     coarse = np.linalg.inv(np.eye(2) + cascade_loop(gains, plant).L_u)
-    fine = np.linalg.inv(np.eye(2) + cascade_loop(gains, plant.interpolated(DENSE)).L_u)
+    fine = np.linalg.inv(np.eye(2) + cascade_loop(gains, plant.interpolated(GRID_STEP)).L_u)
     seen, there = (np.linalg.norm(S, ord=2, axis=(1, 2)).max() for S in (coarse, fine))
     assert there > 1.5 * seen
     assert certify(gains, plant, *MODELS).verdict not in PASSED
@@ -272,7 +274,7 @@ def plain(kp=0.15, outer=4.0, ki=0.0, kd=0.0):
 
 
 def grid(end, start=1.0, step=1.02):
-    """Denser than `DENSE`: nothing is interpolated."""
+    """Denser than `GRID_STEP`: nothing is interpolated."""
     return start * step ** np.arange(np.floor(np.log(end / start) / np.log(step)) + 1)
 
 
@@ -325,7 +327,7 @@ def test_above_the_band_the_loop_may_reach_a_half(reached, verdict):
     """15 / s: where the excitation ends at 15 / 0.45 rad/s it may reach 0.45 above."""
     gains, omega = plain(), grid(60.0)
     plant = integrating(omega * 15 / reached / omega[-1])
-    assert loop_above(gains, plant) == pytest.approx(15 / plant.omega, rel=1e-9)
+    assert loop_gain_above(gains, plant) == pytest.approx(15 / plant.omega, rel=1e-9)
     found = certify(gains, plant, *MODELS)
     assert found.verdict == verdict
     if verdict == Verdict.NOT_CERTIFIED:
@@ -338,21 +340,21 @@ def test_what_the_loop_reaches_above_is_the_largest_that_a_falling_plant_allows(
     w = np.linspace(50, np.pi / TS, 20000)
     z, a = np.exp(1j * w * TS), np.exp(-2 * np.pi * 30 * TS)
     controller = 0.15 + 0.004 * (1 - a) * (z - 1) / (TS * (z - a))
-    assert loop_above(gains, plant)[-1] == pytest.approx(np.max(100 / w * np.abs(controller)), rel=0.01)
+    assert loop_gain_above(gains, plant)[-1] == pytest.approx(np.max(100 / w * np.abs(controller)), rel=0.01)
 
 
 def test_what_the_loop_reaches_above_the_band_is_less_moved_by_noise():
     """w |G| does not rise: the fit by such a sequence is nearer to the truth than the last value alone."""
     gains = defaults()
     plant, rng = exact(truth("adam0").plant, np.linspace(2.0, 110.0, 50)), np.random.default_rng(3)
-    true = loop_above(gains, plant)[-1]
+    true = loop_gain_above(gains, plant)[-1]
     fitted, last = [], []
     for _ in range(200):
         shape = (50, 2, 2)
         noise = (rng.normal(size=shape) + 1j * rng.normal(size=shape)) * 0.1
         noisy = dataclasses.replace(plant, G_i=plant.G_i + noise * np.abs(plant.G_i).max(axis=(1, 2), keepdims=True))
-        fitted.append(loop_above(gains, noisy)[-1] / true - 1)
-        last.append(loop_above(gains, noisy.at([-1]))[-1] / true - 1)
+        fitted.append(loop_gain_above(gains, noisy)[-1] / true - 1)
+        last.append(loop_gain_above(gains, noisy.at([-1]))[-1] / true - 1)
     assert np.std(fitted) < 0.8 * np.std(last)
     assert abs(np.mean(fitted)) < abs(np.mean(last))
 
@@ -407,22 +409,22 @@ def with_peak(at, size, error=0.0, coherence=(0.0, 0.0)):
 
 
 def test_a_gain_that_is_large_again_is_found_with_its_frequency_and_its_error():
-    assert large_again(plain(), integrating(grid(100.0))) is None
-    assert large_again(plain(), with_peak(150.0, 0.45)) is None
-    assert large_again(plain(), with_peak(150.0, 0.6)) == pytest.approx((150.0, 0.6))
+    assert find_structural_mode(plain(), integrating(grid(100.0))) is None
+    assert find_structural_mode(plain(), with_peak(150.0, 0.45)) is None
+    assert find_structural_mode(plain(), with_peak(150.0, 0.6)) == pytest.approx((150.0, 0.6))
     # sqrt(4) deviations of an element.
-    assert large_again(plain(), with_peak(150.0, 0.45, 0.04)) == pytest.approx((150.0, 0.53))
-    assert large_again(plain(), with_peak(150.0, 0.45, 0.02)) is None
+    assert find_structural_mode(plain(), with_peak(150.0, 0.45, 0.04)) == pytest.approx((150.0, 0.53))
+    assert find_structural_mode(plain(), with_peak(150.0, 0.45, 0.02)) is None
 
 
 def test_a_gain_counts_where_one_axis_is_coherent_and_where_it_is_no_noise():
     noisy = {"error": 0.4}
-    assert large_again(plain(), with_peak(150.0, 0.6, **noisy)) is None
-    assert large_again(plain(), with_peak(150.0, 0.6, coherence=(0.8, 0.0), **noisy)) == pytest.approx((150.0, 1.4))
-    assert large_again(plain(), with_peak(150.0, 0.6, coherence=(0.0, 0.8), **noisy)) == pytest.approx((150.0, 1.4))
+    assert find_structural_mode(plain(), with_peak(150.0, 0.6, **noisy)) is None
+    assert find_structural_mode(plain(), with_peak(150.0, 0.6, coherence=(0.8, 0.0), **noisy)) == pytest.approx((150.0, 1.4))
+    assert find_structural_mode(plain(), with_peak(150.0, 0.6, coherence=(0.0, 0.8), **noisy)) == pytest.approx((150.0, 1.4))
     # 2 * 0.14 is less than half of 0.6, though not below the 30 % from which on a response is known.
-    assert large_again(plain(), with_peak(150.0, 0.6, 0.14)) == pytest.approx((150.0, 0.88))
-    assert large_again(plain(), with_peak(150.0, 0.6, 0.16)) is None
+    assert find_structural_mode(plain(), with_peak(150.0, 0.6, 0.14)) == pytest.approx((150.0, 0.88))
+    assert find_structural_mode(plain(), with_peak(150.0, 0.6, 0.16)) is None
 
 
 @pytest.mark.parametrize(("ratio", "counts"), [(1.2, False), (1.35, True), (2.5, True)])
@@ -431,7 +433,7 @@ def test_a_loop_about_its_limit_is_noise_and_one_well_above_is_a_mode(ratio, cou
     plant = integrating(grid(120.0))
     k = int(np.argmin(np.abs(plant.omega - 30 * ratio)))
     plant.G_i[k] *= 0.55 / (15 / plant.omega[k])
-    assert (large_again(plain(), plant) is not None) == counts
+    assert (find_structural_mode(plain(), plant) is not None) == counts
 
 
 def test_a_mode_is_not_certified_and_what_to_do_is_said():
@@ -528,7 +530,7 @@ def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_op
     assert certified(narrow, calm).verdict == Verdict.NOT_CERTIFIED
     assert certified(narrow, None).verdict == Verdict.NOT_CERTIFIED
     assert len(asked) == 3
-    assert GROWING < 1.001
+    assert UNSTABLE_RADIUS < 1.001
 
 
 def test_the_spectral_radius_around_a_model_is_that_of_the_exact_loop():

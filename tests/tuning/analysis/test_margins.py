@@ -12,7 +12,7 @@ from mimopilot.tuning.analysis.margins import (
     peak,
     phase_margin,
     sensitivity,
-    simultaneous,
+    simultaneous_margins,
 )
 
 OMEGA = np.geomspace(1e-2, 1e2, 8000)
@@ -98,12 +98,12 @@ def test_one_loop_has_the_margins_that_python_control_finds(seed):
     assert peak(sensitivities) == pytest.approx(1 / sm, rel=1e-3)
     disk, gain_db, phase = control.disk_margins(system, OMEGA, skew=0.0)
     assert disk_margin(sensitivities) == pytest.approx(disk, rel=1e-6)
-    assert simultaneous(disk_margin(sensitivities)) == pytest.approx((gain_db, phase), rel=1e-6)
+    assert simultaneous_margins(disk_margin(sensitivities)) == pytest.approx((gain_db, phase), rel=1e-6)
 
 
 def test_a_disk_margin_of_one_is_a_factor_of_three_and_53_degrees():
-    assert simultaneous(1.0) == pytest.approx((20 * np.log10(3), 2 * np.degrees(np.arctan(0.5))))
-    assert simultaneous(2.0) == (np.inf, 90.0)
+    assert simultaneous_margins(1.0) == pytest.approx((20 * np.log10(3), 2 * np.degrees(np.arctan(0.5))))
+    assert simultaneous_margins(2.0) == (np.inf, 90.0)
 
 
 def coupled():

@@ -6,7 +6,7 @@ from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.certificate import Verdict
-from mimopilot.tuning.design.advise import Doublet, advise, predict
+from mimopilot.tuning.design.advise import Doublet, advise, predict_doublet
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.plant.frequency_response import plant_response
@@ -32,7 +32,7 @@ def test_the_predicted_doublet_is_the_flown_one(log):
     plant = plant_response(log, log.u_bar, 300.0)
     spec = thesis()
     for gains in (log.flown, tune(log, thesis())):
-        follow, offaxis, effort = predict(gains, plant, spec, Doublet(amplitude_deg=10.0, period_s=0.8))
+        follow, offaxis, effort = predict_doublet(gains, plant, spec, Doublet(amplitude_deg=10.0, period_s=0.8))
         for column, axis in enumerate(("roll", "pitch")):
             task = doublet(axis, np.radians(10.0), 0.8, TS, tail=0.8)
             flight = fly(airframe, Autopilot(airframe, gains), task, noise=False)

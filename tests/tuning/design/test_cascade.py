@@ -9,8 +9,9 @@ from mimopilot.sitl.flight.metrics import performance
 from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.design.cascade import estimate, tune
-from mimopilot.tuning.design.estimate_checks import examine_estimates, examine_saturation
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.cascade_estimate import estimate
+from mimopilot.tuning.design.quality_checks import check_estimates, check_saturation
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.reference_model import second_order
 
@@ -97,7 +98,7 @@ def test_noise_in_place_of_flight_is_refused_by_the_gates(log):
         tune(noise, thesis())
     found = estimate(noise, thesis())
     with pytest.raises(TuningError, match=r"the excitation explains .* of what the roll gains are found from"):
-        examine_estimates("log", found.stretches, found.inner, noise.Ts)
+        check_estimates("log", found.stretches, found.inner, noise.Ts)
 
 
 def test_a_saturated_flight_is_refused_and_an_occasional_limit_warned_about(log):
@@ -106,9 +107,9 @@ def test_a_saturated_flight_is_refused_and_an_occasional_limit_warned_about(log)
     often[::3] = limit + 0.01
     sometimes[::20] = limit + 0.01
     with pytest.raises(TuningError, match="saturated: the roll moment is at its limit for 33%"):
-        examine_saturation(dataclasses.replace(log, u=often))
-    assert len(examine_saturation(dataclasses.replace(log, u=sometimes))) == 2
-    assert examine_saturation(log) == []
+        check_saturation(dataclasses.replace(log, u=often))
+    assert len(check_saturation(dataclasses.replace(log, u=sometimes))) == 2
+    assert check_saturation(log) == []
 
 
 def test_a_vibration_is_no_reason_to_refuse_and_is_told(log):

@@ -8,8 +8,9 @@ from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import excitation_flight
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import Noise, load_airframe
-from mimopilot.tuning.design.cascade import estimate, tune
-from mimopilot.tuning.design.estimate_checks import examine_band, examine_estimates
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.cascade_estimate import estimate
+from mimopilot.tuning.design.quality_checks import check_band, check_estimates
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import align, instruments
 from mimopilot.tuning.experiment import Experiment
@@ -151,22 +152,22 @@ def test_gains_that_cannot_be_told_apart_are_refused_and_hardly_warned_about(log
         loops = [dataclasses.replace(found.inner[0], solution=solution)]
         if refused:
             with pytest.raises(TuningError, match="hardly be told apart"):
-                examine_estimates("log", found.stretches, loops, TS)
+                check_estimates("log", found.stretches, loops, TS)
         else:
-            assert any("told apart" in text for text in examine_estimates("log", found.stretches, loops, TS))
+            assert any("told apart" in text for text in check_estimates("log", found.stretches, loops, TS))
 
 
 def test_the_band_of_the_excitation_is_named_by_axis(log):
     from mimopilot.tuning.plant.frequency_response import measured_plant
 
     plant = measured_plant(log)
-    assert examine_band("log", plant, (20.0, 20.0)) == []
-    fast = examine_band("log", plant, (20.0, 250.0))
+    assert check_band("log", plant, (20.0, 20.0)) == []
+    fast = check_band("log", plant, (20.0, 250.0))
     assert len(fast) == 1
     assert fast[0].startswith("pitch is excited from")
     deaf = dataclasses.replace(plant, coherence=plant.coherence * [1.0, 0.5])
     with pytest.raises(TuningError, match="not excited on pitch"):
-        examine_band("log", deaf, (20.0, 20.0))
+        check_band("log", deaf, (20.0, 20.0))
 
 
 def test_a_quotient_of_models_is_one_filter():

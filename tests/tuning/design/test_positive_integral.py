@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from mimopilot.tuning.design.cascade import estimate
-from mimopilot.tuning.design.positive_integral import LEAST, with_positive_integral
+from mimopilot.tuning.design.cascade_estimate import estimate
+from mimopilot.tuning.design.positive_integral import MIN_INTEGRAL_RATIO, with_positive_integral
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.vrft import LoopEstimate
 from mimopilot.tuning.plant.frequency_response import measured_plant
@@ -48,7 +48,7 @@ def least(matrix):
 def test_the_gains_are_the_most_likely_ones_of_all_that_do_not_run_away(seed):
     """All twelve coefficients against a solver that knows nothing of Cholesky factors or of conditional means."""
     before, body = random_loop(seed)
-    floor = LEAST * least(body.B @ before.gains["P"])
+    floor = MIN_INTEGRAL_RATIO * least(body.B @ before.gains["P"])
     ((after,), (warning,)) = with_positive_integral([before], BOTH, body)
     assert least(body.B @ after.gains["I"]) == pytest.approx(floor, rel=1e-4)
     roots = np.linalg.cholesky(before.solution.covariance)
@@ -92,7 +92,7 @@ def test_one_axis_is_moved_to_its_floor():
     before = loop(np.array([[0.2]]), np.array([[-0.3]]), np.array([[0.0]]), covariance)
     body = RigidBody(np.diag([50.0, 80.0]), np.ones((2, 2)))
     ((after,), _) = with_positive_integral([before], [(slice(0, 1), [(0, 1)])], body)
-    wanted = LEAST * 50 * 0.2 / 50
+    wanted = MIN_INTEGRAL_RATIO * 50 * 0.2 / 50
     assert after.gains["I"] == pytest.approx(wanted, rel=1e-6)
     assert after.gains["P"] == pytest.approx(0.2 + 1.0 / 2.0 * (wanted + 0.3), rel=1e-6)
     assert after.gains["D"] == pytest.approx(0.0)
@@ -116,7 +116,7 @@ def test_a_noisy_log_gives_integral_gains_that_do_not_run_away():
         body, spec = rigid_body(measured_plant(log)), TuningSpec()
         free = estimate(log, spec).gains
         kept = estimate(log, spec, body=body)
-        floor = LEAST * least(body.B @ free.Kp_i)
+        floor = MIN_INTEGRAL_RATIO * least(body.B @ free.Kp_i)
         assert body.least(kept.gains.Ki_i) >= 0.999 * floor
         told = any("run away" in text for text in kept.warnings)
         assert told == (body.least(free.Ki_i) < floor)

@@ -10,10 +10,10 @@ from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.analysis.closed_loop import model_spectral_radius
-from mimopilot.tuning.analysis.doublet_prediction import DoubletModel, doublet_model, effort
+from mimopilot.tuning.analysis.doublet_prediction import DoubletModel, doublet_effort, doublet_model
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.design.cascade import tune
-from mimopilot.tuning.design.constrained_least_squares import descend
+from mimopilot.tuning.design.constrained_least_squares import constrained_least_squares
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Limits
@@ -38,7 +38,7 @@ def log():
 @pytest.fixture(scope="module")
 def sets(log):
     siso = tune(log, thesis(method="siso"))
-    allowed = tuple(1.06 * spent for spent in effort(siso, doublet_model(Measured(log), Manoeuvre(**DOUBLET))))
+    allowed = tuple(1.06 * spent for spent in doublet_effort(siso, doublet_model(Measured(log), Manoeuvre(**DOUBLET))))
     task = {**DOUBLET, "effort": allowed}
     return {
         "siso": siso,
@@ -83,7 +83,7 @@ def test_refined_siso_gains_stay_diagonal(sets):
 
 def test_the_model_needs_no_more_effort_than_was_allowed(log, sets):
     allowed = sets["refined"].provenance.details["manoeuvre"]["effort"]
-    needed = effort(sets["refined"], doublet_model(Measured(log), Manoeuvre(**DOUBLET)))
+    needed = doublet_effort(sets["refined"], doublet_model(Measured(log), Manoeuvre(**DOUBLET)))
     assert np.all(np.array(needed) <= np.array(allowed) * 1.001)
 
 
@@ -98,7 +98,7 @@ def test_the_model_flies_the_flown_difference_equation(gains):
     A = np.array([[0.9, 0.02], [-0.01, 0.92]])
     plant = StateSpace(A, np.array([[0.5, 0.05], [0.04, 0.6]]), np.eye(2), np.zeros((2, 2)), TS)
     setpoint = np.repeat([0.4, -0.4, 0.0], 60)
-    angles, moments = DoubletModel(plant, np.zeros(2), setpoint).fly(GainStack.of(gains))
+    angles, moments = DoubletModel(plant, np.zeros(2), setpoint).simulate(GainStack.of(gains))
     for axis in range(2):
         controller, state, rate, angle = Controller(gains, np.float64), np.zeros(2), np.zeros(2), np.zeros(2)
         asked = np.zeros(3)
@@ -119,10 +119,10 @@ def test_the_spectral_radius_is_how_fast_a_flight_grows(gains):
     model = DoubletModel(plant, np.zeros(2), np.concatenate([np.ones(5), np.zeros(195)]))
     stable = dataclasses.replace(gains, limits=wide)
     growing = dataclasses.replace(gains, limits=wide, Kp_i=30 * gains.Kp_i)
-    size = np.abs(model.fly(GainStack.of(growing))[0][:, 0]).max(axis=(0, 2))
+    size = np.abs(model.simulate(GainStack.of(growing))[0][:, 0]).max(axis=(0, 2))
     assert model_spectral_radius(growing, plant) == pytest.approx((size[150] / size[100]) ** (1 / 50), rel=1e-3)
     # A stable one is told by its slowest mode, which may be the rate loop's when it is alone.
-    size = np.abs(model.fly(GainStack.of(stable))[0][:, 0]).max(axis=(0, 2))
+    size = np.abs(model.simulate(GainStack.of(stable))[0][:, 0]).max(axis=(0, 2))
     assert (size[150:200].max() / size[100:150].max()) ** (1 / 50) < model_spectral_radius(stable, plant) < 1
 
 
@@ -136,17 +136,17 @@ def test_the_descent_comes_back_to_its_limits_from_outside():
     def examine(points):
         return 10.0 * points + 1e-3 * points**3, np.column_stack([points[:, 0] - 1.0, 2.0 - points[:, 1] ** 2])
 
-    point, cost = descend(examine, np.array([0.0, 3.0]), 1e-6)
+    point, cost = constrained_least_squares(examine, np.array([0.0, 3.0]), 1e-6)
     assert point == pytest.approx([1.0, 0.0], abs=1e-3)
     assert cost == pytest.approx(100.02, rel=1e-3)
-    assert descend(lambda points: (points, np.full((len(points), 1), -1.0)), np.ones(2), 1e-6)[1] == np.inf
+    assert constrained_least_squares(lambda points: (points, np.full((len(points), 1), -1.0)), np.ones(2), 1e-6)[1] == np.inf
 
 
 def test_the_descent_finds_the_minimum_on_its_limit():
     def examine(points):
         return points - np.array([3.0, 1.0]), 2.0 - np.sum(points, axis=1, keepdims=True)
 
-    point, cost = descend(examine, np.zeros(2), 1e-6)
+    point, cost = constrained_least_squares(examine, np.zeros(2), 1e-6)
     assert point == pytest.approx([2.0, 0.0], abs=1e-3)
     assert cost == pytest.approx(2.0, rel=1e-3)
 

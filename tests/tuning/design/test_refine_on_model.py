@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from mimopilot.tuning.design.refine import frequency_grid, refine
+from mimopilot.tuning.design.refine_on_model import frequency_grid, refine_on_model
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.siso import siso_vrft, whitening_filter
 from mimopilot.tuning.law import Filters
@@ -21,7 +21,7 @@ def test_refinement_finds_a_controller_that_reaches_the_model_with_derivative_on
     den = np.polymul(np.polymul([1, -0.9], [1, -1]), [1, 0]) + np.r_[0.0, num] + np.r_[0.0, 0.5 * d * np.poly([1, 1])]
     model = ReferenceModel(tuple(num), tuple(den), 0, TS)
     start = LoopController({t: np.array([[v]]) for t, v in (("P", 0.1), ("I", 2.0), ("D", 0.0001))}, Filters(TS))
-    found = refine(start, PLANT, [model])
+    found = refine_on_model(start, PLANT, [model])
     assert found.after < 1e-12 < found.before
     assert found.controller.matrix == pytest.approx(np.array([[kp, ki, kd]]), rel=1e-5)
 
@@ -39,7 +39,7 @@ def test_the_state_space_of_the_loop_has_the_frequency_response_of_the_formula()
 def test_refinement_from_gains_that_are_not_stable_is_refused():
     wild = LoopController({"P": np.array([[10.0]])}, Filters(TS))
     with pytest.raises(TuningError, match="not stable"):
-        refine(wild, PLANT, [ReferenceModel((0.1,), (1.0, -0.9), 0, TS)])
+        refine_on_model(wild, PLANT, [ReferenceModel((0.1,), (1.0, -0.9), 0, TS)])
 
 
 MODEL = ReferenceModel((0.2,), (1.0, -0.8), 0, TS)
