@@ -19,10 +19,10 @@ from mimopilot.common.files import write_atomically
 from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text, toml_entries, toml_value
 
 SCHEMA = 2
-#: Tables and entries beside the parameter table's keys.
+#: Tables and entries other than the parameter table's keys.
 SECTIONS = ("roll_pitch", "yaw", "limits")
 OTHERS = ("schema", "moment_scale", "certificate", "provenance")
-#: What the file says beside a key.
+#: Comments beside keys.
 NOTES = {"Ts": "s", "derivative_cutoff_hz": "0: no filter"}
 
 
@@ -32,7 +32,7 @@ def load_gains(path: str | Path) -> Gains:
     Raises
     ------
     Error
-        When the file is missing, is not TOML, lacks a matrix, or holds a number that is not finite.
+        When the file is missing, is not TOML, lacks a matrix, or has a number that is not finite.
     """
     return _gains(read_toml(Path(path), "gains file"), str(path))
 
@@ -81,7 +81,7 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
 
 
 def _entry(table: dict[str, Any], row: Row) -> Any:
-    """What the file holds for a row, or the row's default."""
+    """Value of a row in the file, or the row's default."""
     section = _get(table, row.section, "") if row.section else table
     if row.default is not None and isinstance(section, dict) and row.key not in section:
         return (row.default,) * 3 if row.shape is Shape.AXES else row.default
@@ -95,7 +95,7 @@ def _entry(table: dict[str, Any], row: Row) -> Any:
 def _get(table: Any, key: str, section: str) -> Any:
     if not isinstance(table, dict) or key not in table:
         name = f"{section}.{key}" if section else key
-        raise TuningError(f"{name}: missing; every entry must be given, there are no default gains")
+        raise TuningError(f"{name}: missing; add it to the file, gains have no defaults")
     return table[key]
 
 

@@ -1,8 +1,8 @@
-"""The one table of the controller's parameters.
+"""The table of the controller's parameters.
 
-A row of `ROWS` is a member of the C++ ``struct Gains``. From the table come that struct and its order, its layout in
-memory, the keys of the gains file, and what every vehicle and ground station calls a parameter, with its range:
-headers, PX4's module.yaml, parameter files, the simulated vehicle's parameters and the uploader.
+A row of `ROWS` is a member of the C++ ``struct Gains``. The struct, its order and its layout in memory come from the
+table, and so do the keys of the gains file and the names and ranges of parameters: in headers, PX4's module.yaml,
+parameter files, the simulated vehicle and the uploader.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from enum import Enum
 
 from mimopilot.tuning.errors import TuningError
 
-#: Before every code in a parameter's name.
+#: Prefix of every parameter's name.
 PREFIX = "MIMO_"
 AXES = ("roll", "pitch", "yaw")
 #: The axes that the matrices couple.
 ROLL_PITCH = AXES[:2]
 AXIS_LETTERS = "RPY"
 AXIS_NAMES = dict(zip(AXIS_LETTERS, AXES, strict=True))
-#: Longest name that MAVLink and PX4 carry.
+#: Longest parameter name of MAVLink (PARAM_SET.param_id) and PX4, characters.
 NAME_LENGTH = 16
 
 
@@ -54,12 +54,12 @@ class Shape(Enum):
 
 @dataclass(frozen=True)
 class Valid:
-    """Values with which the controller can run at all; a vehicle's range may be narrower.
+    """Values that the controller can run with; a vehicle's range may be narrower.
 
     Attributes
     ----------
     lowest, highest : float
-        Bounds; infinite where there is none.
+        Bounds; infinite for none.
     lowest_included, highest_included : bool
         Whether the bound itself is valid.
     """
@@ -85,7 +85,7 @@ class Valid:
 ANY = Valid()
 POSITIVE = Valid(lowest=0.0, lowest_included=False)
 STABLE_POLE = Valid(0.0, 1.0, highest_included=False)
-#: 1 Hz to 10 kHz.
+#: Control period, s: 1 Hz to 10 kHz.
 PERIOD = Valid(1e-4, 1.0)
 
 
@@ -96,28 +96,27 @@ class Row:
     Attributes
     ----------
     key : str
-        Its name in the gains file and in Python.
+        Name in the gains file and in Python.
     member : str
-        Its name in C++.
+        Name in C++.
     code : str
         Short name; with prefix and axes a parameter's name.
     shape : Shape
     unit : str
-        As PX4 spells it; empty when it has none there.
+        PX4's spelling; empty if PX4 has none.
     minimum, maximum : float
         Range that a vehicle accepts, both included.
     description : str
-        Of a parameter.
+        Description of the parameter.
     comment : str
-        Of the C++ member; empty: none.
+        Comment of the C++ member; empty: none.
     diagonal_minimum : float or None
-        Of a matrix: the lower limit of its diagonal, where that is another.
+        Lower limit of a matrix' diagonal, if it differs from `minimum`.
     default : float or None
-        Value of a gains file that lacks the key; None: the key must be there. A gain matrix has none.
+        Value if a gains file lacks the key; None: the key is required. A gain matrix has none.
     writable : bool
-        False for what is fixed in the firmware and published only to be checked.
+        False for values that are fixed in the firmware and published only to be checked.
     valid : Valid
-        See `Valid`.
     """
 
     key: str
@@ -141,7 +140,7 @@ class Row:
 
     @property
     def codes(self) -> tuple[str, ...]:
-        """Codes of its elements, in the order of the C++ member."""
+        """Codes of the elements, in the order of the C++ member."""
         if self.shape is Shape.MATRIX:
             return tuple(f"{self.code}_{i}{j}" for i in "RP" for j in "RP")
         if self.shape is Shape.YAW:
@@ -152,11 +151,11 @@ class Row:
 
     @property
     def dimensions(self) -> str:
-        """Of the C++ member."""
+        """Array dimensions of the C++ member."""
         return {Shape.MATRIX: "[2][2]", Shape.AXES: "[3]"}.get(self.shape, "")
 
     def element(self, value: float, Ts: float) -> float:
-        """What the controller runs on, of a value of the gains file."""
+        """Value in the controller, from the value in the gains file."""
         return pole_of(value, Ts) if self.shape is Shape.POLE else value
 
     def value(self, element: float, Ts: float) -> float:
@@ -164,7 +163,7 @@ class Row:
         return cutoff_of(element, Ts) if self.shape is Shape.POLE else element
 
     def parameters(self) -> Iterator[Parameter]:
-        """Its parameters, one for each element."""
+        """One parameter for each element."""
         for code in self.codes:
             axes = code.removeprefix(self.code).removeprefix("_")
             what, minimum = self.description, self.minimum
@@ -190,11 +189,11 @@ class Parameter:
     code : str
         The element's code in `tuning.gains.Gains.elements`.
     unit : str
-        As PX4 spells it; empty when it has none there.
+        PX4's spelling; empty if PX4 has none.
     minimum, maximum : float
         Range that a vehicle accepts, both included.
     writable : bool
-        False for what is fixed in the firmware and published only to be checked.
+        False for values that are fixed in the firmware and published only to be checked.
     description : str
         One line.
     """
@@ -216,7 +215,7 @@ def _gain(
 
 
 def _yaw(gain: Row) -> Row:
-    """The yaw axis' scalar of a gain matrix."""
+    """Row of the yaw scalar that belongs to a gain matrix."""
     return Row(
         gain.key,
         f"yaw_{gain.member}",
@@ -234,18 +233,19 @@ def _limit(key: str, code: str, unit: str, smallest: float, largest: float, desc
     return Row(key, key, code, Shape.AXES, unit, smallest, largest, description, comment, valid=POSITIVE)
 
 
-# A diagonal without positive P, or with negative I, is no loop. D and feed-forward may be negative: a reference model
-# may ask for less damping than the vehicle has. The least P is a hundredth of what small vehicles have.
+# Ranges: the diagonal of P must be positive and that of I not negative, or the loop is not closed. D and feed-forward
+# may be negative: a reference model may ask for less damping than the vehicle has. The smallest P is a hundredth of
+# that of small vehicles.
 _GAINS = (
-    _gain("Kp_o", "AP", "1/s", 50.0, "rate set-point from angle error", "1/s, angle error to rate set-point", 0.01),
-    _gain("Kp_i", "RP", "s", 5.0, "moment from rate error", "s, rate error to moment", 1e-4),
+    _gain("Kp_o", "AP", "1/s", 50.0, "rate setpoint from angle error", "1/s, angle error to rate setpoint", 0.01),
+    _gain("Kp_i", "RP", "s", 5.0, "torque from rate error", "s, rate error to torque", 1e-4),
     _gain(
         "Ki_i",
         "RI",
         "",
         10.0,
-        "moment from the integral of the rate error",
-        "1, integral of the rate error to moment",
+        "torque from the integral of the rate error",
+        "1, integral of the rate error to torque",
         0.0,
     ),
     _gain(
@@ -253,19 +253,19 @@ _GAINS = (
         "RD",
         "s^2",
         0.5,
-        "moment from angular acceleration, subtracted",
-        "s^2, measured angular acceleration to moment, subtracted",
+        "torque from angular acceleration, subtracted",
+        "s^2, measured angular acceleration to torque, subtracted",
     ),
-    _gain("Kff_i", "RF", "s", 5.0, "moment from rate set-point", "s, rate set-point to moment"),
+    _gain("Kff_i", "RF", "s", 5.0, "torque from rate setpoint", "s, rate setpoint to torque"),
 )
 
 #: The table, in the order of the C++ struct.
 ROWS: tuple[Row, ...] = (
     *_GAINS,
     *map(_yaw, _GAINS),
-    _limit("rate_max", "RMAX", "rad/s", 0.01, 50.0, "limit of the rate set-point", "rad/s"),
-    _limit("moment_max", "UMAX", "norm", 0.01, 1.0, "limit of the moment, excitation included", "dimensionless"),
-    _limit("integral_max", "IMAX", "norm", 0.001, 1.0, "limit of the integral term", "dimensionless"),
+    _limit("rate_max", "RMAX", "rad/s", 0.01, 50.0, "limit of the rate setpoint", "rad/s"),
+    _limit("moment_max", "UMAX", "norm", 0.01, 1.0, "limit of the torque, excitation included", "normalised"),
+    _limit("integral_max", "IMAX", "norm", 0.001, 1.0, "limit of the integral term", "normalised"),
     Row(
         "derivative_cutoff_hz",
         "derivative_pole",
@@ -295,7 +295,7 @@ ROWS: tuple[Row, ...] = (
 
 
 def rows(*shapes: Shape) -> tuple[Row, ...]:
-    """The rows of some shapes."""
+    """Rows of the given shapes."""
     return tuple(row for row in ROWS if row.shape in shapes)
 
 
@@ -306,12 +306,12 @@ LIMITS = {row.key: row.code for row in rows(Shape.AXES)}
 
 PARAMETERS: tuple[Parameter, ...] = tuple(parameter for row in ROWS for parameter in row.parameters())
 
-#: Code of the unit of torque: N m that u = 1 stands for, by axis.
+#: Code of the unit of torque: N m of u = 1, by axis.
 SCALE = "SCALE"
-#: What a vehicle publishes beside the parameters, so that gains made for another unit of torque are noticed.
+#: Further values that a vehicle publishes, so that gains for another unit of torque are detected.
 IDENTITY: tuple[Parameter, ...] = tuple(
     Parameter(
-        f"{PREFIX}{SCALE}_{axis}", f"{SCALE}_{axis}", "N m", 0.0, 1e6, False, f"moment of u = 1, {AXIS_NAMES[axis]}"
+        f"{PREFIX}{SCALE}_{axis}", f"{SCALE}_{axis}", "N m", 0.0, 1e6, False, f"torque of u = 1, {AXIS_NAMES[axis]}"
     )
     for axis in AXIS_LETTERS
 )
@@ -319,14 +319,14 @@ IDENTITY: tuple[Parameter, ...] = tuple(
 
 @dataclass(frozen=True)
 class Setting:
-    """One parameter of a vehicle that is no gain, with a default of its own.
+    """One parameter of a vehicle that is not a gain, with its own default.
 
     Attributes
     ----------
     name, unit, minimum, maximum, description
         As in `Parameter`.
     default : float
-        What it is until somebody sets it.
+        Initial value.
     integer : bool
         True for a whole number.
     """
@@ -340,7 +340,7 @@ class Setting:
     description: str
 
 
-#: The experiment that a vehicle's own firmware flies: a PRBS added to the controller's output.
+#: The experiment in a vehicle's firmware: a PRBS added to the controller output.
 EXCITATION: tuple[Setting, ...] = (
     Setting("MIMO_EX_AX", "", 0, 0, 3, True, "excite once: 0 none, 1 roll, 2 pitch, 3 roll then pitch"),
     Setting("MIMO_EX_AMP", "norm", 0.1, 0.0, 0.5, False, "excitation: amplitude"),
@@ -352,26 +352,28 @@ EXCITATION: tuple[Setting, ...] = (
     Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stops beyond this roll or pitch"),
 )
 
-#: Whether a vehicle's start-up script takes this controller or that of the flight stack.
+#: Whether a vehicle's start-up script starts this controller or that of the flight stack.
 ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
 
 
 def check_names() -> None:
-    """Refuse a table that a vehicle would garble: PX4 and MAVLink say nothing of a name that is too long.
+    """Refuse names that vehicles cannot store: PX4 and MAVLink truncate long ones silently.
 
     Raises
     ------
     TuningError
-        Naming a parameter whose name is too long, not of A-Z, 0-9 and _, or taken twice.
+        When a name is too long, has other characters than A-Z, 0-9 and _, or occurs twice.
     """
     table: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
     seen: set[str] = set()
     for parameter in table:
         name = parameter.name
         if len(name) > NAME_LENGTH:
-            raise TuningError(f"{name}: a name of {len(name)} characters, a vehicle stores at most {NAME_LENGTH}")
+            raise TuningError(
+                f"{name}: got a name of {len(name)} characters, expected at most {NAME_LENGTH}: vehicles truncate it"
+            )
         if not re.fullmatch("[A-Z][A-Z0-9_]*", name):
-            raise TuningError(f"{name}: expected a letter, then A-Z, 0-9 and _: a vehicle drops other names")
+            raise TuningError(f"{name}: expected a letter, then A-Z, 0-9 and _: vehicles drop other names")
         if name in seen:
-            raise TuningError(f"{name}: two parameters have this name")
+            raise TuningError(f"{name}: two parameters have this name; rename one")
         seen.add(name)

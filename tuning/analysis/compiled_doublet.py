@@ -132,7 +132,7 @@ def simulate_doublets(A, B, C, trim, motors, setpoint, gains, terms, limits, Ts,
                     lowest, highest = -limits[1, i] - trim[i], limits[1, i] - trim[i]
                     tried = direct + integral[i] + growth
                     growth *= anti_windup_share(highest - tried if growth > 0 else tried - lowest, soft)
-                    if growth * (moment[i] + trim[i]) > 0:  # torque of the last period, which the motors were to produce
+                    if growth * (moment[i] + trim[i]) > 0:  # last period's torque, before the motors
                         growth *= anti_windup_share(margin, soft)
                     grown = integral[i] + growth
                     integral[i] = min(max(grown, -limits[2, i] - trim[i]), limits[2, i] - trim[i])

@@ -19,7 +19,7 @@ GRID_STEP = 0.05
 
 
 def nominal_and_drawn_loops(gains: Gains, plant: PlantResponse) -> tuple[PlantResponse, CascadeLoop, list[CascadeLoop]]:
-    """The plant on a grid that resolves narrow peaks, the loop around it, and loops around plants drawn from its error."""
+    """The plant on a grid that resolves narrow peaks, its loop, and the loops of plants drawn from its error."""
     generator, dense = np.random.default_rng(0), plant.interpolated(GRID_STEP)
     others = (plant.draw(generator).interpolated(GRID_STEP) for _ in range(DRAWS))
     return dense, cascade_loop(gains, dense), [cascade_loop(gains, other) for other in others]

@@ -26,15 +26,15 @@ from mimopilot.tuning.reference_model import SecondOrder, second_order
 from mimopilot.tuning.spec import TuningSpec
 from numpy.typing import NDArray
 
-#: The grid, rate loops of multirotors from 0.5 to 10 kg: rad/s, damping, delay in samples.
+#: The grid, around the thesis' rate loop of 20 rad/s and damping 0.4: rad/s, damping, delay in samples.
 BANDWIDTHS = (15.0, 17.5, 20.0, 22.5, 25.0, 30.0, 40.0)
 DAMPINGS = (0.4, 0.55, 0.7, 1.0)
 DELAYS = (0, 2, 4)
 #: Cut-offs of the derivative filter, Hz, tried beside the flown one. Above its cut-off D only amplifies noise and
 #: structural modes; a lower one also lowers a fast loop's gain above the band.
 CUTOFFS = (10.0, 5.0)
-#: A rate loop is at most this share of the slowest non-minimum-phase zero (S. Skogestad, I. Postlethwaite, Multivariable
-#: Feedback Control, section 5.7).
+#: Largest bandwidth over the slowest non-minimum-phase zero (S. Skogestad, I. Postlethwaite, Multivariable Feedback
+#: Control: limitations imposed by right half-plane zeros).
 ZERO_SHARE = 0.5
 #: Model from which the search for non-minimum-phase zeros starts: rad/s, damping, delay in samples.
 FLEXIBLE = (20.0, 0.7, 0)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 #: Largest relative difference between the periods of a log and of a gain set: loggers' clocks differ by less.
 PERIOD_TOLERANCE = 0.02
 #: Largest relative difference between the units of torque of a log and of a gain set: rounding in files.
-SCALE_TOLERANCE = 0.01
+UNIT_TOLERANCE = 0.01
 MOTORS_UNKNOWN = (
     "the log does not tell how the allocator drives the motors (PX4: actuator_motors, with THR_MDL_FAC set): where the "
     "doublet saturates motors the refined gains are not optimal"
@@ -106,8 +106,8 @@ def tune(
     verdict, reason = tuned.verdict()
     if verdict == Verdict.UNSTABLE:
         raise TuningError(
-            f"{experiment.source}: the gains from this log for these models are unstable, nothing is written: {reason}; "
-            "record a longer or stronger excitation, or ask for a slower rate loop"
+            f"{experiment.source}: the gains from this log for these models are unstable, nothing is written: "
+            f"{reason}; record a longer or stronger excitation, or ask for a slower rate loop"
         )
     return tuned
 
@@ -173,7 +173,7 @@ def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | No
             "with a log of the same control rate"
         )
     flown = experiment.flown.moment_scale if experiment.flown else None
-    if flown and gains.moment_scale and not np.allclose(flown[:2], gains.moment_scale[:2], rtol=SCALE_TOLERANCE, atol=0):
+    if flown and gains.moment_scale and not np.allclose(flown[:2], gains.moment_scale[:2], rtol=UNIT_TOLERANCE, atol=0):
         theirs, ours = (", ".join(f"{v:.4g}" for v in scale[:2]) for scale in (flown, gains.moment_scale))
         raise TuningError(
             f"{experiment.source}: u = 1 stands for {theirs} N m (roll, pitch), in the gains for {ours}; convert the "

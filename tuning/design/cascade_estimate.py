@@ -198,8 +198,8 @@ def _rate_setpoint(
             r_i[start:stop], settling = rebuild_rate_setpoint(gains, u, y_i)
         if settling > MAX_SETTLING_SHARE * longest:
             raise NotMinimumPhaseError(
-                f"the inverse rate controller takes {settling * experiment.Ts:.0f} s to settle, and the longest stretch "
-                f"is {longest * experiment.Ts:.0f} s"
+                f"the inverse rate controller takes {settling * experiment.Ts:.0f} s to settle, and the longest "
+                f"stretch is {longest * experiment.Ts:.0f} s"
             )
     except NotMinimumPhaseError as error:
         quotients = [m_o.over(m_i) for m_o in outer for m_i in inner]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-# All numbers are relative, and were chosen on the refinements of the simulated airframes.
+# All numbers are relative, and chosen by trial on the simulated airframes.
 #: A round ends when a step lowers the cost by less than this share.
 TOLERANCE = 1e-6
 #: Most evaluations of the residuals in a round.

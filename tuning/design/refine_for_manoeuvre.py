@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 ABOVE_BAND_SHARE = 0.99
 #: The limit on the peak is corrected at most so often...
 MAX_CORRECTIONS = 5
-#: ... until the peak is within this share of the certificate's limit, or a correction lowers the cost by less than that.
+#: ... until the peak is this near to the certificate's limit, or a correction lowers the cost by less than that (both
+#: relative).
 PEAK_TOLERANCE, WORTHWHILE = 0.02, 0.01
 #: Share of VRFT's integral action that is kept in every direction: the vehicle must find its trim.
 INTEGRAL_SHARE = 0.2
@@ -84,8 +85,8 @@ def refine_for_manoeuvre(
     known = response.at(response.coherent_run())
     if len(known.omega) < MIN_FREQUENCIES:
         raise TuningError(
-            f"the excitation reaches only {len(known.omega)} frequencies, {MIN_FREQUENCIES} are needed; record a longer "
-            "or stronger excitation"
+            f"the excitation reaches only {len(known.omega)} frequencies, {MIN_FREQUENCIES} are needed; record a "
+            "longer or stronger excitation"
         )
     wanted = np.zeros((2, 1, len(model.setpoint), 2))
     for axis, reference in enumerate(outer):
@@ -234,7 +235,7 @@ def _flat(parts: Mapping[str, Signal]) -> Signal:
 def typical_sizes(gains: Gains) -> dict[str, float]:
     """Typical size of each matrix' elements: units of the search, since some start at zero.
 
-    Ki_i over Kp_i is 1 / 0.5 s and Kd_i over Kp_i is 20 ms, as tuned sets of small vehicles have them.
+    Ki_i over Kp_i is 1 / 0.5 s and Kd_i over Kp_i is 20 ms, the order of those of the simulated airframes.
     """
     proportional = float(np.abs(gains.Kp_i).max())
     return {

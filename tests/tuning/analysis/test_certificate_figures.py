@@ -1,4 +1,4 @@
-"""The certificate against plants whose closed loop is known exactly."""
+"""Figures and reasons of the certificate against plants whose closed loop is known exactly."""
 
 import dataclasses
 import itertools
@@ -44,7 +44,7 @@ def defaults(name="adam0"):
 
 @cache
 def flown(name, frame=None):
-    """A flight with a good excitation."""
+    """Estimates from a flight with a good excitation."""
     return Measured(experiment(name, airframe=airframe(name, frame), **GOOD.get(name, {})))
 
 
@@ -54,7 +54,7 @@ def truth(name, frame=None):
 
 
 def exact(plant, omega):
-    """What an experiment without any noise would say of a plant."""
+    """Response from an experiment without noise."""
     G, K = plant.frequency_response(omega), len(omega)
     nothing = np.zeros((K, 6, 6)), np.zeros((K, 2, 2))
     return PlantResponse(omega, G[:, :2], G[:, 2:], *nothing, np.ones((K, 2)), TS)
@@ -66,7 +66,7 @@ def scaled(gains, inner=1.0, outer=1.0):
 
 
 def random_set(base, rng):
-    """A gain set of any kind: loops slower and faster, coupled in any way."""
+    """A random gain set: slower and faster loops, with any coupling."""
     scale = {code: np.exp(rng.uniform(-1.2, 1.3)) for code in ("AP", "RP", "RI", "RD")}
     changes, elements = {}, base.elements()
     for code, value in elements.items():
@@ -81,7 +81,7 @@ def random_set(base, rng):
 
 
 def random_sets(name, count, seed):
-    """As many unstable sets as sets that every textbook calls well damped, by the exact loop."""
+    """Equally many unstable and well damped sets, by the exact loop."""
     rng, base, exactly = np.random.default_rng(seed), defaults(name), truth(name)
     unstable, damped = [], []
     while len(unstable) < count or len(damped) < count:
@@ -96,11 +96,11 @@ def random_sets(name, count, seed):
     return unstable, damped
 
 
-# What passes
+# Certified and refused sets
 
 
 @pytest.mark.parametrize("name", [*RIGID, "adam0_flexible"])
-def test_no_unstable_set_passes_and_well_damped_ones_do(name):
+def test_no_unstable_set_is_certified_and_well_damped_ones_are(name):
     unstable, damped = random_sets(name, 12, 7)
     plant = flown(name).response
     assert [g for g in unstable if certify(g, plant, *MODELS).verdict in PASSED] == []
@@ -109,8 +109,8 @@ def test_no_unstable_set_passes_and_well_damped_ones_do(name):
         assert sum(certified) >= 0.95 * len(damped)
 
 
-def test_a_stronger_and_a_longer_flight_do_not_turn_well_damped_sets_down():
-    """Their lowest frequencies are coherent but not linear: the band begins above them."""
+def test_well_damped_sets_are_certified_from_stronger_and_longer_flights_too():
+    """The lowest frequencies are coherent but not linear: the band begins above them."""
     _, damped = random_sets("px4_sih", 12, 11)
     for log in (experiment("px4_sih", amplitude=0.25, bandwidth=60.0), experiment("px4_sih", seconds=40.0)):
         plant = Measured(log).response
@@ -127,8 +127,8 @@ def test_a_stronger_and_a_longer_flight_do_not_turn_well_damped_sets_down():
     ],
     ids=str,
 )
-def test_a_mode_of_the_frame_is_never_certified_and_is_named(frame):
-    """Gains that are well damped on the rigid frame, and the same for a frame that bends."""
+def test_a_structural_mode_is_never_certified_and_its_frequency_is_reported(frame):
+    """Gains that are well damped on a rigid frame, flown on a flexible one."""
     base, bending = defaults(), truth("adam0", frame)
     plant, named = flown("adam0", frame).response, 0
     for factor in (0.6, 1.0, 1.5, 2.0, 3.0):
@@ -149,7 +149,7 @@ def test_a_mode_of_the_frame_is_never_certified_and_is_named(frame):
 
 
 def test_a_loop_whose_peak_lies_between_two_frequencies_is_not_certified():
-    """It oscillates for ever, and no frequency of the response is near to tell."""
+    """The loop oscillates, and no measured frequency is close to the peak."""
     plant = flown("adam0").response
     gains = dataclasses.replace(
         defaults(),
@@ -167,7 +167,7 @@ def test_a_loop_whose_peak_lies_between_two_frequencies_is_not_certified():
 
 
 def test_a_loop_that_is_unstable_below_the_excitation_is_not_certified():
-    """With little gain it oscillates at 0.75 rad/s, where the experiment says nothing."""
+    """With little gain it oscillates at 0.75 rad/s, below the measured band."""
     gains = dataclasses.replace(
         defaults("adam0_perturbed"),
         Kp_o=np.array([[3.9007844, -0.984454], [0.2805008, 2.474772]]),
@@ -184,8 +184,8 @@ def test_a_loop_that_is_unstable_below_the_excitation_is_not_certified():
 # The figures
 
 
-def late_on(plant, axis, samples):
-    """The plant with more delay between u and the torque of one axis."""
+def delayed(plant, axis, samples):
+    """The plant with additional delay between u and the torque of one axis."""
     late = delay(samples, TS)
     keep = [i for i in range(len(late.A)) if i % 2 == axis]
     A, B, C = late.A[np.ix_(keep, keep)], late.B[keep], late.C[:, keep]
@@ -195,9 +195,9 @@ def late_on(plant, axis, samples):
 
 @pytest.mark.parametrize("name", ["adam0", "adam0_boom", "antr", "px4_sih"])
 def test_every_figure_is_that_of_the_exact_loop(name):
-    """Without noise; gain and delay margin by the poles of the changed loop, the others by other formulas."""
+    """Without noise; gain and delay margin by the poles of the changed loop, the others by independent formulas."""
     exactly, rng = truth(name), np.random.default_rng(3)
-    # Dense at the low end: a whole octave below 0.5 rad/s would carry nothing.
+    # From 0.5 rad/s: the octaves below contribute nothing.
     omega = np.geomspace(0.5, 700, 1200)
     plant = exact(exactly.plant, omega)
     for gains in (defaults(name), *(random_sets(name, 2, 5)[1])):
@@ -222,8 +222,8 @@ def test_every_figure_is_that_of_the_exact_loop(name):
             assert figures["phase_margin_deg"][axis] == pytest.approx(pm, abs=0.1)
             late = figures["delay_margin_ms"][axis] / 1e3 / TS
             assert late * TS == pytest.approx(np.radians(pm) / crossing, rel=0.01)
-            assert late_on(exactly.plant, i, int(late)).spectral_radius(gains) < 1
-            assert late_on(exactly.plant, i, int(late) + 1).spectral_radius(gains) > 1
+            assert delayed(exactly.plant, i, int(late)).spectral_radius(gains) < 1
+            assert delayed(exactly.plant, i, int(late) + 1).spectral_radius(gains) > 1
             assert figures["gain_margin"][axis] == "exact"
             margin = 10 ** (figures["gain_margin_db"][axis] / 20)
 
@@ -246,7 +246,7 @@ def test_every_figure_is_that_of_the_exact_loop(name):
 
 
 def test_the_figures_of_a_flight_are_those_of_the_exact_loop():
-    """Thrust is the square of a rotor's speed: a model about hover is right to a few percent."""
+    """Thrust is the square of a rotor's speed, so a linear model about hover is accurate to a few percent."""
     for name in RIGID:
         figures = certify(defaults(name), flown(name).response, *MODELS).figures
         peak, phase = truth(name).margins(defaults(name))
@@ -255,7 +255,7 @@ def test_the_figures_of_a_flight_are_those_of_the_exact_loop():
 
 
 def integrating(omega, error=0.0, coherence=1.0, K=100.0):
-    """A body that is nothing but inertia, with the same relative error of every element."""
+    """Response of a pure inertia, with the same relative error of every element."""
     s = 1j * omega[:, None, None]
     G, root = K / s * np.eye(2), np.zeros((len(omega), 6, 6))
     root[:, 2, 2] = root[:, 3, 3] = error * K / omega
@@ -264,7 +264,7 @@ def integrating(omega, error=0.0, coherence=1.0, K=100.0):
 
 
 def plain(kp=0.15, outer=4.0, ki=0.0, kd=0.0):
-    """P, or PI with D, the same on both axes."""
+    """P, or PID, equal on both axes."""
     one, zero = np.eye(2), np.zeros((2, 2))
     return dataclasses.replace(
         defaults(),
@@ -274,12 +274,12 @@ def plain(kp=0.15, outer=4.0, ki=0.0, kd=0.0):
 
 
 def grid(end, start=1.0, step=1.02):
-    """Denser than `GRID_STEP`: nothing is interpolated."""
+    """Frequencies denser than `GRID_STEP`, so that nothing is interpolated."""
     return start * step ** np.arange(np.floor(np.log(end / start) / np.log(step)) + 1)
 
 
 def test_the_errors_are_two_deviations_of_repeated_flights():
-    """24 flights with other noise; and their mean is the truth."""
+    """24 flights with independent noise; their mean is the true figure."""
     found = [
         certify(defaults(), Measured(experiment("adam0", seed, 0.05, seconds=10.0)).response, *MODELS).figures
         for seed in range(24)
@@ -294,14 +294,14 @@ def test_the_errors_are_two_deviations_of_repeated_flights():
     assert np.mean([f["Ms"] for f in found]) == pytest.approx(truth("adam0").margins(defaults())[0], rel=0.02)
 
 
-def test_the_peak_alone_is_that_of_the_certificate():
+def test_sensitivity_peak_is_the_peak_of_the_certificate():
     plant = flown("adam0").response
     figures = certify(defaults(), plant, *MODELS).figures
     assert sensitivity_peak(defaults(), plant) == (figures["Ms"], figures["Ms_error"])
 
 
-def test_a_peak_beyond_the_band_counts_with_its_error():
-    """A loop of -0.4 at 150 rad/s, where alone the log says something: sensitivity 1 / 0.6, and more with the error."""
+def test_a_peak_above_the_band_counts_with_its_error():
+    """A loop of -0.4 measured at 150 rad/s only: sensitivity 1 / 0.6, and more with the error."""
     omega, gains = grid(60.0), plain(kp=0.1, outer=1.0)
     low = integrating(omega)
     assert certify(gains, low, *MODELS).figures["Ms"] < 1.2
@@ -319,12 +319,12 @@ def test_a_peak_beyond_the_band_counts_with_its_error():
         assert certify(gains, joined, *MODELS).figures["Ms"] == pytest.approx(1 / (0.6 - 2 * error), rel=1e-6)
 
 
-# Outside of the band
+# Outside the band
 
 
 @pytest.mark.parametrize(("reached", "verdict"), [(0.45, Verdict.CERTIFIED), (0.55, Verdict.NOT_CERTIFIED)])
-def test_above_the_band_the_loop_may_reach_a_half(reached, verdict):
-    """15 / s: where the excitation ends at 15 / 0.45 rad/s it may reach 0.45 above."""
+def test_above_the_band_the_loop_gain_may_reach_one_half(reached, verdict):
+    """15 / s: if the excitation ends at 15 / 0.45 rad/s the gain may reach 0.45 above."""
     gains, omega = plain(), grid(60.0)
     plant = integrating(omega * 15 / reached / omega[-1])
     assert loop_gain_above(gains, plant) == pytest.approx(15 / plant.omega, rel=1e-9)
@@ -335,7 +335,7 @@ def test_above_the_band_the_loop_may_reach_a_half(reached, verdict):
         assert f"{end}, where the loop's gain may still reach 0.55" in found.reason
 
 
-def test_what_the_loop_reaches_above_is_the_largest_that_a_falling_plant_allows():
+def test_the_bound_above_the_band_is_that_of_a_plant_falling_like_an_integrator():
     gains, plant = plain(kd=0.004), integrating(grid(50.0))
     w = np.linspace(50, np.pi / TS, 20000)
     z, a = np.exp(1j * w * TS), np.exp(-2 * np.pi * 30 * TS)
@@ -343,8 +343,8 @@ def test_what_the_loop_reaches_above_is_the_largest_that_a_falling_plant_allows(
     assert loop_gain_above(gains, plant)[-1] == pytest.approx(np.max(100 / w * np.abs(controller)), rel=0.01)
 
 
-def test_what_the_loop_reaches_above_the_band_is_less_moved_by_noise():
-    """w |G| does not rise: the fit by such a sequence is nearer to the truth than the last value alone."""
+def test_the_bound_above_the_band_is_less_sensitive_to_noise_than_its_last_value():
+    """w |G| does not rise: a fit with that constraint is closer to the truth than the last value alone."""
     gains = defaults()
     plant, rng = exact(truth("adam0").plant, np.linspace(2.0, 110.0, 50)), np.random.default_rng(3)
     true = loop_gain_above(gains, plant)[-1]
@@ -359,8 +359,8 @@ def test_what_the_loop_reaches_above_the_band_is_less_moved_by_noise():
     assert abs(np.mean(fitted)) < abs(np.mean(last))
 
 
-def test_where_the_attitude_path_alone_is_large_above_the_band_nothing_is_certified():
-    """The rate loop is small there, and the whole loop is 0.3 + 0.8."""
+def test_a_large_attitude_path_above_the_band_is_not_certified():
+    """The rate loop's gain is 0.3 there, and the attitude path adds 0.8."""
     omega = grid(30.0)
     gains, plant = plain(kp=0.3 * omega[-1] / 100, outer=0.8 / 0.3 * omega[-1]), integrating(omega)
     found = certify(gains, plant, *MODELS)
@@ -369,7 +369,7 @@ def test_where_the_attitude_path_alone_is_large_above_the_band_nothing_is_certif
 
 
 @pytest.mark.parametrize(("sensitivity", "verdict"), [(0.45, Verdict.CERTIFIED), (0.55, Verdict.NOT_CERTIFIED)])
-def test_where_the_excitation_begins_the_loop_must_be_in_charge(sensitivity, verdict):
+def test_the_sensitivity_must_be_small_where_the_excitation_begins(sensitivity, verdict):
     """S = s^2 / (s^2 + 15 s + 60)."""
     w = np.linspace(1.0, 30.0, 20000)
     start = w[np.searchsorted(np.abs(w**2 / (60 - w**2 + 15j * w)), sensitivity)]
@@ -380,13 +380,13 @@ def test_where_the_excitation_begins_the_loop_must_be_in_charge(sensitivity, ver
 
 
 @pytest.mark.parametrize(("Ki", "verdict"), [(0.2, Verdict.CERTIFIED), (-0.01, Verdict.NOT_CERTIFIED)])
-def test_an_integral_that_runs_away_below_the_excitation_is_not_certified(Ki, verdict):
+def test_an_integral_that_diverges_below_the_excitation_is_not_certified(Ki, verdict):
     found = certify(plain(ki=Ki), integrating(grid(60.0)), *MODELS)
     assert found.verdict == verdict
     assert ("Ki_i through the measured plant is not positive" in found.reason) == (Ki < 0)
 
 
-def test_too_little_that_is_known_is_said():
+def test_too_few_known_frequencies_are_not_certified():
     found = certify(plain(), integrating(np.arange(1.0, 8.0)), *MODELS)
     assert (found.verdict, found.band) == (Verdict.NOT_CERTIFIED, (0.0, 0.0))
     assert "fewer than 8 frequencies in a row" in found.reason
@@ -396,11 +396,11 @@ def test_too_little_that_is_known_is_said():
     assert "the excitation reaches fewer than 8 frequencies in a row" in found.reason
 
 
-# Modes of the frame
+# Structural modes
 
 
 def with_peak(at, size, error=0.0, coherence=(0.0, 0.0)):
-    """15 / s in the band, and one frequency above it: loop gain `size`, with an `error` of each element."""
+    """15 / s in the band, and loop gain `size` at one frequency above it, with an `error` of each element."""
     band = integrating(grid(100.0))
     one = integrating(np.array([at]), 0.0)
     one = dataclasses.replace(one, G_i=np.full((1, 2, 2), size / 0.15) * np.eye(2), coherence=np.array([coherence]))
@@ -408,7 +408,7 @@ def with_peak(at, size, error=0.0, coherence=(0.0, 0.0)):
     return PlantResponse(Ts=TS, **{k: np.concatenate([v, vars(one)[k]]) for k, v in vars(band).items() if k != "Ts"})
 
 
-def test_a_gain_that_is_large_again_is_found_with_its_frequency_and_its_error():
+def test_a_structural_mode_is_found_with_its_frequency_and_gain_plus_error():
     assert find_structural_mode(plain(), integrating(grid(100.0))) is None
     assert find_structural_mode(plain(), with_peak(150.0, 0.45)) is None
     assert find_structural_mode(plain(), with_peak(150.0, 0.6)) == pytest.approx((150.0, 0.6))
@@ -417,26 +417,26 @@ def test_a_gain_that_is_large_again_is_found_with_its_frequency_and_its_error():
     assert find_structural_mode(plain(), with_peak(150.0, 0.45, 0.02)) is None
 
 
-def test_a_gain_counts_where_one_axis_is_coherent_and_where_it_is_no_noise():
-    noisy = {"error": 0.4}
-    assert find_structural_mode(plain(), with_peak(150.0, 0.6, **noisy)) is None
-    assert find_structural_mode(plain(), with_peak(150.0, 0.6, coherence=(0.8, 0.0), **noisy)) == pytest.approx((150.0, 1.4))
-    assert find_structural_mode(plain(), with_peak(150.0, 0.6, coherence=(0.0, 0.8), **noisy)) == pytest.approx((150.0, 1.4))
-    # 2 * 0.14 is less than half of 0.6, though not below the 30 % from which on a response is known.
+def test_a_gain_counts_if_one_axis_is_coherent_or_its_error_is_small():
+    assert find_structural_mode(plain(), with_peak(150.0, 0.6, 0.4)) is None
+    for coherence in ((0.8, 0.0), (0.0, 0.8)):
+        found = find_structural_mode(plain(), with_peak(150.0, 0.6, 0.4, coherence))
+        assert found == pytest.approx((150.0, 1.4))
+    # 2 * 0.14 is less than half of 0.6, but more than the 30 % below which a response is known.
     assert find_structural_mode(plain(), with_peak(150.0, 0.6, 0.14)) == pytest.approx((150.0, 0.88))
     assert find_structural_mode(plain(), with_peak(150.0, 0.6, 0.16)) is None
 
 
 @pytest.mark.parametrize(("ratio", "counts"), [(1.2, False), (1.35, True), (2.5, True)])
-def test_a_loop_about_its_limit_is_noise_and_one_well_above_is_a_mode(ratio, counts):
-    """15 / s is below a half from 30 rad/s on."""
+def test_a_gain_above_the_limit_counts_only_well_above_the_crossover(ratio, counts):
+    """15 / s is below one half from 30 rad/s on."""
     plant = integrating(grid(120.0))
     k = int(np.argmin(np.abs(plant.omega - 30 * ratio)))
     plant.G_i[k] *= 0.55 / (15 / plant.omega[k])
     assert (find_structural_mode(plain(), plant) is not None) == counts
 
 
-def test_a_mode_is_not_certified_and_what_to_do_is_said():
+def test_a_structural_mode_is_not_certified_and_a_remedy_is_given():
     found = certify(plain(), with_peak(157.0, 0.6), *MODELS)
     assert found.verdict == Verdict.NOT_CERTIFIED
     assert "at 157 rad/s (25 Hz) the loop's gain may reach 0.60 again" in found.reason
@@ -462,8 +462,8 @@ def test_each_verdict_is_given_with_its_reason():
     assert "excitation ends at" in found.reason
 
 
-def test_a_set_that_some_of_the_plants_make_unstable_is_too_close_to_tell():
-    """One percent below the exact limit of the attitude gain: some of the neighbours are unstable."""
+def test_a_set_that_is_unstable_on_some_drawn_plants_is_not_certified():
+    """One percent below the exact limit of the attitude gain some of the drawn plants are unstable."""
     exactly, plant, base = truth("adam0"), flown("adam0").response, defaults()
     low, high = 1.0, 10.0
     for _ in range(40):
@@ -472,19 +472,19 @@ def test_a_set_that_some_of_the_plants_make_unstable_is_too_close_to_tell():
     doubtful = dataclasses.replace(plant, root=15 * plant.root)
     found = certify(scaled(base, outer=0.99 * low), doubtful, *MODELS)
     assert found.verdict == Verdict.NOT_CERTIFIED
-    count = re.search(rf"too close to the limit to tell: (\d+) of {DRAWS} plants", found.reason)
+    count = re.search(rf"too close to instability: (\d+) of {DRAWS} plants", found.reason)
     assert count
     assert 0 < int(count[1]) < DRAWS
     assert certify(scaled(base, outer=1.6 * low), plant, *MODELS).verdict == Verdict.UNSTABLE
 
 
 def noisy_body():
-    """A loop whose figures have errors: of Ms 0.07, of the phase margins 7 degrees and more."""
+    """A loop whose figures have errors: Ms of 0.07, the phase margins of 7 degrees and more."""
     return plain(), integrating(grid(80.0), 0.15)
 
 
-def test_the_error_of_the_peak_is_two_deviations_of_other_plants():
-    """Of 400 plants drawn from the same error, at the response's own frequencies."""
+def test_the_error_of_the_peak_is_two_deviations_over_drawn_plants():
+    """400 plants drawn from the same error, at the response's own frequencies."""
     gains, plant = noisy_body()
     rng = np.random.default_rng(9)
     S = [np.linalg.inv(np.eye(2) + cascade_loop(gains, plant.draw(rng)).L_u) for _ in range(400)]
@@ -492,15 +492,15 @@ def test_the_error_of_the_peak_is_two_deviations_of_other_plants():
     assert sensitivity_peak(gains, plant)[1] == pytest.approx(2 * np.std(peaks), rel=0.3)
 
 
-def test_the_default_levels_are_those_of_the_documentation():
+def test_the_default_thresholds_are_those_of_the_documentation():
     assert Thresholds() == Thresholds(Ms=1.8, phase_deg=40.0, thin_Ms=2.5, thin_phase_deg=25.0)
     for wrong in ({"Ms": 3.0}, {"phase_deg": 20.0}, {"Ms": 1.0}, {"thin_Ms": float("inf")}, {"other": 1.0}):
         with pytest.raises(ValueError, match="validation error"):
             Thresholds(**wrong)
 
 
-def late_model(radius):
-    """An integrator with so much gain that the set of `plain` has this spectral radius around it."""
+def model_with_radius(radius):
+    """An integrator with the gain that gives the set of `plain` this spectral radius."""
     for K in np.linspace(50, 20000, 4000):
         model = StateSpace(np.eye(2), K * TS * np.eye(2), np.eye(2), np.zeros((2, 2)), TS)
         if model_spectral_radius(plain(), model) >= radius:
@@ -508,7 +508,7 @@ def late_model(radius):
     raise AssertionError
 
 
-def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_open():
+def test_the_identified_model_is_computed_only_if_the_response_leaves_the_verdict_open():
     gains, asked = plain(), []
 
     def certified(plant, model):
@@ -519,9 +519,9 @@ def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_op
         return certify(gains, plant, *MODELS, model=given)
 
     wide, narrow = integrating(grid(60.0)), integrating(grid(20.0))
-    growing = late_model(1.05)
+    growing = model_with_radius(1.05)
     assert certified(wide, growing).verdict == Verdict.CERTIFIED
-    assert not asked  # it costs seconds, and changes nothing
+    assert not asked  # identification takes seconds and would change nothing
     found = certified(narrow, growing)
     assert found.verdict == Verdict.UNSTABLE
     assert re.match(r"around the model identified .* spectral radius is 1\.05\d\d; excitation ends at", found.reason)
@@ -534,7 +534,7 @@ def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_op
 
 
 def test_the_spectral_radius_around_a_model_is_that_of_the_exact_loop():
-    """Of its own sampled plant; the angle is an integral by the trapezoidal rule, not the exact one."""
+    """With the exact sampled plant; the angle is integrated by the trapezoidal rule, not exactly."""
     exactly = truth("adam0").plant
     rates = StateSpace(exactly.A, exactly.B, exactly.C[:2], exactly.D[:2], TS)
     rng, compared = np.random.default_rng(2), 0
@@ -548,10 +548,10 @@ def test_the_spectral_radius_around_a_model_is_that_of_the_exact_loop():
             assert around == pytest.approx(max(radius, inner), abs=2e-4)
 
 
-# Bound to the gains
+# Sealed with the gains
 
 
-def test_a_tuned_set_keeps_its_verdict_in_its_file_and_another_threshold_is_stored_with_it():
+def test_a_gains_file_keeps_the_verdict_and_its_thresholds():
     log = flown("adam0").experiment
     spec = TuningSpec(certificate=Thresholds(Ms=1.1, thin_Ms=3.0))
     tuned = certify_from_log(log, defaults(), spec)
@@ -564,12 +564,12 @@ def test_a_tuned_set_keeps_its_verdict_in_its_file_and_another_threshold_is_stor
     assert dataclasses.replace(tuned, certificate=None).verdict()[0] == "none"
     other_unit = dataclasses.replace(tuned, moment_scale=(25.0, 25.0, 2.7))
     assert other_unit.verdict()[0] == "void"
-    with pytest.raises(TuningError, match=r"stands for 2\.546, 2\.546 N m .* in the gains for 25, 25"):
+    with pytest.raises(TuningError, match=r"u = 1 stands for 2\.546, 2\.546 N m .* in the gains for 25, 25"):
         certify_from_log(log, other_unit)
 
 
 def test_gains_that_the_log_makes_unstable_are_not_written():
-    """VRFT of a log with strong gusts: the set may be refused or not certified, but no unstable one passes."""
+    """Logs with strong gusts: a set may be refused or not certified, but no unstable one is certified."""
     for seed in range(4):
         log = experiment("adam0", seed, seconds=10.0, gusts=0.05, late=4)
         try:

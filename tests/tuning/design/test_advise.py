@@ -1,3 +1,5 @@
+"""The scan of rate-loop models: predicted doublets and the recommendation."""
+
 import mimopilot.tuning.design.advise as advisor
 import numpy as np
 import pytest
@@ -27,7 +29,7 @@ def rms(signal):
     return float(np.sqrt(np.mean(signal**2)))
 
 
-def test_the_predicted_doublet_is_the_flown_one(log):
+def test_the_predicted_doublet_matches_the_flown_one(log):
     airframe = load_airframe("adam0").airframe
     plant = plant_response(log, log.u_bar, 300.0)
     spec = thesis()
@@ -41,13 +43,13 @@ def test_the_predicted_doublet_is_the_flown_one(log):
             angles, moments = flight.truth["attitude"][rows], flight.record["moment"][rows, :2]
             away = np.degrees(angles[:, column] - model[rows])
             assert follow[column] == pytest.approx(rms(away), rel=0.1)
-            # The edges of the moment are faster than what the log knows.
+            # The edges of the torque contain frequencies above those measured.
             assert effort[column] == pytest.approx(np.sqrt(2) * rms(moments), rel=0.15)
-            # Off-axis is small: the response is known to a few hundredths of a degree.
+            # The off-axis angle is small: it is predicted to a few hundredths of a degree.
             assert offaxis[column] == pytest.approx(rms(np.degrees(angles[:, 1 - column])), rel=0.15, abs=0.06)
 
 
-def test_the_recommended_model_follows_better_than_the_thesis_one_and_is_certified(log, monkeypatch):
+def test_the_recommended_model_is_certified_and_follows_better_than_that_of_the_thesis(log, monkeypatch):
     monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 30.0))
     monkeypatch.setattr(advisor, "DAMPINGS", (0.4, 1.0))
     monkeypatch.setattr(advisor, "DELAYS", (0, 2))

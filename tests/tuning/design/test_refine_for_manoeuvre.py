@@ -1,4 +1,4 @@
-"""All gains refined for a doublet: what the model flies, what the limits are worth, what comes out."""
+"""All gains refined for a doublet: the prediction, the constraints, and the flown result."""
 
 import dataclasses
 
@@ -49,7 +49,7 @@ def sets(log):
 
 
 @pytest.mark.parametrize("axis", ["roll", "pitch"])
-def test_refined_gains_follow_three_times_better_with_the_effort_that_was_asked(sets, axis):
+def test_refined_gains_follow_three_times_better_within_the_effort(sets, axis):
     airframe = load_airframe("adam0").airframe
     inner, outer = second_order(20, 0.4, 0, TS), second_order(10, 0.7, 0, TS)
     task = doublet(axis, np.radians(DOUBLET["amplitude_deg"]), DOUBLET["period_s"], TS)
@@ -60,17 +60,17 @@ def test_refined_gains_follow_three_times_better_with_the_effort_that_was_asked(
     assert flown["refined"].J_M_o < flown["siso"].J_M_o / 3
     assert flown["refined"].offaxis_peak_deg < flown["siso"].offaxis_peak_deg / 3
     assert flown["refined"].effort_rms < 1.1 * flown["siso"].effort_rms
-    # Without off-diagonals the other axis cannot be helped.
+    # Without off-diagonal gains the axes cannot be decoupled.
     assert flown["refined siso"].offaxis_peak_deg > 2 * flown["refined"].offaxis_peak_deg
 
 
-def test_refined_gains_are_stable_with_the_margin_they_are_kept_to_and_say_what_they_are_for(sets):
+def test_refined_gains_keep_their_margins_and_record_the_manoeuvre(sets):
     refined = sets["refined"]
     figures = refined.certificate.figures
     assert refined.verdict()[0] in ("certified", "stable, thin margin")
     assert figures["Ms"] + figures["Ms_error"] <= 2.5
     assert refined.provenance.details["manoeuvre"]["amplitude_deg"] == DOUBLET["amplitude_deg"]
-    # VRFT's deviations are those of other gains.
+    # VRFT's standard deviations do not apply to the refined gains.
     assert refined.provenance.standard_deviation == {}
     assert np.linalg.eigvalsh(refined.Ki_i + refined.Ki_i.T)[0] > 0
 
@@ -81,7 +81,7 @@ def test_refined_siso_gains_stay_diagonal(sets):
         assert matrix[0, 1] == matrix[1, 0] == 0
 
 
-def test_the_model_needs_no_more_effort_than_was_allowed(log, sets):
+def test_the_predicted_effort_is_within_the_allowed_one(log, sets):
     allowed = sets["refined"].provenance.details["manoeuvre"]["effort"]
     needed = doublet_effort(sets["refined"], doublet_model(Measured(log), Manoeuvre(**DOUBLET)))
     assert np.all(np.array(needed) <= np.array(allowed) * 1.001)
@@ -92,8 +92,8 @@ def test_the_same_log_gives_the_same_gains(log, sets):
     assert again.elements() == sets["refined"].elements()
 
 
-def test_the_model_flies_the_flown_difference_equation(gains):
-    """Against the controller's own statement, with saturation of rates, moments and integral."""
+def test_the_prediction_runs_the_flown_difference_equation(gains):
+    """Against the reference controller, with saturation of rates, torque and integral."""
     gains = dataclasses.replace(gains, limits=Limits((1.5, 1.2, 3.0), (0.12, 0.1, 1.0), (0.02, 0.015, 0.2)))
     A = np.array([[0.9, 0.02], [-0.01, 0.92]])
     plant = StateSpace(A, np.array([[0.5, 0.05], [0.04, 0.6]]), np.eye(2), np.zeros((2, 2)), TS)
@@ -112,7 +112,7 @@ def test_the_model_flies_the_flown_difference_equation(gains):
     assert np.abs(moments[0, 0, :, 0]).max() == 0.12  # it did saturate
 
 
-def test_the_spectral_radius_is_how_fast_a_flight_grows(gains):
+def test_the_spectral_radius_is_the_growth_of_a_simulated_flight(gains):
     wide = Limits((1e99,) * 3, (1e99,) * 3, (1e99,) * 3)
     A = np.array([[0.9, 0.02], [-0.01, 0.92]])
     plant = StateSpace(A, np.array([[0.5, 0.05], [0.04, 0.6]]), np.eye(2), np.zeros((2, 2)), TS)
@@ -121,7 +121,7 @@ def test_the_spectral_radius_is_how_fast_a_flight_grows(gains):
     growing = dataclasses.replace(gains, limits=wide, Kp_i=30 * gains.Kp_i)
     size = np.abs(model.simulate(GainStack.of(growing))[0][:, 0]).max(axis=(0, 2))
     assert model_spectral_radius(growing, plant) == pytest.approx((size[150] / size[100]) ** (1 / 50), rel=1e-3)
-    # A stable one is told by its slowest mode, which may be the rate loop's when it is alone.
+    # For a stable set it is the slowest mode, which may be that of the rate loop alone.
     size = np.abs(model.simulate(GainStack.of(stable))[0][:, 0]).max(axis=(0, 2))
     assert (size[150:200].max() / size[100:150].max()) ** (1 / 50) < model_spectral_radius(stable, plant) < 1
 
@@ -132,17 +132,23 @@ def test_refined_gains_are_stable_on_the_model_in_both_loops(log, sets):
         assert model_spectral_radius(sets[name], model.plant) < 1
 
 
-def test_the_descent_comes_back_to_its_limits_from_outside():
+def test_a_start_that_violates_the_constraints_reaches_the_feasible_minimum():
     def examine(points):
         return 10.0 * points + 1e-3 * points**3, np.column_stack([points[:, 0] - 1.0, 2.0 - points[:, 1] ** 2])
 
     point, cost = constrained_least_squares(examine, np.array([0.0, 3.0]), 1e-6)
     assert point == pytest.approx([1.0, 0.0], abs=1e-3)
     assert cost == pytest.approx(100.02, rel=1e-3)
-    assert constrained_least_squares(lambda points: (points, np.full((len(points), 1), -1.0)), np.ones(2), 1e-6)[1] == np.inf
 
 
-def test_the_descent_finds_the_minimum_on_its_limit():
+def test_no_point_within_the_constraints_costs_infinity():
+    def examine(points):
+        return points, np.full((len(points), 1), -1.0)
+
+    assert constrained_least_squares(examine, np.ones(2), 1e-6)[1] == np.inf
+
+
+def test_the_minimum_on_a_constraint_is_found():
     def examine(points):
         return points - np.array([3.0, 1.0]), 2.0 - np.sum(points, axis=1, keepdims=True)
 
@@ -151,7 +157,7 @@ def test_the_descent_finds_the_minimum_on_its_limit():
     assert cost == pytest.approx(2.0, rel=1e-3)
 
 
-def test_a_doublet_is_two_numbers(mimopilot, tmp_path):
+def test_the_doublet_option_takes_two_numbers(mimopilot, tmp_path):
     assert parse_doublet("22.5,0.42") == DOUBLET
     with pytest.raises(TuningError, match="expected DEGREES,SECONDS"):
         parse_doublet("22.5")

@@ -1,3 +1,5 @@
+"""One loop: refinement on an identified plant, and SISO VRFT with each instrument."""
+
 import numpy as np
 import pytest
 from mimopilot.tuning.design.refine_on_model import frequency_grid, refine_on_model
@@ -13,7 +15,7 @@ TS = 0.004
 PLANT = StateSpace(np.array([[0.9]]), np.array([[1.0]]), np.array([[0.5]]), np.zeros((1, 1)), TS)
 
 
-def test_refinement_finds_a_controller_that_reaches_the_model_with_derivative_on_the_measurement():
+def test_refinement_finds_the_pid_controller_that_reaches_the_model_exactly():
     # P, I and D on 0.5/(z - 0.9) without derivative filter: the closed loop in polynomials is the model.
     kp, ki, kd = 0.2, 4.0, 0.0004
     c, d = (kp + TS * ki, -kp), kd / TS
@@ -26,7 +28,7 @@ def test_refinement_finds_a_controller_that_reaches_the_model_with_derivative_on
     assert found.controller.matrix == pytest.approx(np.array([[kp, ki, kd]]), rel=1e-5)
 
 
-def test_the_state_space_of_the_loop_has_the_frequency_response_of_the_formula():
+def test_the_loop_in_state_space_has_the_frequency_response_of_the_formula():
     controller = LoopController(
         {t: np.array([[v]]) for t, v in zip("PIDF", (0.2, 4.0, 0.0004, 0.05), strict=True)}, Filters(TS, 30.0)
     )
@@ -36,7 +38,7 @@ def test_the_state_space_of_the_loop_has_the_frequency_response_of_the_formula()
     assert np.allclose(T, formula, rtol=1e-9, atol=0)
 
 
-def test_refinement_from_gains_that_are_not_stable_is_refused():
+def test_refinement_from_unstable_gains_is_refused():
     wild = LoopController({"P": np.array([[10.0]])}, Filters(TS))
     with pytest.raises(TuningError, match="not stable"):
         refine_on_model(wild, PLANT, [ReferenceModel((0.1,), (1.0, -0.9), 0, TS)])
@@ -65,13 +67,13 @@ def tuned(u, y, **options):
     return siso_vrft(u, y, u, MODEL, "PI", weight="identity", **options)
 
 
-def test_siso_vrft_without_noise_is_the_ideal_controller_for_white_and_coloured_input():
+def test_siso_vrft_without_noise_gives_the_ideal_controller_for_white_and_coloured_input():
     for coloured in (False, True):
         u, y, _ = siso_data(0, 0.0, coloured)
         assert gains(tuned(u, y, repeated=y)) == pytest.approx(IDEAL, rel=1e-3)
 
 
-def test_every_instrument_removes_the_bias_that_least_squares_has():
+def test_every_instrument_removes_the_bias_of_least_squares():
     found = {name: [] for name in ("none", "second experiment", "model", "external")}
     for seed in range(8):
         u, clean, y = siso_data(seed, 0.3)
@@ -95,7 +97,7 @@ def test_the_whitening_filter_of_an_autoregression_is_its_denominator():
     assert np.abs(taps[3:]).max() < 0.02
 
 
-def test_a_dead_input_is_refused():
+def test_a_zero_input_is_refused():
     u, _, y = siso_data(0, 0.1)
     with pytest.raises(TuningError, match="not excited"):
         tuned(0 * u, y)

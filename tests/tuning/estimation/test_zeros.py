@@ -1,4 +1,4 @@
-"""Non-minimum-phase zeros against plants whose zeros are known."""
+"""Non-minimum-phase zeros of plants with known zeros."""
 
 import dataclasses
 
@@ -41,22 +41,22 @@ def test_a_known_zero_is_found_in_closed_loop_with_and_without_noise(zero):
         assert found.misfit < 1e-4
 
 
-def test_a_minimum_phase_plant_has_none_and_neither_has_the_vehicle():
+def test_no_zero_is_found_in_a_minimum_phase_plant_and_in_the_vehicle():
     assert flexible_model(*closed_loop_data(None, 0.02), START).nonminimum_phase_zeros() == []
     log = experiment("adam0")
     models = [flexible_model(log.u[:, i], log.y_i[:, i], log.u_bar, START) for i in range(2)]
     assert slowest_zero(models) is None
 
 
-def test_data_that_are_short_or_dead_are_refused():
+def test_short_or_unexcited_data_are_refused():
     u, y, w = closed_loop_data(30.0, 0.0)
     with pytest.raises(TuningError, match="too short"):
         flexible_model(u[:500], y[:500], w[:500], START)
-    with pytest.raises(TuningError, match="does not reach the output"):
+    with pytest.raises(TuningError, match="output does not respond"):
         flexible_model(u, 0 * y, w, START)
 
 
-def test_the_advisor_asks_for_nothing_faster_than_half_of_the_zero(monkeypatch):
+def test_the_scan_tries_no_rate_loop_faster_than_half_of_the_zero(monkeypatch):
     monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 40.0))
     monkeypatch.setattr(advisor, "DAMPINGS", (1.0,))
     monkeypatch.setattr(advisor, "DELAYS", (0,))
@@ -72,7 +72,7 @@ def test_the_advisor_asks_for_nothing_faster_than_half_of_the_zero(monkeypatch):
         advise(log, spec)
 
 
-def test_the_advisor_tries_lower_derivative_filters_than_the_flown_one_unless_told(monkeypatch):
+def test_the_scan_tries_lower_derivative_cutoffs_than_the_flown_one(monkeypatch):
     monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0,))
     monkeypatch.setattr(advisor, "DAMPINGS", (1.0,))
     monkeypatch.setattr(advisor, "DELAYS", (0,))
