@@ -97,7 +97,8 @@ def test_a_log_of_noise_is_refused_by_the_quality_checks(log):
     with pytest.raises(TuningError, match="not excited: the response from torque to rates is known at 0 frequencies"):
         tune(noise, thesis())
     found = estimate(noise, thesis())
-    with pytest.raises(TuningError, match=r"the excitation explains .* of the signals that the roll gains are found from"):
+    explained = r"the excitation explains .* of the signals that the roll gains are found from"
+    with pytest.raises(TuningError, match=explained):
         check_estimates("log", found.stretches, found.inner, noise.Ts)
 
 
