@@ -58,11 +58,11 @@ def check_verdict(gains: Gains, allow: bool) -> str:
 def _loose_thresholds(gains: Gains) -> str:
     """Warning if a certificate needed less margin than the default; else empty."""
     given = gains.certificate.thresholds if gains.certificate else {}
-    asked, usual = {**DEFAULT_THRESHOLDS.model_dump(), **given}, DEFAULT_THRESHOLDS
-    peaks = asked["Ms"] <= usual.Ms and asked["thin_Ms"] <= usual.thin_Ms
-    if peaks and asked["phase_deg"] >= usual.phase_deg and asked["thin_phase_deg"] >= usual.thin_phase_deg:
+    used, usual = {**DEFAULT_THRESHOLDS.model_dump(), **given}, DEFAULT_THRESHOLDS
+    peaks = used["Ms"] <= usual.Ms and used["thin_Ms"] <= usual.thin_Ms
+    if peaks and used["phase_deg"] >= usual.phase_deg and used["thin_phase_deg"] >= usual.thin_phase_deg:
         return ""
     return (
-        f"the certificate needed less margin than the default: Ms {asked['Ms']:g} and {asked['phase_deg']:g} degrees "
-        f"(thin: {asked['thin_Ms']:g} and {asked['thin_phase_deg']:g})"
+        f"the certificate needed less margin than the default: Ms {used['Ms']:g} and {used['phase_deg']:g} degrees "
+        f"(thin: {used['thin_Ms']:g} and {used['thin_phase_deg']:g})"
     )

@@ -95,7 +95,7 @@ class Gains:
         Stability of the loop. Valid only while neither it nor the gains are edited; see `verdict`. None: never
         examined.
     provenance : Provenance
-        Where the gains come from.
+        Origin of the gains.
 
     Raises
     ------
@@ -215,9 +215,9 @@ class Gains:
 
     def _seal(self, certificate: Certificate) -> str:
         """Hash of a certificate and of every number that the loop's stability depends on."""
-        said = {name: value for name, value in certificate.as_table().items() if name != "seal"}
+        content = {name: value for name, value in certificate.as_table().items() if name != "seal"}
         numbers = {**self.elements(), **{row.key: self.of(row) for row in rows(Shape.POLE)}}
-        return sha256(json.dumps([said, numbers, self.moment_scale], sort_keys=True, default=str))
+        return sha256(json.dumps([content, numbers, self.moment_scale], sort_keys=True, default=str))
 
     def verdict(self) -> tuple[Verdict, str]:
         """Verdict of the certificate and its reason; ``none`` without one, ``void`` if it or a gain was edited."""

@@ -22,7 +22,7 @@ SCHEMA = 2
 #: Tables and entries other than the parameter table's keys.
 SECTIONS = ("roll_pitch", "yaw", "limits")
 OTHERS = ("schema", "moment_scale", "certificate", "provenance")
-#: Comments beside keys.
+#: Comments of keys.
 NOTES = {"Ts": "s", "derivative_cutoff_hz": "0: no filter"}
 
 
@@ -128,7 +128,7 @@ def _triple(value: Any, where: str) -> tuple[float, float, float]:
 
 
 def gains_to_toml(gains: Gains) -> str:
-    """Text of the gains file: every float is printed so that reading it back gives the same bits."""
+    """Text of the gains file; reading it back restores the same bits of every float."""
 
     def line(row: Row) -> str:
         value = gains.of(row)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from mimopilot.tuning.errors import TuningError
@@ -175,7 +175,15 @@ class Row:
                     minimum = self.diagonal_minimum
             elif axes:
                 what = f"{what}, {AXIS_NAMES[axes]}"
-            yield Parameter(PREFIX + code, code, self.unit, minimum, self.maximum, self.writable, what)
+            yield Parameter(
+                name=PREFIX + code,
+                code=code,
+                unit=self.unit,
+                minimum=minimum,
+                maximum=self.maximum,
+                writable=self.writable,
+                description=what,
+            )
 
 
 @dataclass(frozen=True)
@@ -210,27 +218,38 @@ class Parameter:
 def _gain(
     key: str, code: str, unit: str, largest: float, description: str, comment: str, diagonal: float | None = None
 ) -> Row:
-    smallest = -largest
-    return Row(key, key.lower(), code, Shape.MATRIX, unit, smallest, largest, description, comment, diagonal)
+    return Row(
+        key=key,
+        member=key.lower(),
+        code=code,
+        shape=Shape.MATRIX,
+        unit=unit,
+        minimum=-largest,
+        maximum=largest,
+        description=description,
+        comment=comment,
+        diagonal_minimum=diagonal,
+    )
 
 
 def _yaw(gain: Row) -> Row:
     """Row of the yaw scalar that belongs to a gain matrix."""
-    return Row(
-        gain.key,
-        f"yaw_{gain.member}",
-        gain.code,
-        Shape.YAW,
-        gain.unit,
-        gain.minimum,
-        gain.maximum,
-        gain.description,
-        diagonal_minimum=gain.diagonal_minimum,
-    )
+    return replace(gain, member=f"yaw_{gain.member}", shape=Shape.YAW, comment="")
 
 
 def _limit(key: str, code: str, unit: str, smallest: float, largest: float, description: str, comment: str) -> Row:
-    return Row(key, key, code, Shape.AXES, unit, smallest, largest, description, comment, valid=POSITIVE)
+    return Row(
+        key=key,
+        member=key,
+        code=code,
+        shape=Shape.AXES,
+        unit=unit,
+        minimum=smallest,
+        maximum=largest,
+        description=description,
+        comment=comment,
+        valid=POSITIVE,
+    )
 
 
 # Ranges: the diagonal of P must be positive and that of I not negative, or the loop is not closed. D and feed-forward
@@ -267,27 +286,27 @@ ROWS: tuple[Row, ...] = (
     _limit("moment_max", "UMAX", "norm", 0.01, 1.0, "limit of the torque, excitation included", "normalised"),
     _limit("integral_max", "IMAX", "norm", 0.001, 1.0, "limit of the integral term", "normalised"),
     Row(
-        "derivative_cutoff_hz",
-        "derivative_pole",
-        "D_POLE",
-        Shape.POLE,
-        "norm",
-        0.0,
-        0.9999,
-        "pole of the derivative filter, exp(-2 pi f_d Ts); 0: none",
-        "a = exp(-2 pi f_d Ts), 0: no filter",
+        key="derivative_cutoff_hz",
+        member="derivative_pole",
+        code="D_POLE",
+        shape=Shape.POLE,
+        unit="norm",
+        minimum=0.0,
+        maximum=0.9999,
+        description="pole of the derivative filter, exp(-2 pi f_d Ts); 0: none",
+        comment="a = exp(-2 pi f_d Ts), 0: no filter",
         valid=STABLE_POLE,
     ),
     Row(
-        "Ts",
-        "period",
-        "TS",
-        Shape.SCALAR,
-        "s",
-        1e-4,
-        1.0,
-        "control period, fixed in the firmware",
-        "Ts, s",
+        key="Ts",
+        member="period",
+        code="TS",
+        shape=Shape.SCALAR,
+        unit="s",
+        minimum=PERIOD.lowest,
+        maximum=PERIOD.highest,
+        description="control period, fixed in the firmware",
+        comment="Ts, s",
         writable=False,
         valid=PERIOD,
     ),
@@ -311,7 +330,13 @@ SCALE = "SCALE"
 #: Further values that a vehicle publishes, so that gains for another unit of torque are detected.
 IDENTITY: tuple[Parameter, ...] = tuple(
     Parameter(
-        f"{PREFIX}{SCALE}_{axis}", f"{SCALE}_{axis}", "N m", 0.0, 1e6, False, f"torque of u = 1, {AXIS_NAMES[axis]}"
+        name=f"{PREFIX}{SCALE}_{axis}",
+        code=f"{SCALE}_{axis}",
+        unit="N m",
+        minimum=0.0,
+        maximum=1e6,
+        writable=False,
+        description=f"torque of u = 1, {AXIS_NAMES[axis]}",
     )
     for axis in AXIS_LETTERS
 )
@@ -370,7 +395,7 @@ def check_names() -> None:
         name = parameter.name
         if len(name) > NAME_LENGTH:
             raise TuningError(
-                f"{name}: got a name of {len(name)} characters, expected at most {NAME_LENGTH}: vehicles truncate it"
+                f"{name}: a name of {len(name)} characters, expected at most {NAME_LENGTH}: vehicles truncate it"
             )
         if not re.fullmatch("[A-Z][A-Z0-9_]*", name):
             raise TuningError(f"{name}: expected a letter, then A-Z, 0-9 and _: vehicles drop other names")

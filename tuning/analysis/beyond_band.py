@@ -123,7 +123,7 @@ def find_structural_mode(gains: Gains, plant: PlantResponse) -> tuple[float, flo
 
 
 def sensitivity_peak_above(gains: Gains, plant: PlantResponse, end: float) -> float:
-    """Largest sensitivity, errors included, at frequencies above `end` (rad/s) that the log tells about; 0: none."""
+    """Largest sensitivity at measured frequencies above `end` (rad/s), errors included; 0: none measured."""
     gain, error = _rate_loop_gain(gains, plant)
     counts = _measured(plant, gain, error) & (plant.omega > end)
     if not counts.any():
@@ -133,15 +133,15 @@ def sensitivity_peak_above(gains: Gains, plant: PlantResponse, end: float) -> fl
 
 
 def _measured(plant: PlantResponse, gain: Signal, error: Signal) -> NDArray[np.bool_]:
-    """Where the log tells about the loop's gain, (K,).
+    """Frequencies at which the loop's gain counts as measured, (K,).
 
-    It does where the response is known. It also does where an axis is coherent or the error is small, at this
-    frequency and at a neighbour.
+    Where the response is known; also where an axis is coherent or the error is small, at this frequency and at a
+    neighbour.
     """
     seen = np.any(plant.coherence > COHERENT, axis=1) | (error < MEASURED_ERROR * gain)
     # A single value may exceed these limits by chance; a mode shows at neighbouring frequencies, too.
-    beside = np.append(seen[1:], False) | np.append(False, seen[:-1])
-    return np.asarray(plant.known() | (seen & beside))
+    neighbour = np.append(seen[1:], False) | np.append(False, seen[:-1])
+    return np.asarray(plant.known() | (seen & neighbour))
 
 
 def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]:

@@ -2,8 +2,8 @@
 
 The measured frequency response decides by Nyquist's count: det(n (I + L)) must not encircle 0, for the rate loop alone
 and for the whole cascade cut at u. Other plants are drawn from the response's error; one that is unstable is enough to
-withhold the certificate. So is a loop gain that rises again above the crossover, at any frequency that the log tells
-about: a structural mode.
+withhold the certificate. So is a loop gain that rises again at a measured frequency above the crossover: a structural
+mode.
 """
 
 from __future__ import annotations

@@ -49,10 +49,10 @@ class DoubletModel:
 
         Returns
         -------
-        angles, moments : (2, sets, N, 2) arrays, rad, dimensionless
+        angles, moments : (2, sets, N, 2) arrays, rad, torque (normalised)
             First index: the moving axis.
         """
-        from mimopilot.tuning.analysis.compiled_doublet import (  # takes longer to import than all of the rest
+        from mimopilot.tuning.analysis.compiled_doublet import (  # numba: slower to import than all other modules
             law_terms,
             simulate_doublets,
         )

@@ -215,11 +215,11 @@ def _rate_setpoint(
 def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
     """Gains with everything that is not tuned: yaw, limits, filter and unit, as specified or as flown."""
     flown = experiment.flown
-    asked = {
+    required = {
         "which yaw gains flew ([yaw]: Kp_o, Kp_i, Ki_i, Kd_i)": spec.yaw,
         "which derivative filter flew (derivative_cutoff_hz, Hz, 0 for none)": spec.derivative_cutoff_hz,
     }
-    missing = [name for name, value in asked.items() if value is None]
+    missing = [name for name, value in required.items() if value is None]
     if flown is None and missing:
         raise TuningError(
             f"{experiment.source}: the log does not tell {' and '.join(missing)}; put it into a --spec file"

@@ -141,7 +141,7 @@ def check_band(source: str, plant: PlantResponse, bandwidths: Sequence[float]) -
 
 
 def check_saturation(experiment: Experiment) -> list[str]:
-    """Warnings about a torque at its limit, if the log tells the limit.
+    """Warnings about a torque at its limit, if the log has the limit.
 
     Raises
     ------
