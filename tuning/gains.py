@@ -250,9 +250,7 @@ class Gains:
             When the set's own unit is not known.
         """
         if self.moment_scale is None:
-            raise TuningError(
-                "moment_scale: the torque of u = 1 in N m is not known; write it into the gains file"
-            )
+            raise TuningError("moment_scale: the torque of u = 1 in N m is not known; write it into the gains file")
         ratio = np.array(self.moment_scale) / np.array(scale)
         matrices = {name: getattr(self, name) * ratio[:2, None] for name in MATRICES if name.endswith("_i")}
         yaw = {name: getattr(self.yaw, name) * float(ratio[2]) for name in MATRICES if name.endswith("_i")}

@@ -82,9 +82,9 @@ def attitude_gain_above(gains: Gains, plant: PlantResponse) -> float:
     G_o falls at least like 1/w^2 there, see `loop_gain_above`.
     """
     grid = np.linspace(plant.omega[-1], np.pi / gains.Ts, GRID_POINTS)
-    path = np.linalg.norm(rate_controller(gains, grid)[0] @ gains.Kp_o, ord=2, axis=(1, 2)) * (
-        plant.omega[-1] / grid
-    ) ** 2
+    path = (
+        np.linalg.norm(rate_controller(gains, grid)[0] @ gains.Kp_o, ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
+    )
     return float(np.linalg.norm(plant.G_o[-1], ord=2) * path.max())
 
 

@@ -13,22 +13,14 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.measured import Measured
-from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import load_spec
 
 from mimopilot.common.errors import InputFileError
+from tests.tuning.analysis.loops import MODELS, exact, random_set
 from tests.tuning.truth import TS, Truth, experiment
 
-MODELS = ((second_order(20, 0.4, 0, TS),) * 2, (second_order(10, 0.7, 0, TS),) * 2)
 #: Amplitude of the excitation; ANT-R hovers at 14 % of its thrust and is not linear for a larger one.
 PLANTS = {"adam0": 0.15, "adam0_perturbed": 0.15, "adam0_boom": 0.15, "antr": 0.05, "px4_sih": 0.15}
-
-
-def exact(plant, omega):
-    """A response without error."""
-    G = plant.frequency_response(omega)
-    empty = np.zeros((len(omega), 6, 6)), np.zeros((len(omega), 2, 2))
-    return PlantResponse(omega, G[:, :2], G[:, 2:], *empty, np.ones((len(omega), 2)), TS)
 
 
 @pytest.fixture(scope="module")
@@ -52,21 +44,6 @@ def test_the_measured_response_is_that_of_the_plant(flights):
         noisy = plant.known() & (plant.omega > 60)
         error = np.linalg.norm(plant.G_i - true.G_i, axis=(1, 2)) / np.linalg.norm(plant.deviation(), axis=(1, 2))
         assert 0.4 < np.sqrt(np.mean(error[noisy] ** 2)) < 1.6
-
-
-def random_set(base, rng):
-    """A gain set with a random loop gain, balance of terms and coupling."""
-    scale = {code: np.exp(rng.uniform(-1.2, 1.3)) for code in ("AP", "RP", "RI", "RD")}
-    changes = {}
-    for code, value in base.elements().items():
-        if code[:2] not in scale or code.endswith("Y"):
-            continue
-        diagonal = base.elements()[code[:4] + code[3]]
-        if code[3] == code[4]:
-            changes[code] = float(value * scale[code[:2]] * np.exp(0.25 * rng.normal()))
-        else:
-            changes[code] = float(value + 0.25 * scale[code[:2]] * abs(diagonal) * rng.normal())
-    return base.with_elements(changes)
 
 
 def judged(measured, truth, count, rng):

@@ -1,5 +1,7 @@
 """The scan of rate-loop models: predicted doublets and the recommendation."""
 
+import dataclasses
+
 import mimopilot.tuning.design.advise as advisor
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.advise import Doublet, advise, predict_doublet
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import plant_response
 from mimopilot.tuning.spec import TuningSpec
 
@@ -71,3 +74,33 @@ def test_without_a_certified_candidate_nothing_is_recommended(log, monkeypatch):
     monkeypatch.setattr(advisor, "DELAYS", (0,))
     with pytest.raises(TuningError, match="none of 1 rate loops is certified"):
         advise(log, TuningSpec(derivative_cutoff_hz=30.0))
+
+
+def test_the_scan_tries_no_rate_loop_faster_than_half_of_the_zero(monkeypatch):
+    monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 40.0))
+    monkeypatch.setattr(advisor, "DAMPINGS", (1.0,))
+    monkeypatch.setattr(advisor, "DELAYS", (0,))
+    log = experiment("adam0")
+    spec = TuningSpec(derivative_cutoff_hz=30.0)
+    assert [c.inner[0] for c in advise(log, spec).candidates] == [20.0, 40.0]
+    monkeypatch.setattr(advisor, "slowest_zero", lambda models: 50.0)
+    found = advise(log, spec)
+    assert found.zero == 50.0
+    assert [c.inner[0] for c in found.candidates] == [20.0]
+    monkeypatch.setattr(advisor, "slowest_zero", lambda models: 20.0)
+    with pytest.raises(TuningError, match=r"zero at 20\.0 rad/s, too slow"):
+        advise(log, spec)
+
+
+def test_the_scan_tries_lower_derivative_cutoffs_than_the_flown_one(monkeypatch):
+    monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0,))
+    monkeypatch.setattr(advisor, "DAMPINGS", (1.0,))
+    monkeypatch.setattr(advisor, "DELAYS", (0,))
+    log = experiment("adam0")
+    assert [c.cutoff_hz for c in advise(log, thesis()).candidates] == [30.0, 10.0, 5.0]
+    eight = dataclasses.replace(log, flown=dataclasses.replace(log.flown, filters=Filters(log.flown.Ts, 8.0)))
+    found = advise(eight, thesis())
+    assert [c.cutoff_hz for c in found.candidates] == [8.0, 5.0]
+    for c in found.candidates:
+        assert c.gains.derivative_cutoff_hz == c.cutoff_hz
+        assert c.delta[0] == c.gains.certificate.figures["delta"]

@@ -29,9 +29,7 @@ def logs(tmp_path_factory):
     return folder
 
 
-def test_runs_of_an_experiment_differ_by_their_seeds_and_share_the_excitation(
-    logs, mimopilot, tmp_path
-):
+def test_runs_of_an_experiment_differ_by_their_seeds_and_share_the_excitation(logs, mimopilot, tmp_path):
     options = ["--seconds-per-axis", 10, "--seed", 5, "--excitation-seed", 7, "--out", "one.ulg"]
     assert mimopilot("experiment", "adam0", *options).returncode == 0
     assert log_name(logs, 5).read_bytes() == (tmp_path / "one.ulg").read_bytes()
