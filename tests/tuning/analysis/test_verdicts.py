@@ -19,8 +19,8 @@ from mimopilot.tuning.spec import TuningSpec
 from mimopilot.tuning.statespace import StateSpace
 
 from tests.tuning.analysis.loops import (
-    MODELS,
     ACCEPTED,
+    MODELS,
     RIGID,
     airframe,
     defaults,
