@@ -19,7 +19,6 @@ from mimopilot.tuning.spec import TuningSpec
 from mimopilot.tuning.statespace import StateSpace
 
 from tests.tuning.analysis.loops import (
-    ACCEPTED,
     MODELS,
     RIGID,
     airframe,
