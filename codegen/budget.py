@@ -38,13 +38,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.codegen.cortex_m4 import EmulatedController, FirmwareImage, build_image, run_in_qemu
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.toolchain import CXX_FLAGS, cross_tool, run_tool
 from mimopilot.codegen.vectors import SEED, random_inputs
 from mimopilot.tuning.gains import Gains
-from numpy.typing import NDArray
 
 #: Core clock, Hz: that of the STM32F4 on Pixhawk boards.
 CLOCK = 168e6

@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
 from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS, cross_tool, find_tool, run_tool
 from mimopilot.tuning.gains import Gains
-from numpy.typing import NDArray
 
 #: Memory map of the STM32F405 (RM0090): address and size, bytes, of the flash and of the part of the RAM that is used.
 FLASH, FLASH_SIZE = 0x0800_0000, 1 << 20

@@ -9,10 +9,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import PARAMETERS, ROWS, Row
-from numpy.typing import NDArray
 
 GAINS = np.dtype(("<f4", (len(PARAMETERS),)))
 

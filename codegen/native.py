@@ -10,16 +10,16 @@ from typing import Any
 
 import cffi
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows, to_array
 from mimopilot.codegen.render import interface_hash, render, write_tree
 from mimopilot.codegen.targets import TEMPLATES
 from mimopilot.codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
-from mimopilot.tuning.gains import Gains
-from numpy.typing import NDArray
-
 from mimopilot.common.cache import cache_folder
 from mimopilot.common.files import inside, seal, sha256, unseal, write_atomically
+from mimopilot.tuning.gains import Gains
 
 HEADER = TEMPLATES / "native" / "mimo_pid_native.h"
 SOURCES = ("core/mimo_pid.cpp", "native/mimo_pid_native.cpp")

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import (
     ENABLE,

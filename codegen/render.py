@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
 from mimopilot.codegen.literals import float_literal
@@ -19,12 +20,10 @@ from mimopilot.codegen.px4 import entries
 from mimopilot.codegen.targets import DESCRIPTION, TEMPLATES, Target, find_target
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
 from mimopilot.codegen.vectors import emitted_vectors
-from mimopilot.tuning.acceptance import check_ranges
-from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.gains_file import gains_to_toml
-from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, Row, Shape, check_names
-
 from mimopilot.common.files import inside, read_text, sha256, write_atomically
+from mimopilot.tuning.acceptance import check_ranges
+from mimopilot.tuning.gains import Gains, gains_to_toml
+from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, Row, Shape, check_names
 
 #: These and the parameter table define the C interface.
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")

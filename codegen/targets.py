@@ -8,7 +8,6 @@ from functools import lru_cache
 from pathlib import Path
 
 from mimopilot.codegen.errors import CodegenError
-
 from mimopilot.common.toml import read_toml
 
 TEMPLATES = Path(__file__).resolve().parent.parent / "firmware_templates"

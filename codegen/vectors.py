@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.codegen.layout import INPUT, OUTPUT
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.gains import Gains
-from numpy.typing import NDArray
 
 #: Control periods of the emitted test, and the seed of all test vectors; chosen.
 ROWS, SEED = 256, 1

@@ -10,10 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+
 from mimopilot.codegen.budget import processor_in_the_loop
 from mimopilot.codegen.cortex_m4 import load_emulated
 from mimopilot.codegen.native import NativeController, build_native, load_native
 from mimopilot.codegen.vectors import random_inputs, reference_outputs
+from mimopilot.common.console import print_table
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import doublet, excitation_flight
 from mimopilot.sitl.flight.simulator import fly
@@ -32,8 +34,6 @@ from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.sitl.studies.standard_faults import standard_faults
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.logs.reader import read_log
-
-from mimopilot.common.console import print_table
 from tests.bench_campaign import campaign_rows, rotorpy_rows
 from tests.bench_tuning import best, tuning_rows
 from tests.sitl.mavlink import flood

@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-from mimopilot.sitl.campaign.flights import FlightRunner
-from mimopilot.sitl.campaign.plan import plan_from_files, read_files
 
 from mimopilot.common.parallel import cores
+from mimopilot.sitl.campaign.flights import FlightRunner
+from mimopilot.sitl.campaign.plan import plan_from_files, read_files
 from tests.bench_tuning import best
 
 RUNS, FLIGHT_S = 10_000, 4.0

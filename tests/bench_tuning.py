@@ -8,15 +8,16 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+
 from mimopilot.sitl.studies.benchmark_studies import gain_spread
 from mimopilot.sitl.studies.benchmarks import lv100, numerical_example
 from mimopilot.tuning.analysis.certificate import certify
-from mimopilot.tuning.design.cascade import estimate, tune
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.cascade_estimate import estimate
 from mimopilot.tuning.estimation.vrft import vrft
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.spec import load_spec
-
 from tests.tuning.literal import literal_cascade
 
 Signal = np.ndarray

@@ -14,6 +14,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = os.environ[
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+
 from mimopilot.tuning.gains import Gains, Limits, YawGains
 from mimopilot.tuning.law import Filters
 

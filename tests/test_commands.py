@@ -10,12 +10,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from pyulog import ULog
+
 from mimopilot.sitl.physics.airframe import FOLDER
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.ulog_file import open_ulog
 from mimopilot.tuning.reference_model import SecondOrder
-from pyulog import ULog
-
 from tests.conftest import assert_one_clear_line
 from tests.paths import PACKAGES, TOP
 
@@ -188,6 +188,7 @@ def test_without_a_compiler_the_package_is_named(mimopilot, tmp_path):
 
 def test_a_log_without_the_topics_names_them_and_its_own(mimopilot, tmp_path):
     import numpy as np
+
     from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 
     topics = {
@@ -204,6 +205,7 @@ def test_a_log_without_the_topics_names_them_and_its_own(mimopilot, tmp_path):
 @pytest.mark.parametrize(("Ts", "seconds", "words"), [(0.02, 20, "too slow"), (0.004, 3, "too short")])
 def test_a_slow_or_short_log_is_refused(mimopilot, tmp_path, Ts, seconds, words):
     import numpy as np
+
     from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 
     n = round(seconds / Ts)

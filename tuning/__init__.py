@@ -1,4 +1,4 @@
-"""From signals to gains: reference models, VRFT, log readers, the gains file.
+"""From logs to gains: log readers, reference models, VRFT, certificates, the gains file.
 
-This room knows nothing of C++, of MAVLink or of the plant.
+Nothing here depends on C++, MAVLink or the simulation.
 """

@@ -1,4 +1,4 @@
-"""Whether a gain set may be generated or uploaded: its ranges and its certificate."""
+"""Checks before a gain set is generated or uploaded: its ranges and its certificate."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from mimopilot.tuning.parameters import PARAMETERS
 
 
 def check_ranges(gains: Gains) -> None:
-    """Refuse a set that a vehicle would refuse.
+    """Refuse gains outside the ranges that a vehicle accepts.
 
     Raises
     ------
     TuningError
-        Naming the first parameter out of its range, its value and the range.
+        With the first parameter out of its range, its value and the range.
     """
     values = gains.elements()
     for parameter in PARAMETERS:
@@ -27,24 +27,23 @@ def check_ranges(gains: Gains) -> None:
 
 
 def check_verdict(gains: Gains, allow: bool) -> str:
-    """Refuse gains whose loop is unstable, too near to it, or was never examined.
+    """Refuse gains whose loop is unstable, too close to it, or was never examined.
 
     Parameters
     ----------
     gains : Gains
-        The set, with its certificate.
     allow : bool
-        Go on all the same.
+        Accept them with a warning instead.
 
     Returns
     -------
     str
-        A warning to show; empty when the set is certified.
+        A warning; empty when the set is certified.
 
     Raises
     ------
     TuningError
-        When the verdict is any other than ``certified`` and ``stable, thin margin``, and `allow` is False.
+        When the verdict is neither ``certified`` nor ``stable, thin margin``, and `allow` is False.
     """
     verdict, reason = gains.verdict()
     loose = _loose_thresholds(gains) if verdict in ACCEPTED else ""
@@ -52,18 +51,18 @@ def check_verdict(gains: Gains, allow: bool) -> str:
         return loose
     if verdict not in ACCEPTED and not allow:
         name = "no certificate" if verdict == Verdict.NONE else verdict
-        raise TuningError(f"{name}: {reason}; tune or certify again, or give --uncertified to go on all the same")
+        raise TuningError(f"{name}: {reason}; tune or certify again, or give --uncertified to accept the gains")
     return f"certificate: {verdict}: {reason}{'; ' if loose else ''}{loose}"
 
 
 def _loose_thresholds(gains: Gains) -> str:
-    """A warning where a certificate asked for less margin than usual; empty otherwise."""
+    """Warning if a certificate needed less margin than the default; else empty."""
     given = gains.certificate.thresholds if gains.certificate else {}
-    asked, usual = {**DEFAULT_THRESHOLDS.model_dump(), **given}, DEFAULT_THRESHOLDS
-    peaks = asked["Ms"] <= usual.Ms and asked["thin_Ms"] <= usual.thin_Ms
-    if peaks and asked["phase_deg"] >= usual.phase_deg and asked["thin_phase_deg"] >= usual.thin_phase_deg:
+    used, usual = {**DEFAULT_THRESHOLDS.model_dump(), **given}, DEFAULT_THRESHOLDS
+    peaks = used["Ms"] <= usual.Ms and used["thin_Ms"] <= usual.thin_Ms
+    if peaks and used["phase_deg"] >= usual.phase_deg and used["thin_phase_deg"] >= usual.thin_phase_deg:
         return ""
     return (
-        f"the certificate asked for less margin than usual: Ms {asked['Ms']:g} and {asked['phase_deg']:g} degrees "
-        f"(thin: {asked['thin_Ms']:g} and {asked['thin_phase_deg']:g})"
+        f"the certificate needed less margin than the default: Ms {used['Ms']:g} and {used['phase_deg']:g} degrees "
+        f"(thin: {used['thin_Ms']:g} and {used['thin_phase_deg']:g})"
     )

@@ -1,4 +1,4 @@
-"""The certificate of a gain set: what a log says of the stability of its loop."""
+"""The certificate of a gain set: the stability of its loop, as a log shows it."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import asdict, dataclass, field, fields
 from enum import StrEnum
 from typing import Annotated, Any, Self
 
-from mimopilot.tuning.errors import TuningError
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mimopilot.common.toml import shown
+from mimopilot.tuning.errors import TuningError
 
 
 class Verdict(StrEnum):
-    """What is known of a loop's stability."""
+    """Verdict on a loop's stability."""
 
     CERTIFIED = "certified"
     THIN = "stable, thin margin"
@@ -31,16 +31,16 @@ ACCEPTED = (Verdict.CERTIFIED, Verdict.THIN)
 
 
 class Thresholds(BaseModel):
-    """Margins that a verdict needs, of the loop including its error.
+    """Margins that a verdict needs, after subtracting their errors.
 
     Attributes
     ----------
     Ms, phase_deg : float, -, deg
-        Largest peak of the sensitivity and smallest phase margin of ``certified``. With Ms of 1.8 no loop has less than
-        32 degrees and 7 dB; the position loop around it takes its share of the rest.
+        Largest peak of the sensitivity and smallest phase margin for ``certified``. Ms of 1.8 guarantees 32 degrees
+        and 7 dB; the position loop around it uses part of that.
     thin_Ms, thin_phase_deg : float, -, deg
-        Of ``stable, thin margin``; anything thinner is ``not certified``: a loop at 10 degrees rolled by 25 degrees in
-        a genuine PX4.
+        The same for ``stable, thin margin``; less is ``not certified``: with 10 degrees a vehicle rolled by 25 degrees
+        in PX4's own simulation.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -62,27 +62,27 @@ DEFAULT_THRESHOLDS = Thresholds()
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a log says of a gain set.
+    """Verdict on a gain set and the margins behind it, from one log.
 
     Attributes
     ----------
     verdict : Verdict
         ``certified``, ``stable, thin margin``, ``not certified`` or ``unstable``.
     reason : str
-        Why, and the assumptions made outside of the band.
+        Reason of the verdict, and the assumptions made outside the band.
     figures : mapping
         ``Ms``, ``Ms_error`` (two standard errors), ``delta``, ``delta_error``, ``distance`` of the determinant to
         0, ``disk_margin``, and by axis ``gain_margin_db``, ``gain_margin`` (``exact``, ``at least``, ``not known``),
         ``phase_margin_deg``, ``phase_margin_error_deg`` (two standard errors), ``delay_margin_ms``;
-        ``simultaneous_gain_db`` and ``simultaneous_phase_deg`` for all axes at once. Empty where there are none.
+        ``simultaneous_gain_db`` and ``simultaneous_phase_deg`` for all axes at once. Empty if they were not computed.
     band : tuple of 2 float, rad/s
-        Where the response is known.
+        Lowest and highest frequency at which the response is known.
     thresholds : mapping
         `Thresholds` of the verdict.
     log_sha256 : str
-        The log that it was made from.
+        Hash of the log that it was made from.
     seal : str
-        Hash of all this and of the gains, see `tuning.gains.Gains.with_certificate`; empty: not bound to gains.
+        Hash of the certificate and the gains, see `tuning.gains.Gains.with_certificate`; empty: not bound to gains.
     """
 
     verdict: Verdict
@@ -94,17 +94,17 @@ class Certificate:
     seal: str = ""
 
     def as_table(self) -> dict[str, Any]:
-        """The certificate in plain TOML and JSON values."""
+        """The certificate as plain TOML and JSON values."""
         return {**asdict(self), "verdict": str(self.verdict), "band": list(self.band)}
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Certificate:
-        """Inverse of `as_table`; an entry that is missing or of another kind leaves a certificate that no seal fits.
+        """Inverse of `as_table`; a missing entry gets a default, which the seal then does not match.
 
         Raises
         ------
         TuningError
-            When the table is no certificate at all.
+            When an entry is unknown or of the wrong kind, or the verdict is invalid.
         """
         known = {one.name for one in fields(cls)}
         unknown = sorted(set(table) - known)

@@ -1,4 +1,4 @@
-"""The independent reference of the generated C++: the flown law, step by step.
+"""Independent reference of the generated C++: the flown law, step by step.
 
 With ``dtype=np.float32`` `Controller` must return the same bits as the C++.
 """
@@ -9,19 +9,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import MATRICES
 from numpy.typing import NDArray
 
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameters import MATRICES
+
+# The same numbers as in `firmware_templates/core/mimo_pid.hpp`.
+#: Periods for which the last valid input replaces an invalid one: 0.1 s at 250 Hz.
 HOLD_SAMPLES = 25
+#: Largest valid body rate, rad/s: above the range of gyros, 2000 deg/s.
 MAX_RATE = 100.0
+#: Largest valid angle, rad: two turns.
 MAX_ANGLE = 4 * np.pi
+#: Largest valid excitation, torque (normalised).
 MAX_EXCITATION = 1.0
 
 
 @dataclass
 class Step:
-    """What one control period gives: u, r_i and the faults, each for roll, pitch, yaw."""
+    """Output of one control period: u, r_i and the faults, each for roll, pitch, yaw."""
 
     moment: NDArray[Any]
     rates_setpoint: NDArray[Any]
@@ -35,22 +41,22 @@ class Controller:
     Parameters
     ----------
     gains : Gains
-        What it flies with; rounded to `dtype`.
+        Rounded to `dtype`.
     dtype : type
         ``np.float32`` for the bits of the C++, ``np.float64`` for analysis.
     """
 
     def __init__(self, gains: Gains, dtype: type = np.float32) -> None:
         self.f = dtype
-        self._take(gains)
+        self._load(gains)
         zero = [self.f(0)] * 3
         self.integral, self.derivative = list(zero), list(zero)
         self.setpoint, self.attitude, self.rates = list(zero), list(zero), list(zero)
         self.age = [[HOLD_SAMPLES + 1] * 3 for _ in range(3)]
         self.fault_count = 0
 
-    def _take(self, gains: Gains) -> None:
-        """Round the gains: block-diagonal 3x3 matrices, yaw last."""
+    def _load(self, gains: Gains) -> None:
+        """Round and store the gains: block-diagonal 3x3 matrices, yaw last."""
         f = self.f
         self.matrix = {
             name: [
@@ -66,6 +72,7 @@ class Controller:
         self.pole, self.period = f(gains.filters.derivative_pole), f(gains.Ts)
 
     def _times(self, name: str, x: list[Any], axis: int) -> Any:
+        """One row of a matrix times x."""
         gain = self.matrix[name][axis]
         return gain[2] * x[2] if axis == 2 else gain[0] * x[0] + gain[1] * x[1]
 
@@ -93,15 +100,16 @@ class Controller:
         ]
 
     def set_gains(self, gains: Gains) -> None:
-        """Change the gains; I is re-seated so that v is continuous, within its limit (bumpless)."""
+        """Change the gains; I is adjusted within its limit so that the output is continuous (bumpless)."""
         before = self._output(self.integral)
-        self._take(gains)
+        self._load(gains)
         rest = self._output([self.f(0)] * 3)
         for j in range(3):
             integrates = any(gain != 0 for gain in self.matrix["Ki_i"][j])
             self.integral[j] = self._clamp(before[j] - rest[j], self.integral_max[j]) if integrates else self.f(0)
 
     def _accept(self, kind: int, held: list[Any], values: NDArray[Any], limit: float) -> None:
+        """Store valid values; count and hold over invalid ones."""
         for i in range(3):
             if -self.f(limit) <= values[i] <= self.f(limit):
                 held[i] = self.f(values[i])
@@ -120,7 +128,7 @@ class Controller:
         armed: bool = True,
         landed: bool = False,
     ) -> Step:
-        """One period.
+        """Run one period.
 
         Parameters
         ----------
@@ -129,9 +137,9 @@ class Controller:
         rates : (3,) array, rad/s
             Body rates.
         excitation : (3,) array, optional
-            u_bar, dimensionless.
+            u_bar, torque (normalised).
         saturation : (3,) array, optional
-            Sign of the moment that the allocator could not give in the last period.
+            Sign of the torque that the allocator could not produce in the last period.
         armed, landed : bool
             Disarmed: I = 0. Landed: I held.
         """
@@ -171,7 +179,7 @@ class Controller:
         return Step(np.array(u, f), np.array(r, f), 0, self.fault_count)
 
     def _damp_rates(self, valid: list[bool], fault: int, armed: bool) -> Step:
-        """U = -Kp y_i - Kd d on the axes whose rate is valid, zero on the others; I frozen."""
+        """U = -Kp y_i - Kd d on axes with a valid rate, zero on the others; I is frozen."""
         f = self.f
         if not armed:
             self.integral = [f(0)] * 3

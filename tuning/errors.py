@@ -1,11 +1,11 @@
-"""The exceptions of tuning."""
+"""Exceptions of tuning."""
 
 from mimopilot.common.errors import Error
 
 
 class TuningError(Error, ValueError):
-    """Bad input to tuning."""
+    """Invalid input to tuning."""
 
 
 class NotMinimumPhaseError(TuningError):
-    """A controller that cannot be inverted."""
+    """A controller without a stable inverse."""

@@ -1,4 +1,4 @@
-"""The excitation: a pseudo-random binary moment (theory: PRBS with random hold times)."""
+"""The excitation: a pseudo-random binary torque, PRBS, with random hold times."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
+
+from mimopilot.tuning.errors import TuningError
 
 
 def hold_from_bandwidth(bandwidth: float, Ts: float) -> tuple[int, int]:
@@ -41,10 +42,9 @@ def hold_from_bandwidth(bandwidth: float, Ts: float) -> tuple[int, int]:
 def prbs(
     samples: int, amplitude: float, hold_min: int, hold_max: int, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Two-valued signal of alternating sign, each value held for a random number of samples.
+    """Signal of two values with alternating sign, each held for a random number of samples.
 
-    A constant hold time would put nulls in the spectrum, hence the draw from
-    ``hold_min..hold_max`` (both included).
+    A constant hold time would put nulls into the spectrum, so it is drawn from ``hold_min..hold_max`` (both included).
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def prbs(
     hold_min, hold_max : int, samples
         Range of the hold times.
     generator : numpy.random.Generator
-        Source of all randomness.
+        Source of the randomness.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def prbs(
     signal = np.empty(samples)
     stream = pulses(hold_min, hold_max, generator)
     start = 0
-    while start < samples:  # not one pulse more is drawn than is needed: others draw from the generator next
+    while start < samples:  # draws only the pulses it needs: the caller draws from the generator next
         sign, hold = next(stream)
         signal[start : start + hold] = sign * amplitude
         start += hold
@@ -80,7 +80,7 @@ def prbs(
 
 
 def pulses(hold_min: int, hold_max: int, generator: np.random.Generator) -> Iterator[tuple[float, int]]:
-    """The pulses of `prbs` one by one, without end.
+    """Pulses of `prbs`, one at a time, without end.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def pulses(hold_min: int, hold_max: int, generator: np.random.Generator) -> Iter
     sign : float
         1 or -1.
     hold : int, samples
-        How long it is held.
+        Length of the pulse.
 
     Raises
     ------

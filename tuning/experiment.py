@@ -1,14 +1,15 @@
-"""One recorded flight as uniformly sampled signals: what every log reader and the bench return."""
+"""One recorded flight as uniformly sampled signals: the result of every log reader and of the simulation."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.motors import Motors
-from numpy.typing import NDArray
 
 Signal = NDArray[np.float64]
 
@@ -22,23 +23,23 @@ class Experiment:
     Ts : float, s
         Sampling period.
     u : (N, 2) array
-        Control moment applied to the plant, after injection and saturation, dimensionless.
+        Torque (normalised) applied to the plant, after injection and saturation.
     y_i, y_o : (N, 2) arrays, rad/s, rad
         Measured body rates and measured roll and pitch angle.
     u_bar : (N, 2) array or None
         Injected excitation, part of u. None: not logged.
     r_o, r_i : (N, 2) arrays or None, rad, rad/s
-        Attitude and rate set-points. None: not logged.
+        Attitude and rate setpoints. None: not logged.
     segments : tuple of (start, stop)
         Stretches without a gap, in samples, stop excluded.
     source, sha256 : str
         Name and hash of the log.
     flown : Gains or None
-        The controller that flew, when the log says so.
+        The controller that flew. None: not logged.
     motors : Motors or None
-        How the allocator moved the motors, when the log says so.
+        How the allocator drove the motors. None: not logged.
     warnings : tuple of str
-        What is wrong with the log although it can be used: damage, parameters that changed.
+        Defects of a usable log: damage, parameters that changed.
 
     Raises
     ------
@@ -71,7 +72,7 @@ class Experiment:
                 raise TuningError(f"{self.source}: {name}: got shape {signal.shape}, expected {self.u.shape}")
             for start, stop in self.segments:
                 if not 0 <= start < stop <= len(signal):
-                    raise TuningError(f"{self.source}: segment {start}..{stop} is empty or not within 0..{len(signal)}")
+                    raise TuningError(f"{self.source}: segment {start}..{stop}: expected a part of 0..{len(signal)}")
                 bad = np.flatnonzero(~np.isfinite(signal[start:stop]).all(axis=1))
                 if len(bad):
                     raise TuningError(
@@ -86,18 +87,18 @@ class Experiment:
 
 
 def external_signal(experiment: Experiment) -> tuple[Signal, str]:
-    """The external signal, (N, 2), and its name: the injected moment, else the attitude set-point (rad).
+    """External signal, (N, 2), and its name: the injected torque, else the attitude setpoint (rad).
 
     Raises
     ------
     TuningError
-        When neither is logged and moves.
+        When neither is logged and varies.
     """
     for name in ("u_bar", "r_o"):
         signal = getattr(experiment, name)
         if signal is not None and any(np.ptp(signal[start:stop]) > 0 for start, stop in experiment.segments):
             return signal, name
     raise TuningError(
-        f"{experiment.source}: no excitation: neither an injected moment nor a moving attitude set-point is logged; "
-        "fly an experiment with a moment injected on roll, then on pitch"
+        f"{experiment.source}: no excitation: neither an injected torque nor a varying attitude setpoint is logged; "
+        "fly an experiment with a torque injected on roll, then on pitch"
     )

@@ -1,4 +1,4 @@
-"""Several gain sets of one vehicle at once, for what is computed of hundreds of them."""
+"""Several gain sets of one vehicle in arrays, to evaluate hundreds at once."""
 
 from __future__ import annotations
 
@@ -6,24 +6,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameters import MATRICES
-from numpy.typing import NDArray
 
 Signal = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class GainStack:
-    """Matrices of K gain sets, each array broadcast against frequencies.
+    """Matrices of K gain sets, shaped to broadcast against frequencies.
 
     Attributes
     ----------
     Kp_o, Kp_i, Ki_i, Kd_i, Kff_i : (K, 1, 2, 2) arrays
         As in `tuning.gains.Gains`.
     limits : (3, 2) array
-        Of rates (rad/s), moments and integral, the same for all.
+        Of rates (rad/s), torque and integral, the same for all.
     filters : Filters
         Period and filters, the same for all.
     """
@@ -43,18 +44,18 @@ class GainStack:
 
     @classmethod
     def of(cls, gains: Gains) -> GainStack:
-        """A stack of one."""
+        """A stack of one set."""
         limits = np.array([gains.limits.rate_max[:2], gains.limits.moment_max[:2], gains.limits.integral_max[:2]])
         matrices = {name: getattr(gains, name)[None, None] for name in MATRICES}
         return cls(**matrices, limits=limits, filters=gains.filters)
 
     def varied(self, matrices: Mapping[str, Signal]) -> GainStack:
-        """The first set with some of its matrices replaced, (K, 2, 2) each."""
+        """K copies of the first set with some of its matrices replaced, (K, 2, 2) each."""
         count = len(next(iter(matrices.values())))
         every = {name: np.broadcast_to(getattr(self, name)[:1], (count, 1, 2, 2)) for name in MATRICES}
         every |= {name: matrix[:, None] for name, matrix in matrices.items()}
         return GainStack(**every, limits=self.limits, filters=self.filters)
 
     def stacked(self) -> Signal:
-        """All in one array, (K, 5, 2, 2)."""
+        """All matrices in one array, (K, 5, 2, 2)."""
         return np.concatenate([getattr(self, name) for name in MATRICES], axis=1)

@@ -1,8 +1,8 @@
 """The gains of the cascaded controller: the contract between tuning, code generation and simulation.
 
 One controller is five 2x2 matrices for roll and pitch, five scalars for yaw, its period and filters, and its limits.
-Element (i, j) of a matrix makes output i from the error on axis j. Every scalar has a short code, such as ``RP_RR``
-(rate P, roll from roll); on a vehicle that code with the prefix ``MIMO_`` is the parameter's name. The table of all of
+Element (i, j) of a matrix maps the error on axis j to output i. Every scalar has a short code, such as ``RP_RR``
+(rate P, roll from roll). On a vehicle the parameter's name is that code with the prefix ``MIMO_``. The table of all of
 them is `tuning.parameters`.
 """
 
@@ -15,6 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from mimopilot.common.files import sha256, write_atomically
+from mimopilot.common.toml import toml_entries, toml_value
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
@@ -30,9 +34,6 @@ from mimopilot.tuning.parameters import (
 )
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
-from numpy.typing import NDArray
-
-from mimopilot.common.files import sha256
 
 Matrix = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -40,8 +41,14 @@ Triple = tuple[float, float, float]
 #: Reference models of the thesis' flights (chapter 6): rate loop, attitude loop.
 THESIS_INNER = (SecondOrder(20.0, 0.4),) * 2
 THESIS_OUTER = (SecondOrder(10.0, 0.7),) * 2
+#: Of the gains file.
+SCHEMA = 2
+#: Comments of keys.
+NOTES = {"Ts": "s", "derivative_cutoff_hz": "0: no filter"}
 #: Seal of a certificate that was read from a gains file of schema 1.
 SCHEMA_1 = "schema 1"
+#: Largest relative difference of the ratios of roll and pitch at which a certificate stays valid: rounding of the unit.
+SAME_RATIO = 1e-3
 
 
 @dataclass(frozen=True)
@@ -62,7 +69,7 @@ class Limits:
     Attributes
     ----------
     rate_max : tuple of 3 float, rad/s
-        Limit of the rate setpoint that the attitude controller makes.
+        Limit of the attitude controller's output, the rate setpoint.
     moment_max : tuple of 3 float
         Limit of the torque u (normalised), excitation included.
     integral_max : tuple of 3 float
@@ -92,12 +99,12 @@ class Gains:
     limits : Limits
         Saturations.
     moment_scale : tuple of 3 float or None, N m
-        Torque that one unit of u stands for on roll, pitch and yaw. None: the log did not say.
+        Torque of u = 1 on roll, pitch and yaw. None: not known.
     certificate : Certificate or None
-        What is known of the loop's stability. It counts only while neither it nor the gains are edited; see `verdict`.
-        None: never examined.
+        Stability of the loop. Valid only while neither it nor the gains are edited; see `verdict`. None: never
+        examined.
     provenance : Provenance
-        Where the gains come from.
+        Origin of the gains.
 
     Raises
     ------
@@ -150,7 +157,7 @@ class Gains:
         return self.filters.derivative_cutoff_hz
 
     def of(self, row: Row) -> Any:
-        """What the set holds for a row of the parameter table: a matrix, a triple or a number."""
+        """Value of a row of the parameter table: a matrix, a triple or a number."""
         holder = {Shape.MATRIX: self, Shape.YAW: self.yaw, Shape.AXES: self.limits}.get(row.shape, self.filters)
         return getattr(holder, row.key)
 
@@ -159,14 +166,14 @@ class Gains:
         return [float(value) for value in np.ravel(self.of(row))]
 
     def _named(self, row: Row) -> Iterator[tuple[str, float]]:
-        """Each number of a row and what messages call it."""
+        """Each number of a row and its name in messages."""
         where = f"{row.section}.{row.key}" if row.shape in (Shape.YAW, Shape.AXES) else row.key
         for i, value in enumerate(self._values(row)):
             index = {Shape.MATRIX: f"[{i // 2}][{i % 2}]", Shape.AXES: f" ({AXES[i]})" if i < 3 else ""}
             yield where + index.get(row.shape, ""), value
 
     def elements(self) -> dict[str, float]:
-        """Every number that the controller runs on, by code, in the order of the C++ struct."""
+        """Every number of the controller by code, in the order of the C++ struct."""
         return {
             code: row.element(value, self.Ts)
             for row in ROWS
@@ -174,7 +181,7 @@ class Gains:
         }
 
     def with_elements(self, changes: Mapping[str, float]) -> Gains:
-        """Copy with the elements named by code replaced; see `elements`.
+        """Copy with some elements replaced, given by code; see `elements`.
 
         Raises
         ------
@@ -212,57 +219,53 @@ class Gains:
         return inner.discretise(self.Ts), outer.discretise(self.Ts)
 
     def identity(self) -> dict[str, float]:
-        """Name -> value of `tuning.parameters.IDENTITY`; empty when the set does not say its unit of torque."""
+        """Name -> value of `tuning.parameters.IDENTITY`; empty when the unit of torque is not known."""
         return {p.name: value for p, value in zip(IDENTITY, self.moment_scale or (), strict=False)}
 
     def with_certificate(self, certificate: Certificate | None) -> Gains:
-        """The set with a certificate, sealed by the hash of both: whoever edits either of them voids it."""
+        """The set with a certificate, sealed by the hash of both: an edit of either voids it."""
         if certificate is None:
             return replace(self, certificate=None)
         return replace(self, certificate=replace(certificate, seal=self._seal(certificate)))
 
     def _seal(self, certificate: Certificate) -> str:
-        """Hash of a certificate and of everything that the loop's stability depends on, exactly."""
-        said = {name: value for name, value in certificate.as_table().items() if name != "seal"}
+        """Hash of a certificate and of every number that the loop's stability depends on."""
+        content = {name: value for name, value in certificate.as_table().items() if name != "seal"}
         numbers = {**self.elements(), **{row.key: self.of(row) for row in rows(Shape.POLE)}}
-        return sha256(json.dumps([said, numbers, self.moment_scale], sort_keys=True, default=str))
+        return sha256(json.dumps([content, numbers, self.moment_scale], sort_keys=True, default=str))
 
     def verdict(self) -> tuple[Verdict, str]:
-        """Verdict of the certificate and its reason; ``none`` without one, ``void`` when it or a gain was edited."""
+        """Verdict of the certificate and its reason; ``none`` without one, ``void`` if it or a gain was edited."""
         found = self.certificate
         if found is None:
             return Verdict.NONE, "stability was never examined"
         if found.seal == SCHEMA_1:
-            return Verdict.VOID, "the certificate is of a gains file of schema 1, which sealed less"
+            return Verdict.VOID, "the certificate is from a gains file of schema 1, whose seal covers less"
         if not found.seal:
-            return Verdict.VOID, "the certificate has no seal: it is of an earlier version, or was written by hand"
+            return Verdict.VOID, "the certificate has no seal: it is from an earlier version, or was written by hand"
         if found.seal != self._seal(found):
             return Verdict.VOID, "the gains or the certificate were edited after it was made"
         return found.verdict, found.reason
 
     def with_moment_scale(self, scale: Triple) -> Gains:
-        """The same controller for an allocator whose unit of torque is another.
+        """The same controller for an allocator with another unit of torque.
 
-        Rate gains and the limits of the torque and of its integral are in that unit: all are multiplied by old over
-        new, an axis at a time, so that the torque in N m stays; a limit stays within 1, the most there is. Where roll
-        and pitch have one ratio the certificate holds on and is bound to the new matrices; else its figures would
-        change, and it is left out.
+        Rate gains and the limits of the torque and of its integral are in that unit. All are multiplied by old over
+        new, for each axis, so that the torque in N m stays the same; no limit exceeds 1. If roll and pitch have the
+        same ratio the certificate stays valid and is sealed again; else its figures would change, and it is removed.
 
         Parameters
         ----------
         scale : tuple of 3 float, N m
-            What one unit stands for on the target: roll, pitch, yaw.
+            Torque of u = 1 on the target: roll, pitch, yaw.
 
         Raises
         ------
         TuningError
-            When the set does not say its own unit.
+            When the set's own unit is not known.
         """
         if self.moment_scale is None:
-            raise TuningError(
-                "moment_scale: the gains do not say how many N m one unit of torque stands for; write it into "
-                "their file"
-            )
+            raise TuningError("moment_scale: the torque of u = 1 in N m is not known; write it into the gains file")
         ratio = np.array(self.moment_scale) / np.array(scale)
         matrices = {name: getattr(self, name) * ratio[:2, None] for name in MATRICES if name.endswith("_i")}
         yaw = {name: getattr(self.yaw, name) * float(ratio[2]) for name in MATRICES if name.endswith("_i")}
@@ -283,15 +286,13 @@ class Gains:
         )
         if self.certificate is None or self.verdict()[0] == Verdict.VOID:
             return changed
-        if abs(ratio[0] / ratio[1] - 1) > 1e-3:
+        if abs(ratio[0] / ratio[1] - 1) > SAME_RATIO:
             return replace(changed, certificate=None)
         return changed.with_certificate(self.certificate)
 
     def save(self, path: str | Path) -> None:
         """Write the set as a readable TOML file, ``*.gains.toml``, atomically."""
-        from mimopilot.tuning.gains_file import save_gains
-
-        save_gains(self, Path(path))
+        write_atomically(Path(path), gains_to_toml(self))
 
 
 def _unit(row: Row) -> str:
@@ -301,3 +302,31 @@ def _unit(row: Row) -> str:
 def _said(row: Row, valid: object) -> str:
     text = str(valid)
     return f"{text}; tune again or correct the file" if text.startswith("a finite") else text
+
+
+def gains_to_toml(gains: Gains) -> str:
+    """Text of the gains file; reading it back restores the same bits of every float."""
+
+    def line(row: Row) -> str:
+        value = gains.of(row)
+        note = f"  # {NOTES[row.key]}" if row.key in NOTES else ""
+        plain = np.asarray(value, dtype=np.float64).tolist()
+        return f"{row.key} = {toml_value(plain)}{note}"
+
+    scale = toml_value(list(gains.moment_scale)) if gains.moment_scale else '"unknown"'
+    lines = [
+        "# mimopilot gains. Row: output; column: error; roll then pitch. Positive Kd damps.",
+        "# r_i = Kp_o (r_o - y_o);  u = Kp_i (r_i - y_i) + I - Kd_i dy_i/dt + Kff_i r_i,  I += Ts Ki_i (r_i - y_i)",
+        f"schema = {SCHEMA}",
+        *map(line, rows(Shape.SCALAR)),
+        *map(line, rows(Shape.POLE)),
+        f"moment_scale = {scale}  # N m that u = 1 stands for: roll, pitch, yaw",
+    ]
+    for shape, head in ((Shape.MATRIX, ""), (Shape.YAW, ""), (Shape.AXES, "  # roll, pitch, yaw")):
+        lines += ["", f"[{rows(shape)[0].section}]{head}", *map(line, rows(shape))]
+    tables = {"certificate": gains.certificate, "provenance": gains.provenance}
+    for name, content in tables.items():
+        entries = content.as_table() if content is not None else {}
+        if entries:
+            lines += ["", f"[{name}]", *toml_entries(entries)]
+    return "\n".join(lines) + "\n"

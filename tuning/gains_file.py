@@ -7,23 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mimopilot.common.errors import Error
+from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import SCHEMA_1, Gains, Limits, YawGains
+from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, Gains, Limits, YawGains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameters import ROWS, Row, Shape, rows
 from mimopilot.tuning.provenance import Provenance
 
-from mimopilot.common.errors import Error
-from mimopilot.common.files import write_atomically
-from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text, toml_entries, toml_value
-
-SCHEMA = 2
-#: Tables and entries beside the parameter table's keys.
+#: Tables and entries other than the parameter table's keys.
 SECTIONS = ("roll_pitch", "yaw", "limits")
 OTHERS = ("schema", "moment_scale", "certificate", "provenance")
-#: What the file says beside a key.
-NOTES = {"Ts": "s", "derivative_cutoff_hz": "0: no filter"}
 
 
 def load_gains(path: str | Path) -> Gains:
@@ -32,7 +28,7 @@ def load_gains(path: str | Path) -> Gains:
     Raises
     ------
     Error
-        When the file is missing, is not TOML, lacks a matrix, or holds a number that is not finite.
+        When the file is missing, is not TOML, lacks a matrix, or has a number that is not finite.
     """
     return _gains(read_toml(Path(path), "gains file"), str(path))
 
@@ -40,11 +36,6 @@ def load_gains(path: str | Path) -> Gains:
 def gains_from_toml(text: str, where: str) -> Gains:
     """Parse the text of a gains file; `where` names it in messages. See `load_gains`."""
     return _gains(parse_toml(text, where), where)
-
-
-def save_gains(gains: Gains, path: Path) -> None:
-    """Write a gains file, atomically."""
-    write_atomically(path, gains_to_toml(gains))
 
 
 def _gains(table: dict[str, Any], where: str) -> Gains:
@@ -81,7 +72,7 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
 
 
 def _entry(table: dict[str, Any], row: Row) -> Any:
-    """What the file holds for a row, or the row's default."""
+    """Value of a row in the file, or the row's default."""
     section = _get(table, row.section, "") if row.section else table
     if row.default is not None and isinstance(section, dict) and row.key not in section:
         return (row.default,) * 3 if row.shape is Shape.AXES else row.default
@@ -95,7 +86,7 @@ def _entry(table: dict[str, Any], row: Row) -> Any:
 def _get(table: Any, key: str, section: str) -> Any:
     if not isinstance(table, dict) or key not in table:
         name = f"{section}.{key}" if section else key
-        raise TuningError(f"{name}: missing; every entry must be given, there are no default gains")
+        raise TuningError(f"{name}: missing; add it to the file, gains have no defaults")
     return table[key]
 
 
@@ -125,31 +116,3 @@ def _triple(value: Any, where: str) -> tuple[float, float, float]:
     ):
         raise TuningError(f"{where}: got {shown(value)}, expected three numbers: roll, pitch, yaw")
     return (float(value[0]), float(value[1]), float(value[2]))
-
-
-def gains_to_toml(gains: Gains) -> str:
-    """Text of the gains file: every float is printed so that reading it back gives the same bits."""
-
-    def line(row: Row) -> str:
-        value = gains.of(row)
-        note = f"  # {NOTES[row.key]}" if row.key in NOTES else ""
-        plain = np.asarray(value, dtype=np.float64).tolist()
-        return f"{row.key} = {toml_value(plain)}{note}"
-
-    scale = toml_value(list(gains.moment_scale)) if gains.moment_scale else '"unknown"'
-    lines = [
-        "# mimopilot gains. Row: output; column: error; roll then pitch. Positive Kd damps.",
-        "# r_i = Kp_o (r_o - y_o);  u = Kp_i (r_i - y_i) + I - Kd_i dy_i/dt + Kff_i r_i,  I += Ts Ki_i (r_i - y_i)",
-        f"schema = {SCHEMA}",
-        *map(line, rows(Shape.SCALAR)),
-        *map(line, rows(Shape.POLE)),
-        f"moment_scale = {scale}  # N m that u = 1 stands for: roll, pitch, yaw",
-    ]
-    for shape, head in ((Shape.MATRIX, ""), (Shape.YAW, ""), (Shape.AXES, "  # roll, pitch, yaw")):
-        lines += ["", f"[{rows(shape)[0].section}]{head}", *map(line, rows(shape))]
-    tables = {"certificate": gains.certificate, "provenance": gains.provenance}
-    for name, content in tables.items():
-        entries = content.as_table() if content is not None else {}
-        if entries:
-            lines += ["", f"[{name}]", *toml_entries(entries)]
-    return "\n".join(lines) + "\n"

@@ -1,12 +1,12 @@
-"""The linear part of the flown control law, once, as data.
+"""The linear part of the flown control law, as one table.
 
     r = Kp_o (r_o - y_o)                                attitude controller: rate setpoint
     u = Kp e + Ki I(e) - Kd D(y) + Kff r + u_bar        rate controller, e = r - y
 
-Each term is a gain matrix, the signal that it acts on and a first-order filter. Everything that tuning knows of the
-law is derived from `TERMS`: the regressors of VRFT, the inverse, the frequency response, the state space and what
-predictions fly. The generated C++ and its reference, `tuning.controller`, are written by hand; the tests compare the
-response of the compiled C++ with `response`, for every parameter.
+Each term is a gain matrix, the signal that it acts on and a first-order filter. All of tuning derives the law from
+`TERMS`: VRFT's regressors, the inverse, the frequency response, the state space and the predicted doublets. The
+generated C++ and its reference, `tuning.controller`, are written by hand. Tests compare the response of the compiled
+C++ with `response`, for every parameter.
 """
 
 from __future__ import annotations
@@ -16,24 +16,29 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from mimopilot.tuning.errors import NotMinimumPhaseError
-from mimopilot.tuning.parameters import pole_of
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, schur
 from scipy.signal import lfilter
+
+from mimopilot.tuning.errors import NotMinimumPhaseError
+from mimopilot.tuning.parameters import pole_of
 
 Signal = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
 #: Signals of the rate controller that a term can act on.
 ERROR, RATE, SETPOINT = "error", "rate", "setpoint"
-#: How much of the unknown initial state is left when the inverse counts as settled.
+#: Remaining share of the unknown initial state at which the inverse counts as settled.
 SETTLED = 0.01
+#: Condition number above which a matrix counts as singular in double precision.
+SINGULAR = 1e12
+#: Rounding of an eigenvalue of exactly 1.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
 class Filters:
-    """What the law depends on beside its gains.
+    """Period and filters of the law.
 
     Attributes
     ----------
@@ -56,7 +61,7 @@ class Filters:
 class Filter:
     """H(z) = gain (z - zero) / (divisor (z - pole)), zero = 1 for a difference and 0 otherwise.
 
-    As a state x of its own: y(k) = h s(k) + x(k), x(k+1) = pole x(k) + h (pole - zero) s(k), h = gain / divisor.
+    With a state x: y(k) = h s(k) + x(k), x(k+1) = pole x(k) + h (pole - zero) s(k), h = gain / divisor.
     """
 
     gain: float
@@ -66,21 +71,21 @@ class Filter:
 
     @property
     def zero(self) -> float:
-        """The zero of H."""
+        """Zero of H."""
         return float(self.difference)
 
     @property
     def direct(self) -> float:
-        """H at infinity: what a sample does to the output at once."""
+        """H at infinity: direct gain from input to output."""
         return self.gain / self.divisor
 
     @property
     def memory(self) -> float:
-        """What a sample adds to the state."""
+        """Gain from input to state."""
         return self.direct * (self.pole - self.zero)
 
     def run(self, signal: Signal) -> Signal:
-        """The filter on every column of `signal` (N, n), from rest; a difference begins with 0."""
+        """Filter every column of `signal` (N, n), from rest; a difference begins with 0."""
         moved = np.diff(signal, axis=0, prepend=signal[:1]) if self.difference else signal
         moved = moved / self.divisor
         if self.pole == 1:
@@ -102,11 +107,11 @@ class Term:
     matrix : str
         Name of its gain matrix in `tuning.gains.Gains`.
     signal : str
-        What it acts on: `ERROR`, `RATE` or `SETPOINT`.
+        Signal that it acts on: `ERROR`, `RATE` or `SETPOINT`.
     sign : int
-        With which it is added to u.
+        Sign with which it is added to u.
     filter : callable
-        `Filters` -> its `Filter`; None: it acts on the signal itself.
+        `Filters` -> its `Filter`; None: no filter.
     """
 
     matrix: str
@@ -124,7 +129,7 @@ def _derivative(filters: Filters) -> Filter:
     return Filter(gain=1 - a, pole=a, difference=True, divisor=filters.Ts)
 
 
-#: Letter -> term of the rate controller, in the order in which its regressors and its sums stand.
+#: Letter -> term of the rate controller, in the order of its regressors and its sums.
 TERMS = {
     "P": Term("Kp_i", ERROR),
     "I": Term("Ki_i", ERROR, filter=_integral),
@@ -138,7 +143,7 @@ class Matrices(Protocol):
 
     @property
     def filters(self) -> Filters:
-        """What the law depends on beside its gains."""
+        """Period and filters."""
 
 
 def rate_matrices(gains: Matrices) -> dict[str, Signal]:
@@ -147,7 +152,7 @@ def rate_matrices(gains: Matrices) -> dict[str, Signal]:
 
 
 def regressors(letters: str, error: Signal, rate: Signal, setpoint: Signal, filters: Filters) -> Signal:
-    """The regressor x(k) of u(k) = B x(k), term by term.
+    """Regressor x(k) of u(k) = B x(k), term by term.
 
     Parameters
     ----------
@@ -266,7 +271,7 @@ def _inverse(matrices: Mapping[str, Signal], filters: Filters) -> tuple[Signal, 
             if shape is not None:
                 poles.append(shape.pole * np.eye(len(matrix)))
                 pushes.append(shape.memory * matrix)
-    if np.linalg.cond(direct) > 1e12:
+    if np.linalg.cond(direct) > SINGULAR:
         raise NotMinimumPhaseError(
             f"the rate controller has no inverse: its direct gain from the setpoint, {direct.tolist()}, is singular"
         )
@@ -277,36 +282,36 @@ def _inverse(matrices: Mapping[str, Signal], filters: Filters) -> tuple[Signal, 
 
 
 def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Signal, int]:
-    """Rate setpoint with which the rate controller would have made `u`: C_i^-1 u, (3.32)-(3.34) of the thesis.
+    """Rate setpoint with which the rate controller gives `u`: C_i^-1 u, (3.32)-(3.34) of the thesis.
 
-    The inverse is solved by the Schur form of its state matrix, one first-order filter a state.
+    The inverse is solved by the Schur form of its state matrix, one first-order filter for each state.
 
     Parameters
     ----------
     gains : Gains
-        Of which the rate controller is used.
+        Only the rate controller is used.
     u : (N, 2) array
-        Torque (normalised) applied to the plant, excitation included: the virtual controller makes all of it.
+        Torque (normalised) applied to the plant, excitation included: the output of the virtual controller.
     rates : (N, 2) array, rad/s
         Measured body rates.
 
     Returns
     -------
     r_i : (N, 2) array, rad/s
-        The setpoint; its first samples hold the transient of the unknown initial integrator.
+        The setpoint; its first samples contain the transient of the unknown initial integrator.
     settling : int, samples
-        After so many samples that transient is below 1 %.
+        Time until that transient is below `SETTLED`.
 
     Raises
     ------
     NotMinimumPhaseError
-        When the inverse is unstable, with its eigenvalues, or does not exist.
+        When the inverse is unstable or does not exist.
     """
     matrices, filters = rate_matrices(gains), gains.filters
     A, B, inverse = _inverse(matrices, filters)
     eigenvalues = np.linalg.eigvals(A)
-    # An integrator that is not used (a zero row of Ki) leaves its state at rest: an eigenvalue of exactly 1.
-    at_rest = np.isclose(eigenvalues, 1.0, rtol=0, atol=1e-12)
+    # The state of an unused integrator (a zero row of Ki) is constant: an eigenvalue of exactly 1.
+    at_rest = np.isclose(eigenvalues, 1.0, rtol=0, atol=ROUNDING)
     unstable = np.abs(eigenvalues[~at_rest]) >= 1
     if np.any(unstable) or (at_rest.any() and np.linalg.matrix_rank(B) + at_rest.sum() > len(A)):
         raise NotMinimumPhaseError(
@@ -315,14 +320,14 @@ def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Si
             f"Ki_i = {matrices['I'].round(6).tolist()} should be positive definite"
         )
     known = u
-    for letter, term in TERMS.items():  # what of u the measured rates alone have made
+    for letter, term in TERMS.items():  # remove the part of u that the measured rates alone give
         if term.signal != ERROR:
             known = known - regressors(letter, rates, rates, rates, filters) @ matrices[letter].T
     n = u.shape[1]
     triangle, basis = schur(A, output="complex")
     drive = (known @ B.T) @ basis.conj()
     states = np.zeros_like(drive)
-    for i in reversed(range(len(A))):  # upper triangular: the last state depends on itself alone
+    for i in reversed(range(len(A))):  # upper triangular: the last state depends only on itself
         coupled = drive[:, i].copy()
         for j in range(i + 1, len(A)):
             coupled[1:] += triangle[i, j] * states[:-1, j]
@@ -337,7 +342,7 @@ def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Si
 
 
 def response(gains: Any, omega: Signal) -> Response:
-    """Frequency response of the whole law, for small signals.
+    """Frequency response of the whole law for small signals, without its limits.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""One loop: a controller that is linear in its gains, around a plant, in time and in frequency."""
+"""One loop: a controller that is linear in its gains, and its closed loop around a plant."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+
 from mimopilot.tuning import law
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import TERMS, Filters
@@ -19,14 +20,14 @@ class LoopController:
     Attributes
     ----------
     gains : mapping
-        Term (``P``, ``I``, ``D``, ``F``) -> (n_u, n_y) array; a term that is not there is not in the structure.
+        Term (``P``, ``I``, ``D``, ``F``) -> (n_u, n_y) array; the structure has no other terms.
     filters : Filters
         Sampling period and filters.
 
     Raises
     ------
     TuningError
-        When there is no term, an unknown one, or the matrices differ in shape.
+        When there is no term, a term is unknown, or the matrices differ in shape.
     """
 
     gains: Mapping[str, Signal]
@@ -41,7 +42,7 @@ class LoopController:
 
     @classmethod
     def from_polynomial(cls, B0: object, B1: object, Ts: float) -> LoopController:
-        """The PI (B0 z + B1)/(z - 1), the thesis' form: Kp = -B1, Ki = (B0 + B1)/Ts."""
+        """A PI from the thesis' form (B0 z + B1)/(z - 1): Kp = -B1, Ki = (B0 + B1)/Ts."""
         first, second = np.asarray(B0, float), np.asarray(B1, float)
         return cls({"P": -second, "I": (first + second) / Ts}, Filters(Ts))
 
@@ -52,11 +53,11 @@ class LoopController:
 
     @property
     def terms(self) -> str:
-        """The structure: letters of ``PIDF`` in that order."""
+        """Structure: letters of ``PIDF`` in that order."""
         return "".join(term for term in TERMS if term in self.gains)
 
     def gain(self, term: str) -> Signal:
-        """Matrix of a term; zeros when the structure does not have it."""
+        """Matrix of a term; zeros if the structure lacks it."""
         first = next(iter(self.gains.values()))
         return np.asarray(self.gains.get(term, np.zeros_like(first)), float)
 
@@ -71,7 +72,7 @@ class LoopController:
         return LoopController(dict(zip(self.terms, parts, strict=True)), self.filters)
 
     def shapes(self, omega: Signal) -> tuple[Response, Response]:
-        """How each term sees the reference and the output: x = Phi_r r - Phi_y y.
+        """Response of the regressors to the reference and the output: x = Phi_r r - Phi_y y.
 
         Parameters
         ----------
@@ -110,8 +111,7 @@ def complementary_sensitivity(plant: Response, controller: LoopController, omega
 def closed_loop(plant: StateSpace, controller: LoopController) -> StateSpace:
     """The loop in state space: inputs [r, u_bar, v], outputs [u, y].
 
-    u_bar is added at the plant's input, v to the measured output. A plant with D makes an algebraic loop,
-    which is solved.
+    u_bar is added at the plant's input, v to the measured output. The algebraic loop of a plant with D is solved.
 
     Parameters
     ----------
@@ -135,7 +135,7 @@ def closed_loop(plant: StateSpace, controller: LoopController) -> StateSpace:
     direct_r = flown.D[law.ERROR] + flown.D[law.SETPOINT]
     direct_y = flown.D[law.ERROR] - flown.D[law.RATE]
     loop = np.eye(n_u) + direct_y @ plant.D
-    if np.linalg.cond(loop) > 1e12:
+    if np.linalg.cond(loop) > law.SINGULAR:
         raise TuningError("the algebraic loop of plant and controller has no solution: I + K D is singular")
     X = np.linalg.inv(loop)
     m = len(flown.A)

@@ -1,36 +1,42 @@
-"""The motors behind a moment, from a log: how the allocator moves them, where they end, how their speed lags."""
+"""The motors identified from a log: how the allocator drives them, their saturation, the lag of their speed."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from mimopilot.tuning.statespace import StateSpace
 from numpy.typing import NDArray
 
-#: Share of the moment's variance that the mixer must give back: else the commands are not those of this moment.
+from mimopilot.tuning.statespace import StateSpace
+
+#: Smallest share of the torque's variance that the mixer explains; with less the commands belong to another torque.
 EXPLAINED = 0.95
-#: Break frequencies that rotors have, rad/s.
+#: Range of rotors' break frequencies, rad/s: time constants of 10 to 200 ms.
 ROTORS = (5.0, 100.0)
+#: Fewest samples without a saturated motor for a fit.
 MIN_SAMPLES = 50
-#: A command this near to 0 or 1 is at its end: half of the step of a 10 bit output.
+#: A command this close to 0 or 1 is saturated: half a step of a 10 bit output.
 END = 5e-4
-#: Share of the samples with a motor at an end that is told; and that the amplitude that is advised keeps within.
-SATURATED, NEARLY_ALL = 0.01, 0.999
+#: Share of the samples with a saturated motor above which there is a warning.
+SATURATED = 0.01
+#: Share of the samples that the proposed amplitude keeps from saturation.
+NEARLY_ALL = 0.999
+#: Smallest deflection that limits the amplitude: avoids a division by 0.
+SMALLEST = 1e-9
 
 Signal = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Motors:
-    """How an allocator moves n motors whose commands are thrust fractions.
+    """How an allocator drives n motors whose commands are thrust fractions.
 
     Attributes
     ----------
     mixer : (n, 2) array
-        Change of each command for a unit of the roll and of the pitch moment.
+        Change of each command for u = 1 on roll and on pitch.
     hover : (n,) array
-        Commands that hold the vehicle level.
+        Commands that hold the vehicle level, 0 to 1.
     """
 
     mixer: Signal
@@ -38,19 +44,19 @@ class Motors:
 
 
 def fit_motors(u: Signal, commands: Signal) -> Motors | None:
-    """The allocator by least squares: each command is a constant and a multiple of either moment.
+    """Fit the allocator by least squares: each command is a constant plus a linear function of both torques.
 
     Parameters
     ----------
     u : (N, 2) array
-        Moments in flight.
+        Torques (normalised) in flight.
     commands : (N, n) array
-        Motor commands made from them, 0..1.
+        Motor commands, 0 to 1.
 
     Returns
     -------
     Motors or None
-        None when the moments do not explain the commands.
+        None when the torques do not explain the commands.
     """
     inside = ((commands > 0) & (commands < 1)).all(axis=1) & np.isfinite(u).all(axis=1)
     if np.count_nonzero(inside) < MIN_SAMPLES:
@@ -68,14 +74,14 @@ def fit_motors(u: Signal, commands: Signal) -> Motors | None:
 
 
 def saturation_warnings(u: Signal, commands: Signal, motors: Motors | None, amplitude: float) -> list[str]:
-    """What is to be said of motors at an end of their range: share of the samples, and the amplitude that avoids it.
+    """Warning about saturated motors: share of the samples, and the amplitude that avoids saturation.
 
     Parameters
     ----------
     u : (N, 2) array
-        Torques in flight.
+        Torques (normalised) in flight.
     commands : (N, n) array
-        Motor commands made from them, 0 to 1.
+        Motor commands, 0 to 1.
     motors : Motors or None
         The allocator.
     amplitude : float
@@ -84,20 +90,23 @@ def saturation_warnings(u: Signal, commands: Signal, motors: Motors | None, ampl
     share = float(np.mean(((commands <= END) | (commands >= 1 - END)).any(axis=1))) if len(commands) else 0.0
     if share <= SATURATED:
         return []
-    text = f"a motor is at an end of its range in {share:.0%} of the samples"
+    text = f"a motor is saturated in {share:.0%} of the samples"
     if motors is None or amplitude == 0:
-        return [f"{text}; fly gentler"]
+        return [f"{text}; fly gentler manoeuvres"]
     moved = (u - np.median(u, axis=0)) @ motors.mixer.T
     up, down = np.quantile(moved, [NEARLY_ALL, 1 - NEARLY_ALL], axis=0)
-    room = np.concatenate([(1 - motors.hover) / np.maximum(up, 1e-9), motors.hover / np.maximum(-down, 1e-9)])
-    fitting = amplitude * float(np.clip(room.min(), 0.0, 1.0))
-    return [f"{text}; inject a torque of {fitting:.2g} in place of {amplitude:.2g}"]
+    factors = np.concatenate(
+        [(1 - motors.hover) / np.maximum(up, SMALLEST), motors.hover / np.maximum(-down, SMALLEST)]
+    )
+    fitting = amplitude * float(np.clip(factors.min(), 0.0, 1.0))
+    return [f"{text}; inject a torque of {fitting:.2g} instead of {amplitude:.2g}"]
 
 
 def rotor_lag(plant: StateSpace) -> float:
-    """Time constant (s) of the rotors' speed in a plant from moments to body rates; 0 where it shows none.
+    """Time constant (s) of the rotors' speed in a plant from torques to body rates; 0 if none is visible.
 
-    Around hover a rotor is one real pole an axis. The slowest poles are the body's; a filter's are faster or complex.
+    Around hover a rotor is one real pole on each axis. The slowest poles are the body's; those of filters are faster or
+    complex.
     """
     poles = np.log(plant.poles[len(plant.C) :].astype(complex)) / plant.Ts
     speeds = -poles.real[np.abs(poles.imag) < -poles.real]

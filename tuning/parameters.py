@@ -1,8 +1,8 @@
 """The table of the controller's parameters.
 
-A row of `ROWS` is a member of the C++ ``struct Gains``. The table defines that struct, its memory layout and the keys
-of the gains file. It also defines parameter names and ranges for headers, PX4's module.yaml, parameter files, the
-simulated vehicle and the uploader.
+A row of `ROWS` is a member of the C++ ``struct Gains``. The struct, its order and its layout in memory come from the
+table, and so do the keys of the gains file and the names and ranges of parameters: in headers, PX4's module.yaml,
+parameter files, the simulated vehicle and the uploader.
 """
 
 from __future__ import annotations
@@ -10,17 +10,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 from mimopilot.tuning.errors import TuningError
 
-#: Starts every parameter name; a code follows.
+#: Prefix of every parameter's name.
 PREFIX = "MIMO_"
 AXES = ("roll", "pitch", "yaw")
+#: The axes that the matrices couple.
+ROLL_PITCH = AXES[:2]
 AXIS_LETTERS = "RPY"
 AXIS_NAMES = dict(zip(AXIS_LETTERS, AXES, strict=True))
-#: Longest parameter name in MAVLink and PX4.
+#: Longest parameter name of MAVLink (PARAM_SET.param_id) and PX4, characters.
 NAME_LENGTH = 16
 
 
@@ -57,7 +59,7 @@ class Valid:
     Attributes
     ----------
     lowest, highest : float
-        Bounds; infinite: no bound.
+        Bounds; infinite for none.
     lowest_included, highest_included : bool
         Whether the bound itself is valid.
     """
@@ -83,7 +85,7 @@ class Valid:
 ANY = Valid()
 POSITIVE = Valid(lowest=0.0, lowest_included=False)
 STABLE_POLE = Valid(0.0, 1.0, highest_included=False)
-#: 1 Hz to 10 kHz.
+#: Control period, s: 1 Hz to 10 kHz.
 PERIOD = Valid(1e-4, 1.0)
 
 
@@ -101,7 +103,7 @@ class Row:
         Short name; with prefix and axes it makes a parameter name.
     shape : Shape
     unit : str
-        In PX4's spelling; empty: none.
+        PX4's spelling; empty if PX4 has none.
     minimum, maximum : float
         Range that a vehicle accepts, inclusive.
     description : str
@@ -109,13 +111,12 @@ class Row:
     comment : str
         Comment of the C++ member; empty: none.
     diagonal_minimum : float or None
-        Lower limit of a matrix' diagonal, if it differs.
+        Lower limit of a matrix' diagonal, if it differs from `minimum`.
     default : float or None
-        Value if the gains file lacks the key; None: the key is required, as for every gain matrix.
+        Value if a gains file lacks the key; None: the key is required. A gain matrix has none.
     writable : bool
-        False: fixed in the firmware, published only for checking.
+        False for values that are fixed in the firmware and published only to be checked.
     valid : Valid
-        Values that the controller can run with.
     """
 
     key: str
@@ -150,11 +151,11 @@ class Row:
 
     @property
     def dimensions(self) -> str:
-        """Array dimensions in C++."""
+        """Array dimensions of the C++ member."""
         return {Shape.MATRIX: "[2][2]", Shape.AXES: "[3]"}.get(self.shape, "")
 
     def element(self, value: float, Ts: float) -> float:
-        """The controller's element for a value of the gains file."""
+        """Value in the controller, from the value in the gains file."""
         return pole_of(value, Ts) if self.shape is Shape.POLE else value
 
     def value(self, element: float, Ts: float) -> float:
@@ -174,7 +175,15 @@ class Row:
                     minimum = self.diagonal_minimum
             elif axes:
                 what = f"{what}, {AXIS_NAMES[axes]}"
-            yield Parameter(PREFIX + code, code, self.unit, minimum, self.maximum, self.writable, what)
+            yield Parameter(
+                name=PREFIX + code,
+                code=code,
+                unit=self.unit,
+                minimum=minimum,
+                maximum=self.maximum,
+                writable=self.writable,
+                description=what,
+            )
 
 
 @dataclass(frozen=True)
@@ -188,11 +197,11 @@ class Parameter:
     code : str
         The element's code in `tuning.gains.Gains.elements`.
     unit : str
-        In PX4's spelling; empty: none.
+        PX4's spelling; empty if PX4 has none.
     minimum, maximum : float
         Range that a vehicle accepts, inclusive.
     writable : bool
-        False: fixed in the firmware, published only for checking.
+        False for values that are fixed in the firmware and published only to be checked.
     description : str
         One line.
     """
@@ -209,31 +218,43 @@ class Parameter:
 def _gain(
     key: str, code: str, unit: str, largest: float, description: str, comment: str, diagonal: float | None = None
 ) -> Row:
-    smallest = -largest
-    return Row(key, key.lower(), code, Shape.MATRIX, unit, smallest, largest, description, comment, diagonal)
-
-
-def _yaw(gain: Row) -> Row:
-    """The yaw row of a gain matrix."""
     return Row(
-        gain.key,
-        f"yaw_{gain.member}",
-        gain.code,
-        Shape.YAW,
-        gain.unit,
-        gain.minimum,
-        gain.maximum,
-        gain.description,
-        diagonal_minimum=gain.diagonal_minimum,
+        key=key,
+        member=key.lower(),
+        code=code,
+        shape=Shape.MATRIX,
+        unit=unit,
+        minimum=-largest,
+        maximum=largest,
+        description=description,
+        comment=comment,
+        diagonal_minimum=diagonal,
     )
 
 
+def _yaw(gain: Row) -> Row:
+    """Row of the yaw scalar that belongs to a gain matrix."""
+    return replace(gain, member=f"yaw_{gain.member}", shape=Shape.YAW, comment="")
+
+
 def _limit(key: str, code: str, unit: str, smallest: float, largest: float, description: str, comment: str) -> Row:
-    return Row(key, key, code, Shape.AXES, unit, smallest, largest, description, comment, valid=POSITIVE)
+    return Row(
+        key=key,
+        member=key,
+        code=code,
+        shape=Shape.AXES,
+        unit=unit,
+        minimum=smallest,
+        maximum=largest,
+        description=description,
+        comment=comment,
+        valid=POSITIVE,
+    )
 
 
-# A loop needs positive P and no negative I on its diagonal. D and feed-forward may be negative: a reference model may
-# require less damping than the vehicle has. The smallest P is a hundredth of that of small vehicles.
+# Ranges: the diagonal of P must be positive and that of I not negative, or the loop is not closed. D and feed-forward
+# may be negative: a reference model may ask for less damping than the vehicle has. The smallest P is a hundredth of
+# that of small vehicles.
 _GAINS = (
     _gain("Kp_o", "AP", "1/s", 50.0, "rate setpoint from angle error", "1/s, angle error to rate setpoint", 0.01),
     _gain("Kp_i", "RP", "s", 5.0, "torque from rate error", "s, rate error to torque", 1e-4),
@@ -265,27 +286,27 @@ ROWS: tuple[Row, ...] = (
     _limit("moment_max", "UMAX", "norm", 0.01, 1.0, "limit of the torque, excitation included", "normalised"),
     _limit("integral_max", "IMAX", "norm", 0.001, 1.0, "limit of the integral term", "normalised"),
     Row(
-        "derivative_cutoff_hz",
-        "derivative_pole",
-        "D_POLE",
-        Shape.POLE,
-        "norm",
-        0.0,
-        0.9999,
-        "pole of the derivative filter, exp(-2 pi f_d Ts); 0: none",
-        "a = exp(-2 pi f_d Ts), 0: no filter",
+        key="derivative_cutoff_hz",
+        member="derivative_pole",
+        code="D_POLE",
+        shape=Shape.POLE,
+        unit="norm",
+        minimum=0.0,
+        maximum=0.9999,
+        description="pole of the derivative filter, exp(-2 pi f_d Ts); 0: none",
+        comment="a = exp(-2 pi f_d Ts), 0: no filter",
         valid=STABLE_POLE,
     ),
     Row(
-        "Ts",
-        "period",
-        "TS",
-        Shape.SCALAR,
-        "s",
-        1e-4,
-        1.0,
-        "control period, fixed in the firmware",
-        "Ts, s",
+        key="Ts",
+        member="period",
+        code="TS",
+        shape=Shape.SCALAR,
+        unit="s",
+        minimum=PERIOD.lowest,
+        maximum=PERIOD.highest,
+        description="control period, fixed in the firmware",
+        comment="Ts, s",
         writable=False,
         valid=PERIOD,
     ),
@@ -293,7 +314,7 @@ ROWS: tuple[Row, ...] = (
 
 
 def rows(*shapes: Shape) -> tuple[Row, ...]:
-    """The rows of these shapes."""
+    """Rows of the given shapes."""
     return tuple(row for row in ROWS if row.shape in shapes)
 
 
@@ -304,12 +325,18 @@ LIMITS = {row.key: row.code for row in rows(Shape.AXES)}
 
 PARAMETERS: tuple[Parameter, ...] = tuple(parameter for row in ROWS for parameter in row.parameters())
 
-#: Code of the unit of torque: N m of u = 1, per axis.
+#: Code of the unit of torque: N m of u = 1, by axis.
 SCALE = "SCALE"
-#: Published beside the parameters, so that gains made for another unit of torque are noticed.
+#: Further values that a vehicle publishes, so that gains for another unit of torque are detected.
 IDENTITY: tuple[Parameter, ...] = tuple(
     Parameter(
-        f"{PREFIX}{SCALE}_{axis}", f"{SCALE}_{axis}", "N m", 0.0, 1e6, False, f"torque of u = 1, {AXIS_NAMES[axis]}"
+        name=f"{PREFIX}{SCALE}_{axis}",
+        code=f"{SCALE}_{axis}",
+        unit="N m",
+        minimum=0.0,
+        maximum=1e6,
+        writable=False,
+        description=f"torque of u = 1, {AXIS_NAMES[axis]}",
     )
     for axis in AXIS_LETTERS
 )
@@ -317,14 +344,14 @@ IDENTITY: tuple[Parameter, ...] = tuple(
 
 @dataclass(frozen=True)
 class Setting:
-    """One vehicle parameter that is not a gain, with its own default.
+    """One parameter of a vehicle that is not a gain, with its own default.
 
     Attributes
     ----------
     name, unit, minimum, maximum, description
         As in `Parameter`.
     default : float
-        Value until it is set.
+        Initial value.
     integer : bool
         True: an integer.
     """
@@ -338,7 +365,7 @@ class Setting:
     description: str
 
 
-#: The excitation that the firmware itself flies: a PRBS added to the controller output.
+#: The experiment in a vehicle's firmware: a PRBS added to the controller output.
 EXCITATION: tuple[Setting, ...] = (
     Setting("MIMO_EX_AX", "", 0, 0, 3, True, "excite once: 0 none, 1 roll, 2 pitch, 3 roll then pitch"),
     Setting("MIMO_EX_AMP", "norm", 0.1, 0.0, 0.5, False, "excitation: amplitude"),
@@ -350,26 +377,28 @@ EXCITATION: tuple[Setting, ...] = (
     Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stop above this roll or pitch"),
 )
 
-#: Whether the start-up script starts this controller or the stock one.
+#: Whether a vehicle's start-up script starts this controller or that of the flight stack.
 ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
 
 
 def check_names() -> None:
-    """Refuse names that a vehicle would garble: PX4 and MAVLink do not report a name that is too long.
+    """Refuse names that vehicles cannot store: PX4 and MAVLink truncate long ones silently.
 
     Raises
     ------
     TuningError
-        If a name is too long, is not made of A-Z, 0-9 and _, or occurs twice.
+        When a name is too long, has other characters than A-Z, 0-9 and _, or occurs twice.
     """
     table: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
     seen: set[str] = set()
     for parameter in table:
         name = parameter.name
         if len(name) > NAME_LENGTH:
-            raise TuningError(f"{name}: has {len(name)} characters, vehicles store at most {NAME_LENGTH}")
+            raise TuningError(
+                f"{name}: has {len(name)} characters, expected at most {NAME_LENGTH}: vehicles truncate it"
+            )
         if not re.fullmatch("[A-Z][A-Z0-9_]*", name):
             raise TuningError(f"{name}: expected a letter, then A-Z, 0-9 and _: vehicles drop other names")
         if name in seen:
-            raise TuningError(f"{name}: two parameters have this name")
+            raise TuningError(f"{name}: two parameters have this name; rename one")
         seen.add(name)

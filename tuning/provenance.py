@@ -1,4 +1,4 @@
-"""Where a gain set comes from."""
+"""Origin of a gain set."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from mimopilot.common.toml import shown
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.reference_model import ContinuousModel, model_from_table
-
-from mimopilot.common.toml import shown
 
 Models = tuple[ContinuousModel, ContinuousModel]
 MODELS = ("inner_model", "outer_model")
@@ -17,7 +16,7 @@ MODELS = ("inner_model", "outer_model")
 
 @dataclass(frozen=True)
 class Provenance:
-    """How a gain set was made.
+    """Method and data that a gain set was made from.
 
     Attributes
     ----------
@@ -32,7 +31,7 @@ class Provenance:
     fit : tuple of float
         Share of the torque that each axis' rate regression explains, R^2.
     warnings : tuple of str
-        What is doubtful about the log or the gains.
+        Doubts about the log or the gains.
     details : mapping
         Further entries, as plain TOML values: options of the method, notes of the user.
     """
@@ -48,7 +47,7 @@ class Provenance:
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def as_table(self) -> dict[str, Any]:
-        """All in plain TOML values; what is empty is left out."""
+        """All entries that are not empty, as plain TOML values."""
         table: dict[str, Any] = {"method": self.method, "log": self.log, "log_sha256": self.log_sha256}
         table |= self.details
         for name in MODELS:
@@ -66,7 +65,7 @@ class Provenance:
         Raises
         ------
         TuningError
-            When an entry is of the wrong kind; those that are not known become `details`.
+            When an entry is of the wrong kind; unknown ones become `details`.
         """
         values = dict(table)
         known: dict[str, Any] = {}

@@ -1,4 +1,4 @@
-"""Reference models: what each closed loop is asked to look like."""
+"""Reference models: the transfer function asked of each closed loop."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from functools import lru_cache
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
 from mimopilot.common.toml import shown
+from mimopilot.tuning.errors import TuningError
 
-MAX_DAMPING = 10
-MAX_DELAY = 100
+#: Range of attitude loops; beyond it a model is a mistake of the user's: smallest natural frequency, rad/s, largest
+#: damping ratio, and largest delay, samples.
+MIN_OMEGA, MAX_DAMPING, MAX_DELAY = 1e-3, 10, 100
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class ReferenceModel:
     Ts : float, s
         Sampling period.
     label : str
-        How it was specified, for reports and provenance.
+        Specification as text, for reports and messages.
     """
 
     num: tuple[float, ...]
@@ -42,34 +43,34 @@ class ReferenceModel:
 
     @property
     def taps(self) -> NDArray[np.float64]:
-        """Numerator in powers of z^-1, aligned with `den` and with the delay in front, for `lfilter`."""
+        """Numerator in powers of z^-1, aligned with `den` and preceded by the delay, for `lfilter`."""
         lag = len(self.den) - len(self.num) + self.delay
         return np.concatenate([np.zeros(lag), self.num])
 
     def response(self, signal: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Output of the model, from rest, along axis 0.
+        """Output of the model from rest, along axis 0.
 
         Parameters
         ----------
         signal : (N,) or (N, n) array
-            Input, each column by itself.
+            Input; columns are independent.
         """
         filtered: NDArray[np.float64] = lfilter(self.taps, self.den, signal, axis=0)
         return filtered
 
     def over(self, other: ReferenceModel) -> ReferenceModel:
-        """Times the inverse of another, as one proper and stable filter.
+        """Product with the inverse of another model, as one proper and stable filter.
 
         Raises
         ------
         TuningError
-            When the other answers later than this one, or its inverse is not stable.
+            When the other has more delay, or its inverse is not stable.
         """
         lag = len(self.den) - len(self.num) + self.delay - (len(other.den) - len(other.num) + other.delay)
         if lag < 0 or np.any(np.abs(np.roots(other.num)) >= 1):
             raise TuningError(
-                f"reference model {self.label} over {other.label}: the quotient is not a proper, stable filter; ask "
-                "the first for as much delay as the second has"
+                f"reference model {self.label} over {other.label}: the quotient is not a proper, stable filter; give "
+                "the first at least the delay of the second"
             )
         num, den = np.polymul(self.num, other.den), np.polymul(self.den, other.num)
         delay = lag - (len(den) - len(num))
@@ -83,7 +84,7 @@ class ReferenceModel:
         return value
 
     def settling_samples(self, fraction: float = 0.01) -> int:
-        """Samples after which a transient of the model has fallen below `fraction` of its peak, delay included."""
+        """Samples until a transient of the model is below `fraction` of its peak, delay included."""
         slowest = float(np.max(np.abs(np.roots(self.den))))
         if slowest >= 1:
             raise TuningError(f"reference model {self.label}: pole at {slowest:.4g}, expected inside the unit circle")
@@ -93,19 +94,19 @@ class ReferenceModel:
 
 
 class ContinuousModel(Protocol):
-    """A reference model as it is asked for, in continuous time."""
+    """A reference model as specified, in continuous time."""
 
     type: ClassVar[str]
 
     @property
     def bandwidth(self) -> float:
-        """Where its magnitude begins to fall, rad/s."""
+        """Frequency at which the magnitude begins to fall, rad/s."""
 
     def discretise(self, Ts: float) -> ReferenceModel:
         """The model sampled every `Ts` seconds, zero-order hold."""
 
     def as_table(self) -> dict[str, Any]:
-        """Its parameters and its type, as plain TOML values; see `model_from_table`."""
+        """Parameters and type as plain TOML values; see `model_from_table`."""
 
 
 @dataclass(frozen=True)
@@ -152,11 +153,11 @@ class SecondOrder:
         return {"type": self.type, **asdict(self)}
 
     def as_list(self) -> list[float | int]:
-        """OMEGA, ZETA, DELAY, as a specification and the command line have it."""
+        """OMEGA, ZETA, DELAY, the form of specifications and of the command line."""
         return [self.omega, self.zeta, self.delay]
 
 
-#: Type -> class of every reference model that there is; a new one is a class and a row.
+#: Type -> class of every reference model; a new model needs a class and a row here.
 CONTINUOUS_MODELS: dict[str, type[SecondOrder]] = {SecondOrder.type: SecondOrder}
 
 
@@ -166,7 +167,7 @@ def model_from_table(table: Any, where: str) -> ContinuousModel:
     Raises
     ------
     TuningError
-        When the type is unknown, or an entry is missing, unknown or no number.
+        When the type is unknown, or an entry is missing, unknown or not a number.
     """
     if isinstance(table, list | tuple) and len(table) in (2, 3):
         table = {"type": SecondOrder.type, **dict(zip(("omega", "zeta", "delay"), table, strict=False))}
@@ -201,12 +202,12 @@ def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceM
     Raises
     ------
     TuningError
-        When omega is above Nyquist, or a number is out of the range of any attitude loop.
+        When omega is above Nyquist, or a number is out of the range of attitude loops.
     """
-    if not (1e-3 <= omega < np.pi / Ts and 0 < zeta <= MAX_DAMPING and 0 <= delay <= MAX_DELAY):
+    if not (MIN_OMEGA <= omega < np.pi / Ts and 0 < zeta <= MAX_DAMPING and 0 <= delay <= MAX_DELAY):
         raise TuningError(
             f"reference model: got omega {omega} rad/s, damping {zeta}, delay {delay}; "
-            f"expected 0.001 <= omega < {np.pi / Ts:.4g} rad/s, 0 < damping <= {MAX_DAMPING}, "
+            f"expected {MIN_OMEGA:g} <= omega < {np.pi / Ts:.4g} rad/s, 0 < damping <= {MAX_DAMPING}, "
             f"delay 0 to {MAX_DELAY} samples"
         )
     num, den, _ = cont2discrete(([omega**2], [1, 2 * zeta * omega, omega**2]), Ts, method="zoh")

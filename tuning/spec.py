@@ -1,28 +1,30 @@
-"""What to tune for: reference models, method, and what the log does not say. TOML in, validated."""
+"""Tuning specification: reference models, method, and what the log lacks. Read from TOML and validated."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated, Literal
 
-from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
-from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder, model_from_table
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from mimopilot.common.toml import checked, read_toml
+from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder, model_from_table
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Triple = tuple[Positive, Positive, Positive]
 
 
-class _Table(BaseModel):
+class _SpecTable(BaseModel):
+    """Table of the specification: unknown entries are refused."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class YawSpec(_Table):
-    """Yaw gains, for logs that do not hold them; names as in `tuning.gains.YawGains`."""
+class YawSpec(_SpecTable):
+    """Yaw gains, for logs without them; names and units as in `tuning.gains.YawGains`."""
 
     Kp_o: Finite
     Kp_i: Finite
@@ -31,7 +33,7 @@ class YawSpec(_Table):
     Kff_i: Finite = 0.0
 
 
-class LimitsSpec(_Table):
+class LimitsSpec(_SpecTable):
     """Saturations; names and units as in `tuning.gains.Limits`."""
 
     rate_max: Triple
@@ -39,17 +41,16 @@ class LimitsSpec(_Table):
     integral_max: Triple
 
 
-class Manoeuvre(_Table):
-    """A doublet that all gains are refined for, `tuning.design.refine_manoeuvre`.
+class Manoeuvre(_SpecTable):
+    """A doublet that all gains are refined for, see `tuning.design.refine_for_manoeuvre`.
 
     Attributes
     ----------
     amplitude_deg : float, deg
     period_s : float, s
-        Its whole length.
+        Whole length.
     effort : tuple of 2 float or None
-        RMS of both moments together that the roll and the pitch doublet may need; None: what they need with the
-        gains that VRFT gives.
+        Largest RMS of both torques together in the roll and in the pitch doublet; None: that of VRFT's gains.
     """
 
     amplitude_deg: Annotated[float, Field(gt=0, le=60)]
@@ -57,7 +58,7 @@ class Manoeuvre(_Table):
     effort: tuple[Positive, Positive] | None = None
 
 
-class TuningSpec(_Table):
+class TuningSpec(_SpecTable):
     """One tuning task.
 
     Attributes
@@ -66,38 +67,36 @@ class TuningSpec(_Table):
         ``mimo``: full matrices. ``siso``: each axis by itself, with the optimal prefilter (3.12).
     inner, outer : tuple of 2 SecondOrder
         Reference models of the rate and the attitude loop, roll then pitch. In TOML [omega rad/s, damping, delay
-        samples], one list for both axes or one each.
+        samples], one list for both axes or one for each.
     structure : str
         Terms of the rate controller: letters of ``PIDF`` in that order, P among them. The attitude controller is P.
     instrument : str
-        ``external``: lags of the injected moment, or of the set-point. ``u``: lags of the moment that acted, the
-        thesis' choice. ``model``, ``repeated``: see `tuning.estimation.instrumental_variables.instruments`.
+        ``external``: lags of the injected torque, or of the setpoint. ``u``: lags of the whole torque, the thesis'
+        choice. ``model``, ``repeated``: see `tuning.estimation.instrumental_variables.instruments`.
     trim : bool
         Estimate a constant (trim, initial integrator) on each stretch; the thesis does not.
     window : int or None, samples
         Lags of the instrument; None: from the reference model.
     weight : str
-        Of the rate loop's instruments: ``optimal`` is (3.30), in two steps; ``identity`` is plain least squares.
-        (3.30) holds where the residual is noise, so the attitude loop, whose residual is what a P controller
-        cannot do, always uses the latter.
+        Weight of the rate loop's instruments: ``optimal`` is (3.30), in two steps; ``identity`` is plain least squares.
+        (3.30) needs a residual that is noise. The attitude loop's residual is the P controller's error, so that loop
+        always uses ``identity``.
     pull : float
-        Pull of the rate gains towards the flying ones, the safe choice on a short log: 1 goes half of the way for a
-        gain that stands alone; 0 none.
+        Pull of the rate gains towards the flown ones, for short logs: 1 moves a single gain halfway, 0 not at all.
     refine : bool
-        Refine the attitude gains on the measured frequency response, `tuning.analysis.closed_loop.refine_outer`; False
-        leaves them as VRFT gives them.
+        Refine VRFT's attitude gains on the measured frequency response, see `tuning.design.refine_attitude`.
     doublet_s : float or None, s
-        Length of the doublet that the refinement weighs errors by; None: 1/omega, for set-points of all kinds.
+        Length of the doublet whose spectrum weighs the errors of that refinement; None: 1/omega, for all setpoints.
     manoeuvre : Manoeuvre or None
-        Refine all gains, of both loops, for this doublet; None: the rate loop stays as its model asks.
+        Refine the gains of both loops for this doublet; None: the rate loop follows its model.
     derivative_cutoff_hz : float or None, Hz
-        Of the derivative filter that will fly; None: as flown.
+        Cut-off of the derivative filter; None: as flown.
     moment_scale : tuple of 3 float or None, N m
-        What one unit of u stands for; None: as logged.
+        Torque of u = 1; None: as logged.
     yaw, limits
         None: as flown.
     certificate : Thresholds
-        Margins that verdicts need.
+        Margins that the verdict needs.
     """
 
     method: Literal["mimo", "siso"] = "mimo"
@@ -134,12 +133,12 @@ class TuningSpec(_Table):
 
 
 def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
-    """A specification from a TOML file, with the given entries replaced (None: not given).
+    """Specification from a TOML file, with the given entries replaced (None: not given).
 
     Raises
     ------
-    TuningError
-        When the file cannot be read, is not TOML, or holds an unknown or impossible entry.
+    Error
+        When the file cannot be read, is not TOML, or has an unknown or invalid entry.
     """
     table = read_toml(path, "specification") if path is not None else {}
     table |= {name: value for name, value in overrides.items() if value is not None}
@@ -147,7 +146,7 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
 
 
 def parse_model(text: str) -> SecondOrder:
-    """``OMEGA,ZETA,DELAY`` (rad/s, damping, samples) as it stands on the command line.
+    """Parse ``OMEGA,ZETA,DELAY`` (rad/s, damping, samples) from the command line.
 
     Raises
     ------
@@ -170,7 +169,7 @@ def parse_model(text: str) -> SecondOrder:
 
 
 def parse_doublet(text: str) -> dict[str, float]:
-    """``DEGREES,SECONDS`` as it stands on the command line: a `Manoeuvre`.
+    """Parse ``DEGREES,SECONDS`` from the command line: entries of a `Manoeuvre`.
 
     Raises
     ------

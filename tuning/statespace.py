@@ -1,12 +1,13 @@
-"""Discrete state space: what identification finds and what benchmarks are made of."""
+"""Linear systems in discrete state space: identified plants and benchmarks."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
+
+from mimopilot.tuning.errors import TuningError
 
 Signal = NDArray[np.float64]
 Response = NDArray[np.complex128]
@@ -19,14 +20,14 @@ class StateSpace:
     Attributes
     ----------
     A, B, C, D : (n, n), (n, n_u), (n_y, n), (n_y, n_u) arrays
-        The state has no unit of its own; B, C and D carry those of u and y.
+        The state has no unit; B, C and D have those of u and y.
     Ts : float, s
         Sampling period.
 
     Raises
     ------
     TuningError
-        When the shapes do not fit one another.
+        When the shapes do not match.
     """
 
     A: Signal
@@ -39,13 +40,15 @@ class StateSpace:
         n, n_u, n_y = len(self.A), self.B.shape[1], len(self.C)
         got = tuple(matrix.shape for matrix in (self.A, self.B, self.C, self.D))
         if got != ((n, n), (n, n_u), (n_y, n), (n_y, n_u)):
-            raise TuningError(f"state space: A, B, C, D have shapes {got}, which do not fit one another")
+            raise TuningError(
+                f"state space: got A, B, C, D of shapes {got}, expected (n, n), (n, n_u), (n_y, n), (n_y, n_u)"
+            )
 
     @property
     def poles(self) -> Response:
         """Eigenvalues of A, largest modulus first."""
         values = np.linalg.eigvals(self.A).astype(np.complex128)
-        # Rounded keys: conjugates have equal moduli only up to the last digit, and their order must not depend on it.
+        # Rounded keys: the moduli of conjugates differ in the last digit, and the order must not depend on it.
         order = np.lexsort((values.imag.round(12), -np.abs(values).round(12)))
         sorted_values: Response = values[order]
         return sorted_values
@@ -77,7 +80,7 @@ class StateSpace:
         Parameters
         ----------
         u : (N, ..., n_u) array
-            Input, time first; further axes are runs of their own.
+            Input, time first; further axes are independent runs.
 
         Returns
         -------

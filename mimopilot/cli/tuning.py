@@ -228,7 +228,7 @@ def advise(
 
 def print_certificate(gains: Gains) -> None:
     """Verdict, reason and margins of a certified set."""
-    from mimopilot.tuning.analysis.margins import AXES
+    from mimopilot.tuning.parameters import ROLL_PITCH
 
     certificate = gains.certificate
     assert certificate is not None
@@ -242,7 +242,7 @@ def print_certificate(gains: Gains) -> None:
         ["disk margin", f"{figures['disk_margin']:.2f}"],
         ["all axes at once", f"{figures['simultaneous_gain_db']:.1f} dB, {figures['simultaneous_phase_deg']:.0f} deg"],
     ]
-    for axis in AXES:
+    for axis in ROLL_PITCH:
         kind = figures["gain_margin"][axis]
         gain = "gain not known" if kind == "not known" else f"{figures['gain_margin_db'][axis]:.1f} dB"
         phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))

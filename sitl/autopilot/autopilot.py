@@ -9,6 +9,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.codegen.cortex_m4 import EmulatedController
 from mimopilot.codegen.layout import INPUT, OUTPUT
 from mimopilot.codegen.native import NativeController, load_native
@@ -19,7 +21,6 @@ from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS
 from mimopilot.sitl.physics.state_estimate import euler_angles
 from mimopilot.tuning.gains import Gains
-from numpy.typing import NDArray
 
 MIN_THRUST_RATIO, MAX_THRUST_RATIO = 0.5, 1.5  # of hover; chosen: altitude hold accelerates by at most half of g
 MIN_TILT_COSINE = 0.5  # 60 degrees, the largest tilt of a setpoint: beyond it thrust is not increased further

@@ -10,6 +10,7 @@ from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
+
 from mimopilot.tuning.excitation import pulses
 
 #: The parameter that starts and stops the excitation.

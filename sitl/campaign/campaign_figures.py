@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.stats import rankdata
+
 from mimopilot.sitl.campaign.draws import RunSampler
 from mimopilot.sitl.campaign.flights import FlightRunner
 from mimopilot.sitl.campaign.plan import CampaignPlan
@@ -18,8 +21,6 @@ from mimopilot.sitl.faults.kinds import KINDS
 from mimopilot.sitl.flight.figures import SETPOINT, STYLES
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from mimopilot.sitl.flight.scenario import AXES
-from numpy.typing import NDArray
-from scipy.stats import rankdata
 
 ENVELOPE_RUNS = 400  # first runs, repeated for the envelopes
 CELLS = 16  # largest number of cells on each side of the map

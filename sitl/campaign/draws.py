@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.campaign.variation import Distribution, FaultVariation, Variation
 from mimopilot.sitl.errors import SitlError
@@ -17,7 +19,6 @@ from mimopilot.sitl.flight.flight_log import quaternions
 from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.physics.airframe import MAX_HOVER, Airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, hover_state, is_physical_inertia
-from numpy.typing import NDArray
 
 ATTEMPTS = 1000  # impossible draws for one run before the specification is refused
 MAX_DELAY = 100  # samples: 0.4 s at 250 Hz, beyond any flyable delay

@@ -16,13 +16,13 @@ from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
-from mimopilot.sitl.campaign.flights import CHUNK, chunk_count, flight_runner, fly_chunk, label
-from mimopilot.sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, CampaignPlan, write_plan_files
-from mimopilot.sitl.errors import SitlError
 
 from mimopilot.common.console import progress_console
 from mimopilot.common.files import inside, unseal, write_atomically
 from mimopilot.common.parallel import processes, run_all
+from mimopilot.sitl.campaign.flights import CHUNK, chunk_count, flight_runner, fly_chunk, label
+from mimopilot.sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, CampaignPlan, write_plan_files
+from mimopilot.sitl.errors import SitlError
 
 ROW_GROUP = 1 << 14  # rows of a Parquet row group: a few MB in memory at a time
 SHOWN = 3  # parts named in one message

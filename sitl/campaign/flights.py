@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+
 from mimopilot.codegen.render import generator_version
+from mimopilot.common.files import seal
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot
 from mimopilot.sitl.campaign.draws import Draw, RunSampler
 from mimopilot.sitl.campaign.plan import CampaignPlan, plan_from_files
@@ -20,8 +22,6 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.flight.metrics import Performance, performance
 from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, first_loss
-
-from mimopilot.common.files import seal
 
 CHUNK = 64  # runs per chunk: at most these are lost when a worker dies
 FIGURES = tuple(field.name for field in fields(Performance))

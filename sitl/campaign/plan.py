@@ -11,18 +11,18 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import pyarrow as pa
+from pydantic import BaseModel, ConfigDict, Field
+
 from mimopilot.codegen.render import generator_version
+from mimopilot.common.files import inside, read_text, sha256, write_atomically
+from mimopilot.common.toml import checked, parse_toml, shown, toml_entries
 from mimopilot.sitl.campaign.variation import Variation
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import parse_fault
 from mimopilot.sitl.flight.scenario import Scenario, make_scenario
 from mimopilot.sitl.physics.airframe import Airframe, AirframeFile, airframe_from_toml
-from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml
-from pydantic import BaseModel, ConfigDict, Field
-
-from mimopilot.common.files import inside, read_text, sha256, write_atomically
-from mimopilot.common.toml import checked, parse_toml, shown, toml_entries
+from mimopilot.tuning.gains import Gains, gains_to_toml
+from mimopilot.tuning.gains_file import gains_from_toml
 
 SPEC, AIRFRAME = "spec.toml", "airframe.toml"
 RESULTS, PARTS, LOCK = "results.parquet", "parts", "campaign.lock"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+
 from mimopilot.sitl.campaign.flights import FlightRunner
 from mimopilot.sitl.campaign.plan import RESULTS, SPEC, CampaignPlan, plan_from_files, read_files, reading_results
 from mimopilot.sitl.errors import SitlError

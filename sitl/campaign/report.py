@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mimopilot.common.files import inside
+from mimopilot.common.html_report import ReportTable, Section, write_report
 from mimopilot.sitl.campaign import campaign_figures
 from mimopilot.sitl.campaign.flights import flight_runner
 from mimopilot.sitl.campaign.plan import REPORT, SPEC
@@ -18,9 +20,6 @@ from mimopilot.sitl.campaign.summary import (
     worst_rows,
 )
 from mimopilot.sitl.flight.figures import svg
-
-from mimopilot.common.files import inside
-from mimopilot.common.html_report import ReportTable, Section, write_report
 
 INTERVALS = (
     "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "

@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-from mimopilot.sitl.campaign.plan import CampaignPlan, reading_results
-from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from numpy.typing import NDArray
 
 from mimopilot.common.intervals import quantile, wilson
+from mimopilot.sitl.campaign.plan import CampaignPlan, reading_results
+from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 
 #: Figures in the summary.
 SHOWN = ("J_M_o", "peak_deg", "offaxis_peak_deg", "effort_rms", "saturated")

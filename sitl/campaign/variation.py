@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from mimopilot.sitl.physics.airframe import Vector
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from mimopilot.common.toml import checked, parse_toml, read_toml
+from mimopilot.sitl.physics.airframe import Vector
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pair = tuple[Finite, Finite]

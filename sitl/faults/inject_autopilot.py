@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.tuning.parameters import MATRICES, PARAMETERS
-from numpy.typing import NDArray
 
 
 class AutopilotFaults:

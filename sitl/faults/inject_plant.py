@@ -12,6 +12,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_autopilot import AutopilotFaults
@@ -19,7 +21,6 @@ from mimopilot.sitl.faults.kinds import Fault, periods
 from mimopilot.sitl.physics.airframe import Airframe, PointMass, combine_masses
 from mimopilot.sitl.physics.rigid_body import COMMAND_HISTORY
 from mimopilot.sitl.physics.simulated_plant import SimulatedPlant
-from numpy.typing import NDArray
 
 FAULT_STREAM = 0x6661  # arbitrary; separates the random numbers of faults from the noise of the same seed
 

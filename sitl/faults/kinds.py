@@ -12,12 +12,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.physics.airframe import Vector
-from mimopilot.tuning.parameters import AXES
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from mimopilot.common.toml import complaint
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.physics.airframe import Vector
+from mimopilot.tuning.parameters import AXES
 
 NOTATION = re.compile(r"([a-z-]+)(?::([^=@]+))?(?:=([^@]+))?@([^+]+)(?:\+(.+))?")
 FOR_EVER = 1 << 62  # periods; more than any flight has

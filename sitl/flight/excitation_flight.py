@@ -9,6 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mimopilot.common.files import inside
+from mimopilot.common.parallel import processes, run_all
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.flight_log import save_flight
@@ -17,9 +20,6 @@ from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.tuning.gains import Gains
-
-from mimopilot.common.files import inside
-from mimopilot.common.parallel import processes, run_all
 
 #: Largest amplitude (normalised) of the injected torque that is proposed, as in the demo.
 AMPLITUDE = 0.15

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT, MAX_TILT_SECONDS
 from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS
 from mimopilot.sitl.flight.simulator import Flight
-from numpy.typing import NDArray
 
 RECOVERED_ANGLE = np.radians(1.0)  # rad, from the flight without faults; chosen: above the noise of the estimate
 ALTITUDE_LOSS = 2.0  # m; chosen: far above what a manoeuvre loses

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+
+from mimopilot.common.charts import STYLES as STYLES
+from mimopilot.common.charts import svg as svg
 from mimopilot.sitl.flight.metrics import reference_responses
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.tuning.reference_model import ReferenceModel
-
-from mimopilot.common.charts import STYLES as STYLES
-from mimopilot.common.charts import svg as svg
 
 MODEL = {"color": "#888888", "linewidth": 3.0, "alpha": 0.6}
 SETPOINT = {"color": "black", "linewidth": 1.0}

@@ -6,16 +6,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.render import generator_version
+from mimopilot.common.files import write_atomically
 from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import IDENTITY, PARAMETERS
-from numpy.typing import NDArray
-
-from mimopilot.common.files import write_atomically
 
 EXCITATION_NAME = b"MIMO_EXC"  # of the debug_vect topic that carries the excitation, as in the firmware
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.sitl.physics.compiled import compiled
 from mimopilot.tuning.reference_model import ReferenceModel
-from numpy.typing import NDArray
 
 #: Figure of a flight -> its label: those of `Performance`, then of `sitl.flight.fault_recovery.Recovery`.
 FIGURE_LABELS = {

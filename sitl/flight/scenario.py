@@ -23,14 +23,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
-from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.faults.kinds import Fault, make_fault, parse_fault
-from mimopilot.tuning.excitation import hold_from_bandwidth, prbs
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from mimopilot.common.toml import checked, read_toml
+from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.faults.kinds import Fault, make_fault, parse_fault
+from mimopilot.tuning.excitation import hold_from_bandwidth, prbs
 
 AXES = ("roll", "pitch")
 LEAD = 1.0  # s of hover before a manoeuvre; chosen: the measured rates and the integrators have settled

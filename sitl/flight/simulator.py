@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick_unpacked
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT, MAX_TILT_SECONDS
 from mimopilot.sitl.faults.inject_plant import FaultInjection
@@ -15,7 +17,6 @@ from mimopilot.sitl.physics.compiled import compiled
 from mimopilot.sitl.physics.rigid_body import COMMAND_HISTORY, PlantParameters, advance
 from mimopilot.sitl.physics.simulated_plant import SimulatedPlant
 from mimopilot.sitl.physics.state_estimate import Sensors, euler_angles, measure
-from numpy.typing import NDArray
 
 #: The true state at each sample.
 TRUTH = np.dtype([("position", "f8", 3), ("velocity", "f8", 3), ("attitude", "f8", 3), ("rates", "f8", 3)])

@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.physics.mixer import Allocation, make_allocation, moment_scale
-from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, checked_inertia
-from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.gains_file import load_gains
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from mimopilot.common.files import read_text
 from mimopilot.common.toml import checked, parse_toml
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.physics.mixer import Allocation, make_allocation, moment_scale
+from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, checked_inertia
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains_file import load_gains
 
 MAX_HOVER = 0.9  # weight over largest thrust; chosen: with less than 10 % to spare no torque can be given
 FOLDER = Path(__file__).resolve().parent / "airframes"

@@ -7,9 +7,10 @@ do not bounce, and friction holds them. There is no ground effect.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.physics.compiled import compiled, inlined
 from mimopilot.sitl.physics.rigid_body import QUATERNION, ROTORS, PlantParameters
-from numpy.typing import NDArray
 
 FRICTION = 0.7  # Coulomb coefficient of a foot; chosen: rubber on dry concrete
 SWEEPS = 10  # over all feet (Gauss-Seidel); chosen: a vehicle at rest then moves by less than 1e-7 m/s

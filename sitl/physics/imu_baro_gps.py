@@ -10,9 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.physics.compiled import compiled
 from mimopilot.sitl.physics.rigid_body import GRAVITY
-from numpy.typing import NDArray
 
 GYRO_DENSITY = 1.75e-4  # rad/s/sqrt(Hz): 0.01 deg/s/sqrt(Hz)
 GYRO_BIAS = 2e-3  # rad/s, standard deviation between runs

@@ -10,9 +10,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.compiled import compiled, inlined
-from numpy.typing import NDArray
 
 ROUNDING = 1e-9  # thrust fraction; a command out of range by less is clipped and not reported as saturation
 

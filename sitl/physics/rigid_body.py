@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.compiled import compiled, inlined
-from numpy.typing import ArrayLike, NDArray
 
 GRAVITY = 9.80665  # m/s^2, standard gravity
 RUNGE_KUTTA_STEP = 1e-3  # s; chosen: a step of 0.1 ms moves half a second of flight by less than 1e-6 (m, m/s, rad/s)

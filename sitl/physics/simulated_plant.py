@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.sitl.physics.rigid_body import (
     COMMAND_HISTORY,
@@ -20,7 +22,6 @@ from mimopilot.sitl.physics.state_estimate import (
     low_pass,
     measure,
 )
-from numpy.typing import NDArray
 
 
 class SimulatedPlant:

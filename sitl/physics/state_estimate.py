@@ -10,11 +10,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.physics.compiled import inlined
 from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.signal import butter
+
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.physics.compiled import inlined
 
 MEASUREMENT_SIZE = 9  # numbers in a measurement
 ESTIMATE_NOISES = 6  # normal numbers for one measurement: 3 angles, 3 rates

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
+from numpy.typing import NDArray
+
 from mimopilot.sitl.flight.figures import STYLES
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS, reference_responses
 from mimopilot.sitl.flight.scenario import AXES
@@ -15,7 +17,6 @@ from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.sitl.studies.attitude_run import AttitudeRun
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
 from mimopilot.sitl.studies.attitude_study import MIMO, REFINED, SISO, AttitudeStudy
-from numpy.typing import NDArray
 
 #: Method -> (colour, line style) and marker.
 LOOK = dict(zip((SISO, MIMO, REFINED), zip(STYLES, "so^", strict=False), strict=False))

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
+
+from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
@@ -33,8 +35,6 @@ from mimopilot.sitl.studies.attitude_study import (
     SISO_OWN,
     AttitudeStudy,
 )
-
-from mimopilot.common.html_report import ReportTable, Section
 
 COMPARABILITY = (
     "Only trends can be compared with the thesis' real flights: the inertias, motors and winds there are not known, "

@@ -7,6 +7,7 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+
 from mimopilot.codegen.native import NativeController, NativeLibrary, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
@@ -28,11 +29,12 @@ from mimopilot.sitl.studies.attitude_study import (
 )
 from mimopilot.sitl.studies.autotune import autotune
 from mimopilot.sitl.studies.optimum import OptimumTask, best_gains, flown_effort
-from mimopilot.tuning.analysis.certificate import DENSE, certify, sensitivity_peak
-from mimopilot.tuning.analysis.doublet_prediction import doublet_model, effort
+from mimopilot.tuning.analysis.certificate import certify
+from mimopilot.tuning.analysis.doublet_prediction import doublet_effort, doublet_model
+from mimopilot.tuning.analysis.stability_figures import GRID_STEP, sensitivity_peak
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS
 from mimopilot.tuning.design.cascade import tune
-from mimopilot.tuning.design.refine_manoeuvre import INTEGRAL
+from mimopilot.tuning.design.refine_for_manoeuvre import INTEGRAL_SHARE
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.motors import fit_motors
@@ -117,7 +119,7 @@ def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experimen
     if siso_log is not log:
         found[SISO_OWN] = tune(log, siso)
     task = Manoeuvre(amplitude_deg=study.amplitude_deg, period_s=study.period_s)
-    roll, pitch = effort(found[SISO], doublet_model(measured, task))
+    roll, pitch = doublet_effort(found[SISO], doublet_model(measured, task))
     task = task.model_copy(update={"effort": (EFFORT_RATIO * roll, EFFORT_RATIO * pitch)})
     found[MIMO] = tune(log, mimo, measured)
     found[REFINED] = tune(log, mimo.model_copy(update={"manoeuvre": task}), measured)
@@ -158,7 +160,7 @@ def optimum(study: AttitudeStudy) -> dict[str, Gains]:
     plant = measured_plant(experiment(study, study.airframe, TYPICAL[0], noise=False)[1])
     body = rigid_body(plant)
     low, high = np.median(bands, axis=0)
-    plant = plant.at((low <= plant.omega) & (plant.omega <= high)).interpolated(DENSE)
+    plant = plant.at((low <= plant.omega) & (plant.omega <= high)).interpolated(GRID_STEP)
     vehicle, _, library = _vehicle_and_library(study.airframe)
     task = OptimumTask(
         airframe=vehicle.airframe,
@@ -169,7 +171,7 @@ def optimum(study: AttitudeStudy) -> dict[str, Gains]:
         body=body,
         peak=DEFAULT_THRESHOLDS.thin_Ms - float(np.median(errors)),
         effort=[float(rms) for rms in np.median(spent, axis=0)],
-        integral=INTEGRAL * float(body.least(found[0][MIMO].Ki_i)),
+        integral=INTEGRAL_SHARE * float(body.least(found[0][MIMO].Ki_i)),
     )
     best = best_gains(task, [found[0][AUTOTUNE], *(gains[REFINED] for gains in found)])
     return {BEST: best, BOUND: best_gains(replace(task, effort=None), [best])}

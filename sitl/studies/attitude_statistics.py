@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from mimopilot.sitl.studies.attitude_run import AttitudeRun, numbers, optimum, run
-from mimopilot.sitl.studies.attitude_study import AttitudeStudy
-from mimopilot.tuning.gains import Gains
 from numpy.typing import NDArray
 
 from mimopilot.common.console import progress_console
 from mimopilot.common.parallel import cores, processes, run_all
+from mimopilot.sitl.studies.attitude_run import AttitudeRun, numbers, optimum, run
+from mimopilot.sitl.studies.attitude_study import AttitudeStudy
+from mimopilot.tuning.gains import Gains
 
 
 @dataclass(frozen=True, eq=False)

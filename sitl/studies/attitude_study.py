@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+
 from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet
 from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.tuning.reference_model import ReferenceModel, second_order

@@ -20,12 +20,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfilt
+
 from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.provenance import Provenance
-from numpy.typing import NDArray
-from scipy.signal import butter, sosfilt
 
 BAND_HZ = (0.5, 30.0)  # high-pass and low-pass, PX4
 PERIOD = 0.010  # s, largest period of the model, PX4

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+
 from mimopilot.sitl.flight.figures import MODEL, STYLES
 from mimopilot.sitl.studies.benchmarks import Benchmark
 from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity

@@ -10,19 +10,19 @@ from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
+
+from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.sitl.flight.figures import svg
 from mimopilot.sitl.studies.benchmark_figures import sensitivity_figure, step_figure
 from mimopilot.sitl.studies.benchmarks import Benchmark, Signal, excitation, lv100, numerical_example
 from mimopilot.sitl.studies.report_part import ReportPart
-from mimopilot.tuning.design.refine import refine
+from mimopilot.tuning.design.refine_on_model import refine_on_model
 from mimopilot.tuning.estimation.cbt_ift import Comparison, correlation_based_tuning, iterative_feedback_tuning
 from mimopilot.tuning.estimation.siso import siso_vrft
 from mimopilot.tuning.estimation.vrft import vrft
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.loop_controller import LoopController
 from mimopilot.tuning.plant.pbsid import pbsid
-
-from mimopilot.common.html_report import ReportTable, Section
 
 SAMPLES = 5000  # per experiment
 IFT_SAMPLES = 1000  # per experiment of Iterative Feedback Tuning
@@ -65,7 +65,7 @@ def tune_once(task: Benchmark, design: str, seed: int) -> dict[str, LoopControll
         "VRFT, instrument u, W = I (thesis)": LoopController(thesis.gains, Filters(Ts)),
         "VRFT, instrument u_bar, W = I": LoopController(external.gains, Filters(Ts)),
         "VRFT, instrument u_bar, optimal W": optimal,
-        "VRFT, refined on a PBSID model": refine(optimal, plant, models).controller,
+        "VRFT, refined on a PBSID model": refine_on_model(optimal, plant, models).controller,
     }
 
 

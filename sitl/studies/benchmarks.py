@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mimopilot.tuning.design.refine import model_reference_cost
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete
+
+from mimopilot.tuning.design.refine_on_model import model_reference_cost
 from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
-from numpy.typing import NDArray
-from scipy.signal import cont2discrete
 
 TABLES = Path(__file__).with_name("thesis_tables.json")
 #: Number of frequencies for J_MR, (3.1) of the thesis.

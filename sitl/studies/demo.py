@@ -12,7 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.common.console import print_table
+from mimopilot.common.files import inside
+from mimopilot.common.html_report import ReportTable, Section, write_report
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
@@ -29,10 +33,6 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.spec import load_spec
-
-from mimopilot.common.console import print_table
-from mimopilot.common.files import inside
-from mimopilot.common.html_report import ReportTable, Section, write_report
 
 AIRFRAME = "adam0"
 METHODS = ("default", "siso", "mimo")

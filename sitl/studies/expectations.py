@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from mimopilot.common.html_report import ReportTable
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
 from mimopilot.sitl.studies.attitude_study import BEST, MIMO, REFINED, SISO
-
-from mimopilot.common.html_report import ReportTable
 
 #: Limits: J_M,o over the best on the true plant, effort over SISO's, J_M,o over SISO's.
 NEAR_BEST, EFFORT, NO_WORSE = 1.15, 1.10, 1.0

@@ -10,7 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
 from mimopilot.codegen.native import NativeController, NativeLibrary, load_native
+from mimopilot.common.console import progress_console
+from mimopilot.common.intervals import wilson
+from mimopilot.common.parallel import processes, run_all
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.sitl.flight.fault_recovery import Recovery, recovery
@@ -18,10 +22,6 @@ from mimopilot.sitl.flight.scenario import Scenario, make_scenario
 from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.sitl.studies.standard_faults import standard_faults
-
-from mimopilot.common.console import progress_console
-from mimopilot.common.intervals import wilson
-from mimopilot.common.parallel import processes, run_all
 
 TAIL_S = 5.0  # s of level flight after the manoeuvre: long enough to lose an unstable vehicle in the flight
 

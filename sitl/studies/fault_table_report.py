@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from mimopilot.sitl.studies.fault_table import FaultTable, FaultTableRow
-
 from mimopilot.common.console import print_table
+from mimopilot.sitl.studies.fault_table import FaultTable, FaultTableRow
 
 COLUMNS = (
     *("fault", "gains", "survived", "95 %", "peak [deg]", "worst", "RMS", "recovered [s]"),

@@ -10,23 +10,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.codegen.native import NativeController, NativeLibrary
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.physics.airframe import Airframe
-from mimopilot.tuning.analysis.certificate import HIGH_FREQUENCY_LOOP, loop_above
+from mimopilot.tuning.analysis.beyond_band import MAX_GAIN_ABOVE_BAND, loop_gain_above
 from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.analysis.doublet_prediction import moment_rms
-from mimopilot.tuning.design.constrained_least_squares import MISSED, descend
-from mimopilot.tuning.design.refine_manoeuvre import OTHER_AXIS, typical_sizes
+from mimopilot.tuning.design.constrained_least_squares import INFEASIBLE, constrained_least_squares
+from mimopilot.tuning.design.refine_for_manoeuvre import OTHER_AXIS, typical_sizes
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel
-from numpy.typing import NDArray
 
 #: The optimised gains: those in the thesis' tables.
 FREE = ("Kp_o", "Kp_i", "Ki_i", "Kd_i")
@@ -109,7 +110,7 @@ class OptimumTask:
         return residuals, [
             *(1 - flown_effort(flight) / most for flight, most in zip(flights, allowed, strict=True)),
             1 - float((1 / loop).max()) / self.peak,
-            1 - float(loop_above(gains, self.plant)[-1]) / HIGH_FREQUENCY_LOOP,
+            1 - float(loop_gain_above(gains, self.plant)[-1]) / MAX_GAIN_ABOVE_BAND,
             float(self.body.least(gains.Ki_i)) / self.integral - 1,
         ]
 
@@ -143,7 +144,7 @@ def best_gains(task: OptimumTask, starts: Sequence[Gains]) -> Gains:
             every = [task.examine(at(values)) for values in points]
             return np.array([residuals for residuals, _ in every]), np.array([left for _, left in every])
 
-        found = at(descend(examine, first, STEP)[0])
+        found = at(constrained_least_squares(examine, first, STEP)[0])
         residuals, left = task.examine(found)
-        ends.append((min(left) < -MISSED, float(residuals @ residuals), found))
+        ends.append((min(left) < -INFEASIBLE, float(residuals @ residuals), found))
     return min(ends, key=lambda end: end[:2])[2]

@@ -7,16 +7,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from mimopilot.common.console import print_table
+from mimopilot.common.files import inside
+from mimopilot.common.html_report import ReportTable, Section, write_report
 from mimopilot.sitl.studies.attitude_report import COMPARABILITY, study_figures, study_sections
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics, run_studies
 from mimopilot.sitl.studies.attitude_study import studies
 from mimopilot.sitl.studies.benchmark_studies import study_lv100, study_numerical_example
 from mimopilot.sitl.studies.expectations import expectations, expectations_table
 from mimopilot.sitl.studies.report_part import ReportPart
-
-from mimopilot.common.console import print_table
-from mimopilot.common.files import inside
-from mimopilot.common.html_report import ReportTable, Section, write_report
 
 #: Noise seeds of the attitude studies; the expectations apply to the medians over them.
 SEEDS = 50

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+
 from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.toolchain import WARNINGS, find_compiler
 

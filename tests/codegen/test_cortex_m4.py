@@ -7,6 +7,7 @@ import subprocess
 import numpy as np
 import pytest
 import unicorn
+
 from mimopilot.codegen import budget
 from mimopilot.codegen.budget import BudgetItem, cycles, different_rows, processor_in_the_loop, stack_bytes, step_costs
 from mimopilot.codegen.cortex_m4 import RAM, RAM_SIZE, EmulatedController, build_image, load_emulated, run_in_qemu
@@ -17,7 +18,6 @@ from mimopilot.codegen.toolchain import CXX_FLAGS
 from mimopilot.codegen.vectors import random_inputs
 from mimopilot.sitl.physics.airframe import FOLDER
 from mimopilot.tuning.gains_file import load_gains
-
 from tests.conftest import assert_one_clear_line
 
 #: PX4's compiler flags that affect code, and -fno-fast-math, which the controller requires.

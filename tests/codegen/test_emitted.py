@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from mimopilot.codegen.layout import OUTPUT, to_array
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.render import render, write_tree

@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from mimopilot.codegen.layout import INPUT, offset
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.tuning.law import TERMS, Filters, response
 from mimopilot.tuning.parameters import PARAMETERS, ROWS, Shape
-
 from tests.conftest import coupled_gains
 
 INPUTS = ("attitude_setpoint", "attitude", "rates", "excitation")

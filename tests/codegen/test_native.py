@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import INPUT, to_array
 from mimopilot.codegen.native import NativeController, NativeLibrary, build_native, load_native

@@ -12,13 +12,13 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.px4 import yaml_number
 from mimopilot.codegen.render import render
 from mimopilot.codegen.targets import TEMPLATES, targets
 from mimopilot.codegen.toolchain import find_compiler
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
-
 from tests.codegen.px4_host import PX4_FLAGS, definitions
 
 GOLDEN = Path(__file__).parent / "golden"

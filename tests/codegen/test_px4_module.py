@@ -4,12 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
-from mimopilot.codegen.layout import INPUT
-from mimopilot.codegen.native import NativeController, load_native
-from mimopilot.tuning.excitation import prbs
 from scipy.spatial.transform import Rotation
 from scipy.stats import ks_2samp
 
+from mimopilot.codegen.layout import INPUT
+from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.tuning.excitation import prbs
 from tests.codegen.px4_host import PX4_PARAMETERS, STANDARD, build, drive
 
 HOLD_MODE = 4

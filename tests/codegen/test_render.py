@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.literals import float_literal
 from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.targets import DESCRIPTION, TEMPLATES, targets
 from mimopilot.codegen.toolchain import find_compiler
+from mimopilot.common.files import sha256
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS
-
-from mimopilot.common.files import sha256
 
 
 def read_tree(folder):

@@ -8,11 +8,12 @@ import tomllib
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml
-from mimopilot.tuning.provenance import Provenance
 
 from mimopilot.common.errors import InputFileError
 from mimopilot.common.toml import MAX_DEPTH, MAX_SHOWN, MAX_TOKEN, parse_toml, read_toml, shown, toml_entries
+from mimopilot.tuning.gains import gains_to_toml
+from mimopilot.tuning.gains_file import gains_from_toml
+from mimopilot.tuning.provenance import Provenance
 from tests.conftest import assert_one_clear_line
 
 REFUSED_TEXTS = {

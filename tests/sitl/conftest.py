@@ -5,10 +5,10 @@ import subprocess
 import sys
 
 import pytest
-from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
-from mimopilot.tuning.parameters import IDENTITY
 
 import mimopilot.cli.main as front_door
+from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+from mimopilot.tuning.parameters import IDENTITY
 from tests.sitl.mavlink.running import WAITS
 from tests.sitl.mavlink.scripted_vehicle import float32
 

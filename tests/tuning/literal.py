@@ -1,8 +1,7 @@
-"""The thesis' pseudo-code of the cascade, word for word: Kronecker products, one sample after the other.
+"""The thesis' pseudo-code of the cascade, literally: Kronecker products, one sample after the other.
 
-It is the oracle of the fast estimator, and what the benchmark compares its time with. Two departures from
-its print: phi transposed in steps 3 and 9, and + Kd on y in the inverse controller, since D is
-subtracted.
+It is the reference for the fast estimator, and for its time in the benchmark. Two differences from the print: phi
+transposed in steps 3 and 9, and + Kd on y in the inverse controller, since D is subtracted.
 """
 
 import numpy as np
@@ -71,7 +70,7 @@ def literal_derivative(y, Ts, cutoff_hz):
 
 
 def literal_inverse(u, y, Kp, Ki, Kd, Ts, cutoff_hz):
-    """(3.32)-(3.34) and how long the unknown initial integrator is felt."""
+    """(3.32)-(3.34), and the settling time of the unknown initial integrator, samples."""
     inverse = np.linalg.inv(Kp + Ts * Ki)
     d = literal_derivative(y, Ts, cutoff_hz)
     integral, r = np.zeros(2), np.zeros_like(y)

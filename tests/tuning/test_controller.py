@@ -1,9 +1,10 @@
-"""The reference difference equation: its inverse, and the regressor that VRFT fits."""
+"""The reference controller against the law of tuning: VRFT's regressor and the inverse."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
@@ -18,7 +19,7 @@ def unlimited(gains):
 
 
 def fly(gains, seed=0):
-    """Random set-points and measurements through the float64 controller; returns u, r_i and y_i."""
+    """Run the float64 controller on random setpoints and measurements; returns u, r_i and y_i."""
     rng = np.random.default_rng(seed)
     controller = Controller(gains, np.float64)
     y_o, y_i, r_o = (rng.standard_normal((N, 3)) * s for s in (0.2, 1.0, 0.2))
@@ -38,7 +39,7 @@ def test_the_regressor_is_the_flown_difference_equation(gains, cutoff):
     assert x @ B.T == pytest.approx(u, abs=1e-10)
 
 
-def test_running_the_inner_controller_backwards_returns_the_rate_setpoint(gains):
+def test_the_inverse_rate_controller_returns_the_rate_setpoint(gains):
     gains = unlimited(gains)
     u, r_i, y_i = fly(gains)
     rebuilt, settling = rebuild_rate_setpoint(gains, u, y_i)
@@ -46,7 +47,7 @@ def test_running_the_inner_controller_backwards_returns_the_rate_setpoint(gains)
     assert settling > 0
 
 
-def test_the_inverse_forgets_its_unknown_integrator_after_settling(gains):
+def test_the_transient_of_the_unknown_integrator_decays_within_the_settling_time(gains):
     gains = unlimited(gains)
     u, r_i, y_i = fly(gains)
     rebuilt, settling = rebuild_rate_setpoint(gains, u + 0.1, y_i)  # as if I had started at 0.1

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.excitation import hold_from_bandwidth, prbs
 
@@ -24,7 +25,7 @@ def test_equal_seeds_give_equal_signals_and_others_do_not():
     assert (one != other).any()
 
 
-def test_a_prbs_draws_one_sign_and_the_pulses_that_it_needs_and_nothing_more():
+def test_a_prbs_draws_only_a_sign_and_the_pulses_it_needs():
     generator, again = np.random.default_rng(5), np.random.default_rng(5)
     signal = prbs(500, 1.0, 16, 64, generator)
     again.integers(2)

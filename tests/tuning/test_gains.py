@@ -5,10 +5,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.gains_file import gains_from_toml, gains_to_toml, load_gains
+from mimopilot.tuning.gains import Gains, gains_to_toml
+from mimopilot.tuning.gains_file import gains_from_toml, load_gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.provenance import Provenance
@@ -90,7 +91,7 @@ def test_no_cutoff_means_no_filter(gains):
 
 CERTIFICATE = Certificate.from_table({
     "verdict": "unstable",
-    "reason": "the determinant goes round 0: the rate loop alone is unstable",
+    "reason": "the determinant encircles 0: the rate loop alone is unstable",
     "figures": {"Ms": 1.4, "phase_margin_deg": {"roll": 45.0, "pitch": 46.0}, "gain_margin": {"roll": "at least"}},
     "band": [1.3, 100.0],
     "thresholds": {"Ms": 1.8, "phase_deg": 40.0, "thin_Ms": 2.5, "thin_phase_deg": 25.0},
@@ -120,7 +121,7 @@ def test_a_seal_survives_its_file_to_the_bit(gains):
         ("0123456789abcdef", "0123456789abcdee"),
     ],
 )
-def test_a_word_or_a_figure_that_is_edited_voids_the_certificate(gains, old, new):
+def test_an_edited_text_or_figure_voids_the_certificate(gains, old, new):
     text = gains_to_toml(gains.with_certificate(CERTIFICATE))
     assert text.count(old) >= 1
     head, tail = text.split("[certificate", 1)
@@ -129,8 +130,8 @@ def test_a_word_or_a_figure_that_is_edited_voids_the_certificate(gains, old, new
     assert edited.verdict() == ("void", "the gains or the certificate were edited after it was made")
 
 
-def test_any_number_of_the_controller_that_is_edited_voids_the_certificate(gains):
-    """Every gain, limit, the period, the cut-off and the scale; in the last bit too."""
+def test_an_edit_of_any_number_of_the_controller_voids_the_certificate(gains):
+    """Every gain and limit, the period, the cut-off and the unit of torque, even in the last bit."""
     sealed = gains.with_certificate(CERTIFICATE)
     for code, value in gains.elements().items():
         changed = sealed.with_elements({code: math.nextafter(value, math.inf)})
@@ -153,13 +154,13 @@ def test_any_number_of_the_controller_that_is_edited_voids_the_certificate(gains
         ("Ki_i = 0.1", "Ki_i = 0.2"),
     ],
 )
-def test_a_number_that_is_edited_in_the_file_voids_the_certificate(gains, old, new):
+def test_a_number_edited_in_the_file_voids_the_certificate(gains, old, new):
     text = gains_to_toml(gains.with_certificate(CERTIFICATE))
     assert old in text
     assert gains_from_toml(text.replace(old, new, 1), "test").verdict()[0] == "void"
 
 
-def test_a_certificate_without_a_seal_or_with_one_of_another_is_void(gains):
+def test_a_certificate_without_a_seal_or_of_another_set_is_void(gains):
     plain = dataclasses.replace(gains, certificate=CERTIFICATE)
     assert plain.verdict()[0] == "void"
     assert "has no seal" in plain.verdict()[1]

@@ -1,4 +1,4 @@
-"""The motors in a log: what the allocator does, how rotors lag, what a doublet is that drives them to their limits."""
+"""The motors in a log: the allocator, the rotors' lag, and doublets that saturate them."""
 
 import dataclasses
 
@@ -6,21 +6,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.flight_log import save_flight
 from mimopilot.sitl.flight.scenario import doublet, excitation_flight
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.mixer import allocate
-from mimopilot.tuning.analysis.compiled_doublet import allocated
+from mimopilot.tuning.analysis.compiled_doublet import allocate_commands
 from mimopilot.tuning.analysis.doublet_prediction import doublet_model
-from mimopilot.tuning.design.cascade import NO_MOTORS, tune
+from mimopilot.tuning.design.cascade import MOTORS_UNKNOWN, tune
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.motors import fit_motors, rotor_lag, saturation_warnings
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.spec import Manoeuvre
-
 from tests.tuning.logs.flights import make_flight, microseconds, px4_topics, write_ulog
 from tests.tuning.truth import thesis
 
@@ -43,7 +43,7 @@ def logs(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", ["adam0_nominal", "adam0_perturbed", "antr"])
-def test_a_log_says_how_the_allocator_moves_the_motors(logs, name):
+def test_the_allocator_is_identified_from_a_log(logs, name):
     motors, airframe = logs[name].motors, load_airframe(name).airframe
     assert motors.mixer == pytest.approx(airframe.allocation().mixer[:, :2], abs=0.005)
     weight = airframe.plant().mass * 9.80665 / (4 * airframe.motors.thrust_max)
@@ -59,7 +59,7 @@ def test_the_motor_that_carries_a_mass_hovers_higher(logs):
 @pytest.mark.parametrize("name", ["adam0_nominal", "adam0_perturbed", "antr"])
 def test_the_lag_of_the_rotors_is_a_pole_of_the_identified_plant(logs, name):
     lag = rotor_lag(PlantEstimates(logs[name]).identified.model.plant)
-    # Half a period is the hold's.
+    # Half a period of it is the zero-order hold.
     assert lag == pytest.approx(load_airframe(name).airframe.motors.time_constant, rel=0.08)
 
 
@@ -73,7 +73,7 @@ def test_the_mixer_of_linear_commands_is_found_exactly():
     assert motors.hover == pytest.approx(np.full(6, 0.5), abs=1e-9)
 
 
-def test_commands_that_the_moment_does_not_explain_are_not_taken():
+def test_commands_that_the_torque_does_not_explain_give_no_motors():
     rng = np.random.default_rng(2)
     u, other = 0.1 * rng.normal(size=(500, 2)), 0.1 * rng.normal(size=(500, 2))
     commands = 0.5 + other @ np.array([[0.5, 0.5, -0.5, -0.5], [0.5, -0.5, 0.5, -0.5]])
@@ -84,30 +84,30 @@ def test_commands_that_the_moment_does_not_explain_are_not_taken():
 
 @given(roll=UNIT, pitch=UNIT, collective=st.floats(0.05, 1))
 @settings(max_examples=300, deadline=None)
-def test_commands_are_those_of_the_flown_allocator(roll, pitch, collective):
-    """Two statements of one law: the bench's, for any geometry and with yaw, and the prediction's."""
+def test_predicted_commands_are_those_of_the_simulated_allocator(roll, pitch, collective):
+    """Two implementations of one law: the simulation's, for any geometry and with yaw, and the prediction's."""
     allocation = load_airframe("adam0").airframe.allocation()
     flown, unallocated = np.zeros(4), np.zeros(3)
     allocate(np.array([roll, pitch, 0.0]), collective, allocation, flown, unallocated)
     predicted = np.zeros(4)
-    share = allocated(allocation.mixer[:, :2] @ np.array([roll, pitch]), np.full(4, collective), predicted)
+    share = allocate_commands(allocation.mixer[:, :2] @ np.array([roll, pitch]), np.full(4, collective), predicted)
     assert predicted == pytest.approx(flown, abs=1e-7)
     if abs(share - 1) > 1e-6 and roll * pitch != 0:
         assert bool(unallocated[:2].any()) == (share < 1)
 
 
 @pytest.mark.parametrize("axis", [0, 1])
-def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axis):
+def test_a_doublet_that_saturates_the_motors_is_flown_as_predicted(logs, axis):
     log, vehicle = logs["adam0_nominal"], load_airframe("adam0_nominal")
     gains = dataclasses.replace(tune(log, thesis(method="siso")), certificate=None)
     gains = dataclasses.replace(gains, Kp_i=1.6 * gains.Kp_i, Kd_i=2.0 * gains.Kd_i)
     task = doublet(("roll", "pitch")[axis], np.radians(40.0), 0.45, TS)
     flight = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), task, 0, noise=False)
     flown = flight.truth["attitude"][slice(*task.window), axis]
-    assert flight.record["commands"][slice(*task.window), :4].min() == 0  # a motor stood
+    assert flight.record["commands"][slice(*task.window), :4].min() == 0  # a motor stopped
 
     def deviation_deg(model):
-        angles, _ = model.fly(GainStack.of(gains))
+        angles, _ = model.simulate(GainStack.of(gains))
         return np.degrees(np.sqrt(np.mean((angles[axis, 0, :, axis] - flown) ** 2)))
 
     model = doublet_model(PlantEstimates(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
@@ -116,16 +116,16 @@ def test_a_doublet_that_saturates_the_motors_flies_as_it_was_predicted(logs, axi
     assert deviation_deg(model) < without / 3
 
 
-def test_the_drawn_out_switch_of_the_integral_hardly_changes_a_doublet(logs):
+def test_the_gradual_anti_windup_hardly_changes_a_doublet(logs):
     log = logs["adam0_nominal"]
     model = doublet_model(PlantEstimates(log), Manoeuvre(amplitude_deg=40.0, period_s=0.45))
     stack = GainStack.of(tune(log, thesis()))
-    sharp, soft = model.fly(stack)[0], model.fly(stack, 0.05)[0]
+    sharp, soft = model.simulate(stack)[0], model.simulate(stack, 0.05)[0]
     assert 0 < np.degrees(np.abs(soft - sharp).max()) < 0.5
 
 
 def test_commands_are_read_at_any_rate_and_only_where_they_are_thrust_fractions(tmp_path):
-    """A PX4 log with four of twelve motors, logged at 10 Hz; without its thrust curve commands set the speed."""
+    """A PX4 log with four of twelve motors, logged at 10 Hz; without a thrust curve commands set the speed."""
     flight = make_flight()
     mixer = np.sqrt(0.5) * np.array([[-1.0, 1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, -1.0]])
     control = np.full((len(flight.t), 12), np.nan, np.float32)
@@ -143,14 +143,14 @@ def test_commands_are_read_at_any_rate_and_only_where_they_are_thrust_fractions(
     assert read_log(write_ulog(tmp_path / "speed.ulg", topics, {"THR_MDL_FAC": 0.0})).motors is None
 
 
-def test_a_tuning_says_that_it_does_not_know_the_motors(logs):
+def test_tuning_for_a_manoeuvre_warns_if_the_motors_are_not_logged(logs):
     log, spec = logs["adam0_nominal"], thesis(manoeuvre={"amplitude_deg": 10.0, "period_s": 0.42})
-    assert NO_MOTORS in tune(dataclasses.replace(log, motors=None), spec).provenance.warnings
-    assert NO_MOTORS not in tune(log, spec).provenance.warnings
+    assert MOTORS_UNKNOWN in tune(dataclasses.replace(log, motors=None), spec).provenance.warnings
+    assert MOTORS_UNKNOWN not in tune(log, spec).provenance.warnings
 
 
-def test_motors_at_their_ends_are_told_with_the_amplitude_that_avoids_it():
-    """Two motors that move by half of the torque about 0.2: a torque of 0.4 and what is on top of it is the most."""
+def test_saturated_motors_are_reported_with_an_amplitude_that_avoids_saturation():
+    """Motors that change by half of the torque about 0.2: a total torque of 0.4 saturates them."""
     rng = np.random.default_rng(0)
     u = 0.1 * rng.choice([-1.0, 0.0, 1.0], (4000, 2))
     u[:200, 0] = 0.5 * rng.choice([-1.0, 1.0], 200)
@@ -158,13 +158,13 @@ def test_motors_at_their_ends_are_told_with_the_amplitude_that_avoids_it():
     commands = np.clip(hover + u @ mixer.T, 0.0, 1.0)
     motors = fit_motors(u, commands)
     (text,) = saturation_warnings(u, commands, motors, 0.5)
-    assert text.startswith("a motor is at an end of its range in 5% of the samples")
-    # The farthest any motor is moved is (0.5 + 0.1) / 2 below a hover of 0.2.
-    assert text.endswith(f"inject a torque of {0.5 * 0.2 / 0.3:.2g} in place of 0.5")
+    assert text.startswith("a motor is saturated in 5% of the samples")
+    # The largest change of a motor is (0.5 + 0.1) / 2, below a hover command of 0.2.
+    assert text.endswith(f"inject a torque of {0.5 * 0.2 / 0.3:.2g} instead of 0.5")
     assert saturation_warnings(0.1 * u, np.clip(hover + 0.1 * u @ mixer.T, 0, 1), motors, 0.05) == []
 
 
-def test_the_amplitude_that_is_proposed_leaves_the_motors_of_each_airframe_room():
+def test_the_default_amplitude_does_not_saturate_the_motors_of_each_airframe():
     from mimopilot.sitl.flight.excitation_flight import default_amplitude
 
     found = {name: default_amplitude(load_airframe(name).airframe) for name in ("adam0", "antr", "px4_sih")}

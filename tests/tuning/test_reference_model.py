@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.reference_model import second_order
 
 TS = 1 / 250
 
-#: omega, damping, delay, numerator and denominator as the thesis prints them.
+#: omega (rad/s), damping, delay (samples), numerator and denominator as printed in the thesis.
 PRINTED = [
     (20, 0.4, 0, ("0.003131", "0.003065"), ("-1.932", "0.9380")),
     (10, 0.7, 0, ("0.0007852", "0.0007706"), ("-1.9440", "0.9455")),

@@ -1,12 +1,14 @@
-"""The closed loop of an airframe about hover, exactly: what no method of the program knows.
+"""The exact closed loop of an airframe about hover, independent of the tested code.
 
-Rigid body and rotors are sampled with a zero-order hold, then come the computing delay, the gyro's filter and the
-frame's mode as they fly; the controller is written out state by state.
+Rigid body and rotors are sampled with a zero-order hold. The computing delay, the gyro's filter and the structural mode
+are as simulated; the controller is written out state by state.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag, expm
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import excitation_flight
 from mimopilot.sitl.flight.simulator import fly
@@ -15,15 +17,14 @@ from mimopilot.sitl.physics.state_estimate import frame_mode, low_pass
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.spec import load_spec
 from mimopilot.tuning.statespace import StateSpace
-from scipy.linalg import block_diag, expm
 
 TS = 0.004
-#: As its own command has it.
+#: Bandwidth of the excitation, rad/s, the default of the experiment command.
 BANDWIDTH = 50.0
 
 
 def thesis(**options):
-    """A specification with the thesis' model of the rate loop, unless another is given: its figures are known."""
+    """A specification with the thesis' model of the rate loop, whose figures are known, unless another is given."""
     return load_spec(**{"inner": (20.0, 0.4, 0), **options})
 
 
@@ -48,7 +49,7 @@ def delay(samples, Ts=TS):
 
 
 def linear_plant(airframe, late=0, Ts=TS):
-    """From u to [measured rates, measured angles], with `late` periods of delay besides the airframe's own."""
+    """From u to [measured rates, measured angles], with `late` periods of delay added to the airframe's own."""
     plant = airframe.plant()
     inverse, tau = plant.inertia_inverse[:2, :2], airframe.motors.time_constant
     A = np.zeros((6, 6))
@@ -61,14 +62,14 @@ def linear_plant(airframe, late=0, Ts=TS):
     sampled = expm(M)
     body = StateSpace(sampled[:6, :6], sampled[:6, 6:], np.eye(4, 6), np.zeros((4, 2)), Ts)
     whole = series(delay(airframe.computing_delay + late), body)
-    # The frame and the gyro see the rates; what is seen of both axes alike.
+    # Structural mode and gyro act on the rates, equally on both axes.
     blocks = []
     for _ in range(2):
         bend = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((2, 0)), np.array([[1.0], [0.0]]), Ts)
         if airframe.frame is not None:
             f = frame_mode(airframe.frame.frequency_hz, airframe.frame.damping, airframe.frame.gain, Ts)
             F, g = f[:4].reshape(2, 2), f[4:, None] / Ts
-            # The new bend is seen at once: b(k) = F b(k-1) + g (w(k) - w(k-1)); states b(k-1), w(k-1).
+            # The new bend acts at once: b(k) = F b(k-1) + g (w(k) - w(k-1)); states b(k-1), w(k-1).
             A1 = np.block([[F, -g], [np.zeros((1, 3))]])
             B1 = np.vstack([g, [[1.0]]])
             C1 = np.array([[F[1, 0], F[1, 1], -g[1, 0]], [F[0, 0], F[0, 1], -g[0, 0]]])
@@ -89,7 +90,7 @@ def linear_plant(airframe, late=0, Ts=TS):
             Ts,
         )
         blocks.append(series(bend, passed))
-    # Each block: rate -> [filtered rate, bend]. Rates in, angles passed by.
+    # Each block: rate -> [filtered rate, bend]. Angles bypass it.
     stack = StateSpace(
         block_diag(*(b.A for b in blocks), np.zeros((0, 0))),
         np.hstack([block_diag(*(b.B for b in blocks)), np.zeros((sum(len(b.A) for b in blocks), 2))]),
@@ -112,7 +113,7 @@ def linear_plant(airframe, late=0, Ts=TS):
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """The plant of an airframe and what becomes of gain sets on it."""
+    """The plant of an airframe and the closed loops of gain sets around it."""
 
     plant: StateSpace
 
@@ -168,7 +169,7 @@ class Truth:
 
 
 def experiment(name, seed=0, amplitude=0.15, bandwidth=BANDWIDTH, seconds=20.0, gusts=0.0, late=0, airframe=None):
-    """A flight of the bench as an Experiment; gusts are a coloured torque, RMS as a share of the full torque."""
+    """A simulated flight as an Experiment; gusts are a coloured torque, their RMS a share of the full torque."""
     vehicle = load_airframe(name)
     airframe = airframe or vehicle.airframe
     airframe = airframe.model_copy(update={"computing_delay": airframe.computing_delay + late})
@@ -181,7 +182,7 @@ def experiment(name, seed=0, amplitude=0.15, bandwidth=BANDWIDTH, seconds=20.0, 
         u = record["moment"][:, :2].astype(float)
         u_bar = record["excitation"][:, :2].astype(float)
     else:
-        # A gust is torque that the log does not show: injected with the excitation, then taken out of both.
+        # A gust is a torque that is not logged: injected with the excitation, then subtracted from both signals.
         noise = np.random.default_rng([seed, 9]).standard_normal((len(scenario.excitation), 2))
         pole = np.exp(-TS / 0.5)
         gust = np.zeros_like(noise)

@@ -1,1 +1,1 @@
-"""The closed loop of a gain set: transfers, margins, certificate, predicted doublets."""
+"""The closed loop of a gain set: frequency responses, margins, certificate, predicted doublets."""

@@ -1,34 +1,30 @@
-"""The cascade around a measured frequency response: loop transfers and the closed loop.
+"""The cascade around a measured frequency response: open and closed loop.
 
-The plant's responses G_i (rates) and G_o (angles) to the torque u are known at some frequencies; `tuning.law` gives
-the controller's there.
+G_i (rates) and G_o (angles) are the plant's responses to the torque u at the measured frequencies; `tuning.law` gives
+the controller's response there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning import law
-from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.plant.frequency_response import DRAWS, MIN_FREQUENCIES, PlantResponse
-from mimopilot.tuning.reference_model import ReferenceModel
+from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.statespace import StateSpace
-from numpy.typing import NDArray
-from scipy.optimize import least_squares
-
-ACCURATE = 0.1
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
 
 def singular_values(matrices: Complex) -> tuple[Signal, Signal]:
-    """Largest and smallest singular value of 2x2 matrices (..., 2, 2), each (...), in closed form: half of a tuning's
-    time would be spent in LAPACK's.
+    """Largest and smallest singular value of 2x2 matrices (..., 2, 2), each (...).
+
+    In closed form: LAPACK's would take half of a tuning's time.
     """
     size = np.sum(np.abs(matrices) ** 2, axis=(-2, -1))
     determinant = np.abs(matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0])
@@ -38,14 +34,14 @@ def singular_values(matrices: Complex) -> tuple[Signal, Signal]:
 
 @dataclass(frozen=True, eq=False)
 class CascadeLoop:
-    """Transfers of a gain set around a plant, (K, 2, 2) each.
+    """Frequency responses of a gain set around a plant, (K, 2, 2) each.
 
     Attributes
     ----------
     L_i : rate loop alone, cut at u.
     L_u : whole loop, cut at u: C_y G_i + C_r Kp_o G_o, with u = C_r r_i - C_y y_i.
-    T_o : from attitude set-point to attitude.
-    U_o : from attitude set-point to u.
+    T_o : from attitude setpoint to attitude.
+    U_o : from attitude setpoint to u.
     """
 
     L_i: Complex
@@ -68,14 +64,16 @@ def rate_controller(gains: Gains | GainStack, omega: Signal) -> tuple[Complex, C
 
 
 def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
-    """The transfers of `CascadeLoop` for a gain set on a measured plant."""
+    """Open and closed loop of a gain set around a measured plant."""
     L_i, L_u, forward = whole_loop(gains, plant)
     U_o: Complex = np.linalg.solve(np.eye(2) + L_u, forward).astype(np.complex128)
     return CascadeLoop(L_i, L_u, plant.G_o @ U_o, U_o)
 
 
 def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
-    """Of a gain set around an identified plant, without limits: the larger one of the rate loop and of the cascade.
+    """Spectral radius of the closed loop around an identified plant, without limits.
+
+    The larger of two: the rate loop alone, and the whole cascade.
 
     Parameters
     ----------
@@ -98,92 +96,21 @@ def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
         kept = np.ones(len(step), bool)
         if not setpoint.any():  # the rate loop alone: the angle is not fed back
             kept[-2:] = False
-        # A filter whose output is not used, such as an integral without a gain, is no part of the loop.
+        # A filter whose output is not used, such as an integral with zero gain, is not part of the loop.
         kept[n : n + m] = np.any(flown.C, axis=0)
         radius = max(radius, float(np.abs(np.linalg.eigvals(step[np.ix_(kept, kept)])).max()))
     return radius
 
 
 def doublet_spectrum(omega: Signal, seconds: float) -> Complex:
-    """Fourier transform of a doublet of height 1, +1 then -1 for half of its length each.
+    """Fourier transform of a doublet: +1, then -1, each for half of its length.
 
     Parameters
     ----------
     omega : (K,) array, rad/s
     seconds : float, s
-        Its whole length.
+        Whole length.
     """
     s = 1j * omega
     spectrum: Complex = (1 - np.exp(-s * seconds / 2)) ** 2 / s
     return spectrum
-
-
-def refine_outer(
-    gains: Gains,
-    plant: PlantResponse,
-    models: Sequence[ReferenceModel],
-    full: bool,
-    doublet_s: float | None = None,
-    draw_inner: Callable[[Gains, np.random.Generator], Gains] = lambda gains, generator: gains,
-) -> tuple[Gains, Signal]:
-    """Kp_o that brings the measured closed loop closest to the outer reference model.
-
-    VRFT weighs what a P controller cannot do by the experiment's spectrum; here the same measured data weigh it by
-    that of set-points: |T_o - M_o|^2 / omega, between an impulse's (J_MR, (3.1)) and a step's, or the spectrum of a
-    doublet. Gauss-Newton from the VRFT gains, four numbers at most; no model is fitted.
-
-    Parameters
-    ----------
-    gains : Gains
-        A complete set; its rate loop is kept.
-    plant : PlantResponse
-        From the same experiment.
-    models : sequence of 2 ReferenceModel
-        Of the attitude loop.
-    full : bool
-        False: the diagonal only (SISO).
-    doublet_s : float, s, optional
-        Length of the doublet whose spectrum weighs the error.
-    draw_inner : callable, optional
-        Gives the set with rate gains that the log's noise could have given as well.
-
-    Returns
-    -------
-    gains : Gains
-        With the new Kp_o.
-    deviations : (2, 2) array, 1/s
-        Standard deviation of its elements, from the errors of the measured response and of the rate gains.
-
-    Raises
-    ------
-    TuningError
-        When the response is known well at too few frequencies.
-    """
-    use = plant.known() & (plant.relative_error() < ACCURATE)
-    if use.sum() < MIN_FREQUENCIES:
-        raise TuningError(f"only {use.sum()} frequencies of the measured response are known to 10 %")
-    plant = plant.at(use).extended()
-    target = np.stack([model.frequency_response(plant.omega) for model in models], axis=1)[:, :, None] * np.eye(2)
-    where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
-    spectrum = plant.omega**-0.5 if doublet_s is None else np.abs(doublet_spectrum(plant.omega, doublet_s))
-    # An integral over frequency: where the response's windows are narrow its values are many.
-    spectrum = spectrum * np.sqrt(np.gradient(plant.omega))
-    weight = where * spectrum[:, None, None]
-
-    def placed(values: Signal, around: Gains = gains) -> Gains:
-        Kp_o = np.zeros((2, 2))
-        Kp_o[where] = values
-        return replace(around, Kp_o=Kp_o)
-
-    def distance(values: Signal, of: PlantResponse = plant, around: Gains = gains) -> Signal:
-        error = (cascade_loop(placed(values, around), of).T_o - target) * weight
-        return np.concatenate([error.real.ravel(), error.imag.ravel()])
-
-    found = least_squares(distance, gains.Kp_o[where], x_scale="jac")
-    generator = np.random.default_rng(0)
-    shifts = np.array(
-        [distance(found.x, plant.draw(generator), draw_inner(gains, generator)) - found.fun for _ in range(DRAWS)]
-    )
-    deviations = np.zeros((2, 2))
-    deviations[where] = np.std(shifts @ np.linalg.pinv(found.jac).T, axis=0)
-    return placed(found.x), deviations

@@ -1,23 +1,24 @@
-"""A doublet around a linear plant behind its motors, compiled: a refinement flies thousands."""
+"""Doublets simulated around a linear plant and its motors, compiled: a refinement needs thousands."""
 
 from __future__ import annotations
 
 import numpy as np
-from mimopilot.tuning import law
 from numpy.typing import NDArray
 
 from mimopilot.common.compiled import compiled
+from mimopilot.tuning import law
 
 Signal = NDArray[np.float64]
 
-
+#: Smallest cosine of the tilt that the collective compensates: twice the weight, as the simulated autopilot does.
+MIN_TILT_COSINE = 0.5
 #: Numbers of the signals that a term acts on.
 ERROR, RATE, SETPOINT = range(3)
 _SIGNALS = {law.ERROR: ERROR, law.RATE: RATE, law.SETPOINT: SETPOINT}
 
 
 def law_terms(filters: law.Filters) -> Signal:
-    """The terms of the law as numbers, (4, 5): signal, sign, direct gain, zero and pole of the filter."""
+    """Terms of the law as numbers, (4, 5): signal, sign, direct gain, zero and pole of the filter."""
     numbers = []
     for term in law.TERMS.values():
         shape = term.filter(filters)
@@ -27,9 +28,10 @@ def law_terms(filters: law.Filters) -> Signal:
 
 
 @compiled
-def allocated(part, rest, commands):  # type: ignore[no-untyped-def]
-    """Commands `rest` + share `part` within 0..1, the collective lowered where that makes room; fills `commands` (n,)
-    and returns the largest share for which a collective that is not higher does it; up to 1 is given.
+def allocate_commands(part, rest, commands):  # type: ignore[no-untyped-def]
+    """Fill `commands` (n,) with `rest` + share `part` within 0 to 1, and return the largest share possible.
+
+    The collective is lowered, never raised, where a command would exceed 1. A share above 1 is applied as 1.
     """
     share = np.inf
     for i in range(len(part)):
@@ -48,43 +50,43 @@ def allocated(part, rest, commands):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def kept(room, soft):  # type: ignore[no-untyped-def]
-    """Share of the integral's growth that anti-windup lets pass, `room` before the limit: 1 or 0, or in between."""
+def anti_windup_share(margin, soft):  # type: ignore[no-untyped-def]
+    """Share of the integral's growth that anti-windup allows, `margin` before the limit: 1 or 0, or in between."""
     if soft > 0.0:
-        return min(max(0.5 + room / soft, 0.0), 1.0)
-    return 1.0 if room >= 0.0 else 0.0
+        return min(max(0.5 + margin / soft, 0.0), 1.0)
+    return 1.0 if margin >= 0.0 else 0.0
 
 
 @compiled
-def fly(A, B, C, trim, motors, setpoint, gains, terms, limits, Ts, soft, angles, moments):  # type: ignore[no-untyped-def]
-    """The law of `tuning.law` with its limits, axis by axis and gain set by gain set, without noise.
+def simulate_doublets(A, B, C, trim, motors, setpoint, gains, terms, limits, Ts, soft, angles, moments):  # type: ignore[no-untyped-def]
+    """Simulate the law of `tuning.law` with its limits, axis by axis and gain set by gain set, without noise.
 
-    The plant is the linear one around hover, which holds the rotors' lag. Rotors whose speed lags behind commands that
-    are thrust fractions, f = w^2, make another moment where commands are large; what a linear lag would have to be
-    given for the same moment is the plant's input.
+    The plant is linear around hover and includes the rotors' lag. The rotors' speed lags behind the commands, which
+    are thrust fractions f = w^2, so large commands produce another torque than a linear lag. The plant's input is the
+    torque command that gives the same torque behind a linear lag.
 
     Parameters
     ----------
     A, B, C : arrays
-        Of the plant from moment to body rates.
+        Plant from torque to body rates.
     trim : (2,) array
-        Moment that holds the vehicle level.
+        Torque that holds the vehicle level.
     motors : tuple
-        mixer (n, 2), its inverse (2, n), hover (n,) and exp(-Ts / lag) of the rotors; n = 0: as the plant says.
+        mixer (n, 2), its inverse (2, n), hover (n,) and exp(-Ts / lag) of the rotors; n = 0: linear motors.
     setpoint : (N,) array, rad
-        Of the axis that moves.
+        Of the moving axis.
     gains : (K, 5, 2, 2) array
         Kp_o, then the matrices of `terms`, of every set.
     terms : (4, 5) array
         See `law_terms`.
     limits : (3, 2) array
-        Of rates, moments and integral.
+        Of rates, torque and integral.
     Ts : float, s
     soft : float
-        Moment over which the anti-windup's switch is drawn out: the flown one, 0, makes angles jump where gains change
-        by nothing, and no descent gets past that.
+        Torque over which anti-windup switches gradually. As flown it is 0: angles then jump at tiny changes of the
+        gains, which stops an optimisation.
     angles, moments : (2, K, N, 2) arrays
-        Are filled; first index: the axis that moves.
+        Filled; first index: the moving axis.
     """
     mixer, inverse, hover, decay = motors
     n, weight = len(hover), hover.sum() / max(len(hover), 1)
@@ -97,7 +99,7 @@ def fly(A, B, C, trim, motors, setpoint, gains, terms, limits, Ts, soft, angles,
             integral, wanted, moment = np.zeros(2), np.zeros(2), np.zeros(2)
             filtered, before, signals = np.zeros((len(terms), 2)), np.zeros((len(terms), 2)), np.zeros((3, 2))
             part, rest, commands = np.zeros(n), np.zeros(n), np.zeros(n)
-            speed, acting, equivalent, room = np.sqrt(hover), np.zeros(2), np.zeros(2), np.inf
+            speed, acting, equivalent, margin = np.sqrt(hover), np.zeros(2), np.zeros(2), np.inf
             for t in range(len(setpoint)):
                 for i in range(2):
                     now[i] = 0.0
@@ -114,7 +116,7 @@ def fly(A, B, C, trim, motors, setpoint, gains, terms, limits, Ts, soft, angles,
                     for j in range(2):
                         step = signals[source, j] - zero * before[q, j]
                         before[q, j] = signals[source, j]
-                        # Of an integrator only what it grows by is kept: its sum is `integral`, behind the anti-windup.
+                        # Of an integrator only its growth is kept: `integral` is the sum, after anti-windup.
                         filtered[q, j] = step if pole == 1.0 else pole * filtered[q, j] + size * step
                 for i in range(2):
                     direct, growth = 0.0, 0.0
@@ -126,12 +128,12 @@ def fly(A, B, C, trim, motors, setpoint, gains, terms, limits, Ts, soft, angles,
                             else:
                                 added += terms[q, 1] * gains[k, 1 + q, i, j] * filtered[q, j]
                         direct += added
-                    # Moments are counted from the trim, which the flown integral holds.
+                    # Torques are relative to the trim, which the flown integral holds.
                     lowest, highest = -limits[1, i] - trim[i], limits[1, i] - trim[i]
                     tried = direct + integral[i] + growth
-                    growth *= kept(highest - tried if growth > 0 else tried - lowest, soft)
-                    if growth * (moment[i] + trim[i]) > 0:  # moment of the last period, which the motors were to make
-                        growth *= kept(room, soft)
+                    growth *= anti_windup_share(highest - tried if growth > 0 else tried - lowest, soft)
+                    if growth * (moment[i] + trim[i]) > 0:  # last period's torque, before the motors
+                        growth *= anti_windup_share(margin, soft)
                     grown = integral[i] + growth
                     integral[i] = min(max(grown, -limits[2, i] - trim[i]), limits[2, i] - trim[i])
                     moment[i] = min(max(direct + integral[i], lowest), highest)
@@ -139,11 +141,11 @@ def fly(A, B, C, trim, motors, setpoint, gains, terms, limits, Ts, soft, angles,
                     equivalent[i] = moment[i]
                 if n:
                     # The collective carries the weight at any tilt.
-                    lift = weight / min(max(np.cos(angle[0]) * np.cos(angle[1]), 0.5), 1.0) - weight
+                    extra = weight / min(max(np.cos(angle[0]) * np.cos(angle[1]), MIN_TILT_COSINE), 1.0) - weight
                     for m in range(n):
                         part[m] = mixer[m, 0] * (moment[0] + trim[0]) + mixer[m, 1] * (moment[1] + trim[1])
-                        rest[m] = level[m] + lift
-                    room = allocated(part, rest, commands) - 1.0
+                        rest[m] = level[m] + extra
+                    margin = allocate_commands(part, rest, commands) - 1.0
                     for i in range(2):
                         equivalent[i] = -decay * acting[i]
                         acting[i] = 0.0

@@ -1,4 +1,4 @@
-"""A doublet predicted from a log: the flown difference equation around the plant and the motors that the log gives."""
+"""Doublets predicted from a log: the flown difference equation around the plant and motors identified from it."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.motors import Motors, rotor_lag
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.spec import Manoeuvre
 from mimopilot.tuning.statespace import StateSpace
-from numpy.typing import NDArray
 
 Signal = NDArray[np.float64]
 
@@ -24,13 +25,13 @@ class DoubletModel:
     Attributes
     ----------
     plant : StateSpace
-        From moment to body rates.
+        From torque to body rates.
     trim : (2,) array
-        Moment that holds the vehicle level.
+        Torque (normalised) that holds the vehicle level.
     setpoint : (N,) array, rad
-        Of the axis that moves; the other's is zero.
+        Of the moving axis; the other's is zero.
     motors : Motors or None
-        Behind the moment; None: it is given whatever it is.
+        Motors that produce the torque; None: any torque is produced.
     """
 
     plant: StateSpace
@@ -38,30 +39,30 @@ class DoubletModel:
     setpoint: Signal
     motors: Motors | None = None
 
-    def fly(self, stack: GainStack, soft: float = 0.0) -> tuple[Signal, Signal]:
-        """Doublets on roll and on pitch under each of several gain sets, without noise.
+    def simulate(self, stack: GainStack, soft: float = 0.0) -> tuple[Signal, Signal]:
+        """Doublets on roll and on pitch with each of several gain sets, without noise.
 
         Parameters
         ----------
         stack : GainStack
         soft : float
-            Moment over which the anti-windup's switch is drawn out, so that angles depend on gains without a jump.
+            Torque over which anti-windup switches gradually: the angles are then continuous in the gains.
 
         Returns
         -------
-        angles, moments : (2, sets, N, 2) arrays, rad, dimensionless
-            First index: the axis that moves.
+        angles, moments : (2, sets, N, 2) arrays, rad, torque (normalised)
+            First index: the moving axis.
         """
-        from mimopilot.tuning.analysis.compiled_doublet import (  # takes longer to import than all of the rest
-            fly,
+        from mimopilot.tuning.analysis.compiled_doublet import (  # numba: slower to import than all other modules
             law_terms,
+            simulate_doublets,
         )
 
         gains, plant = stack.stacked(), self.plant
         angles, moments = (np.empty((2, len(gains), len(self.setpoint), 2)) for _ in range(2))
         matrices = (np.ascontiguousarray(matrix) for matrix in (plant.A, plant.B, plant.C))
         terms = law_terms(stack.filters)
-        fly(
+        simulate_doublets(
             *matrices,
             self.trim,
             self._motors,
@@ -78,7 +79,7 @@ class DoubletModel:
 
     @cached_property
     def _motors(self) -> tuple[Signal, Signal, Signal, float]:
-        """What the compiled doublet takes."""
+        """Motors as `simulate_doublets` takes them."""
         if self.motors is None:
             return np.empty((0, 2)), np.empty((2, 0)), np.empty(0), 0.0
         lag = rotor_lag(self.plant)
@@ -87,7 +88,7 @@ class DoubletModel:
 
 
 def doublet_model(measured: PlantEstimates, manoeuvre: Manoeuvre) -> DoubletModel:
-    """The manoeuvre around the plant that was identified from an experiment.
+    """The manoeuvre around the plant identified from an experiment.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def doublet_model(measured: PlantEstimates, manoeuvre: Manoeuvre) -> DoubletMode
     Raises
     ------
     TuningError
-        When no model is near the measured response.
+        When no model is close to the measured response.
     """
     experiment, plant = measured.experiment, measured.identified.model.plant
     half = round(manoeuvre.period_s / 2 / experiment.Ts)
@@ -106,13 +107,13 @@ def doublet_model(measured: PlantEstimates, manoeuvre: Manoeuvre) -> DoubletMode
     return DoubletModel(plant, np.median(u, axis=0), np.concatenate([height, -height]), experiment.motors)
 
 
-def effort(gains: Gains, model: DoubletModel) -> tuple[float, float]:
-    """Predicted RMS of both moments together over the roll and over the pitch doublet."""
-    roll, pitch = moment_rms(model.fly(GainStack.of(gains))[1])[:, 0]
+def doublet_effort(gains: Gains, model: DoubletModel) -> tuple[float, float]:
+    """Predicted RMS of both torques together over the roll and over the pitch doublet."""
+    roll, pitch = moment_rms(model.simulate(GainStack.of(gains))[1])[:, 0]
     return float(roll), float(pitch)
 
 
 def moment_rms(moments: Signal) -> Signal:
-    """RMS of both moments (..., N, 2) together over the N samples, (...)."""
+    """RMS of both torques (..., N, 2) together over the N samples, (...)."""
     power: Signal = np.sqrt(np.mean(np.sum(moments**2, axis=-1), axis=-1))
     return power

@@ -1,14 +1,14 @@
-"""Margins of a measured loop: gain, phase and delay of one axis, and those of all axes at once."""
+"""Margins of a measured loop: gain, phase and delay of one axis, and of all axes at once."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from mimopilot.tuning.analysis.closed_loop import CascadeLoop
 from numpy.typing import NDArray
 
-AXES = ("roll", "pitch")
+from mimopilot.tuning.analysis.closed_loop import CascadeLoop
+from mimopilot.tuning.parameters import ROLL_PITCH
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
@@ -26,14 +26,16 @@ def peak(S: Complex) -> float:
 
 
 def disk_margin(S: Complex) -> float:
-    """Largest radius of the disk about 1 in which complex factors on both channels may lie together: 1 over the peak of
-    S - I/2 (P. Seiler, A. Packard, P. Gahinet, "An introduction to disk margins", IEEE Control Systems 40, 2020).
+    """Radius of the largest disk about 1 of complex factors that both channels tolerate at once.
+
+    1 over the peak of S - I/2 (P. Seiler, A. Packard, P. Gahinet, "An introduction to disk margins", IEEE Control
+    Systems 40, 2020).
     """
     return 1 / peak(S - np.eye(2) / 2)
 
 
-def simultaneous(disk: float) -> tuple[float, float]:
-    """Gain (dB, up or down) and phase (deg) that a disk margin allows on all axes at once."""
+def simultaneous_margins(disk: float) -> tuple[float, float]:
+    """Changes of gain (dB, up or down) and of phase (deg) that a disk margin allows on all axes at once."""
     ratio = (2 + disk) / (2 - disk) if disk < 2 else np.inf
     return float(20 * np.log10(ratio)), float(2 * np.degrees(np.arctan(disk / 2)))
 
@@ -45,7 +47,7 @@ def axis_loops(S: Complex) -> Complex:
 
 
 def phase_margin(loop: Complex, omega: Signal) -> tuple[float, float]:
-    """Smallest phase margin (deg) and smallest delay margin (ms) of one loop; infinite where its gain is never 1.
+    """Smallest phase margin (deg) and smallest delay margin (ms) of one loop; infinite if its gain is never 1.
 
     Parameters
     ----------
@@ -63,7 +65,7 @@ def phase_margin(loop: Complex, omega: Signal) -> tuple[float, float]:
 
 
 def gain_margin(loop: Complex) -> float:
-    """Smallest factor, up or down, that makes one loop (K,) unstable, dB; infinite where its phase is never 180 deg."""
+    """Smallest factor, up or down, that makes one loop (K,) unstable, dB; infinite if its phase is never 180 deg."""
     at, place = _crossings(loop.imag)
     if not len(at):
         return np.inf
@@ -72,25 +74,25 @@ def gain_margin(loop: Complex) -> float:
     return float(np.min(np.abs(20 / np.log(10) * size[opposite]), initial=np.inf))
 
 
-def gain_margins(loops: Complex, above: float) -> dict[str, Any]:
-    """Gain margin of each axis as far as it is known.
+def gain_margins(loops: Complex, gain_above: float) -> dict[str, Any]:
+    """Gain margin of each axis, as far as the log shows it.
 
     Parameters
     ----------
     loops : (2, K) array
         In the band.
-    above : float
-        What the loop's gain may still reach above it: a margin beyond 1 / above cannot be vouched for.
+    gain_above : float
+        Upper bound of the loop's gain above the band: no margin larger than 1 / gain_above is claimed.
 
     Returns
     -------
     dict
-        ``gain_margin_db``: by axis, never negative. ``gain_margin``: by axis, what the number is: ``exact``, ``at
+        ``gain_margin_db``: by axis, never negative. ``gain_margin``: by axis, the kind of the number: ``exact``, ``at
         least`` or ``not known`` (the number is then 0).
     """
-    ceiling = -20 * float(np.log10(above)) if above > 0 else np.inf
+    ceiling = -20 * float(np.log10(gain_above)) if gain_above > 0 else np.inf
     margins, kinds = {}, {}
-    for axis, loop in zip(AXES, loops, strict=True):
+    for axis, loop in zip(ROLL_PITCH, loops, strict=True):
         found = gain_margin(loop)
         if found <= ceiling:
             margins[axis], kinds[axis] = found, "exact"
@@ -100,11 +102,12 @@ def gain_margins(loops: Complex, above: float) -> dict[str, Any]:
 
 
 def _crossings(values: Signal) -> tuple[NDArray[np.intp], Signal]:
-    """Where values pass zero: index of the sample before, and the share of the way to the next."""
+    """Zero crossings: index of the sample before, and the fraction of the step to the next."""
     at = np.flatnonzero(values[:-1] * values[1:] < 0)
     return at, values[at] / (values[at] - values[at + 1])
 
 
 def _between(values: Signal, at: NDArray[np.intp], place: Signal) -> Signal:
+    """Values at crossings, by linear interpolation."""
     between: Signal = values[at] + place * (values[at + 1] - values[at])
     return between

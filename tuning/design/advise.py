@@ -1,7 +1,7 @@
-"""Which reference model to ask of the rate loop, and which derivative filter: what decides the attitude response.
+"""Scan of reference models for the rate loop and of derivative filters, with one recommended.
 
-Each candidate is tuned on the log; what its closed loop will then do in a doublet follows from the measured
-frequency response by Parseval. Recommended is the gentlest of those that follow the attitude model nearly best.
+Each candidate is tuned on the log. The measured frequency response predicts its doublet by Parseval's theorem. Of the
+candidates that follow the attitude model nearly best, the one with the least torque is recommended.
 """
 
 from __future__ import annotations
@@ -11,9 +11,12 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from mimopilot.tuning.analysis.closed_loop import ACCURATE, cascade_loop, doublet_spectrum
+from numpy.typing import NDArray
+
+from mimopilot.tuning.analysis.closed_loop import cascade_loop, doublet_spectrum
 from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.refine_attitude import ACCURATE
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
 from mimopilot.tuning.experiment import Experiment, external_signal
@@ -23,19 +26,24 @@ from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import SecondOrder, second_order
 from mimopilot.tuning.spec import TuningSpec
-from numpy.typing import NDArray
 
+#: The grid, around the thesis' rate loop of 20 rad/s and damping 0.4: rad/s, damping, delay in samples.
 BANDWIDTHS = (15.0, 17.5, 20.0, 22.5, 25.0, 30.0, 40.0)
 DAMPINGS = (0.4, 0.55, 0.7, 1.0)
 DELAYS = (0, 2, 4)
-#: Cut-offs of the derivative filter, Hz, tried beside the flown one: above it D is nothing but gain for noise and
-#: structure, and a lower one is what makes a fast loop small where the log ends.
+#: Cut-offs of the derivative filter, Hz, tried beside the flown one. Above its cut-off D only amplifies noise and
+#: structural modes; a lower one also lowers a fast loop's gain above the band.
 CUTOFFS = (10.0, 5.0)
-#: Where the search for non-minimum-phase zeros starts: rad/s, damping, delay.
+#: Largest bandwidth over the slowest non-minimum-phase zero (S. Skogestad, I. Postlethwaite, Multivariable Feedback
+#: Control: limitations imposed by right half-plane zeros).
+ZERO_SHARE = 0.5
+#: Model from which the search for non-minimum-phase zeros starts: rad/s, damping, delay in samples.
 FLEXIBLE = (20.0, 0.7, 0)
-#: Spacing at which the response is read between the measured frequencies, rad/s.
+#: Frequency step of the predicted spectrum, rad/s.
 RESOLUTION = 0.05
-#: Following within this share of the best candidate counts as following as well.
+#: Largest relative error of the response at the frequencies of the prediction.
+PREDICTABLE = 3 * ACCURATE
+#: A candidate whose error is within this factor of the best one's counts as equally good.
 NEARLY_BEST = 1.1
 
 #: Rate-loop model and derivative cut-off, Hz.
@@ -44,7 +52,7 @@ Choice = tuple[tuple[float, float, int], float]
 
 @dataclass(frozen=True)
 class Doublet:
-    """The manoeuvre that candidates are judged by: amplitude (deg) and whole length (s)."""
+    """The manoeuvre that candidates are compared by: amplitude (deg) and whole length (s)."""
 
     amplitude_deg: float = 18.0
     period_s: float = 1.6
@@ -52,7 +60,7 @@ class Doublet:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One reference model and what came of it.
+    """One reference model and the result of tuning for it.
 
     Attributes
     ----------
@@ -61,17 +69,17 @@ class Candidate:
     cutoff_hz : float, Hz
         Of the derivative filter.
     gains : Gains or None
-        Tuned and certified; None when tuning refused, `reason` says why.
+        Tuned and certified; None when tuning was refused, see `reason`.
     verdict, reason : str
         Of the certificate.
     delta : tuple of 2 float
         The certificate's small-gain figure of the rate loop and twice its standard error.
     fit : float
-        Share of the moment that the rate controller explains, the smaller of both axes.
+        Share of the torque that the rate controller explains, the smaller of both axes.
     follow_deg, offaxis_deg : tuple of 2 float, deg
-        Predicted RMS of the roll and the pitch doublet: distance to the attitude model; the other axis.
+        Predicted RMS in the roll and the pitch doublet: error to the attitude model; angle of the other axis.
     effort : tuple of 2 float
-        Predicted RMS of the moments.
+        Predicted RMS of the torques (normalised).
     """
 
     inner: tuple[float, float, int]
@@ -88,14 +96,14 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Advice:
-    """What the scan found.
+    """Result of the scan.
 
     Attributes
     ----------
     candidates : tuple of Candidate
         In the order of the grid.
     recommended : Candidate
-        Certified, follows within 10 % of the best certified one, and of those needs the least moment.
+        Certified, error within 10 % of the best certified one, and of those the least torque.
     zero : float or None, rad/s
         Slowest non-minimum-phase zero of the plant (`tuning.estimation.zeros`); no candidate is faster than half of it.
     """
@@ -105,15 +113,15 @@ class Advice:
     zero: float | None
 
 
-def predict(
+def predict_doublet(
     gains: Gains, plant: PlantResponse, spec: TuningSpec, doublet: Doublet
 ) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
-    """Predicted RMS of following (deg), of the other axis (deg) and of the moments, roll then pitch doublet.
+    """Predicted RMS of the error (deg), the other axis (deg) and the torques, roll then pitch doublet.
 
-    The mean is over twice the doublet's length. Above the frequencies that the log knows nothing is counted, below
-    them the plant goes on as a rigid body.
+    The mean is over twice the doublet's length. Frequencies above those measured are left out; below them the plant is
+    a rigid body.
     """
-    known = plant.at(plant.known() & (plant.relative_error() < 3 * ACCURATE)).extended()
+    known = plant.at(plant.known() & (plant.relative_error() < PREDICTABLE)).extended()
     loop = cascade_loop(gains, known)
     omega = np.arange(RESOLUTION, known.omega[-1], RESOLUTION)
     signal = np.radians(doublet.amplitude_deg) * doublet_spectrum(omega, doublet.period_s)
@@ -145,9 +153,9 @@ def advise(
     experiment : Experiment
         One flight.
     spec : TuningSpec
-        Everything but the inner model, which is scanned; a derivative filter that it names is kept.
+        Everything but the inner model, which is scanned; a derivative filter given here is kept.
     doublet : Doublet, optional
-        What the candidates are judged by.
+        The manoeuvre that candidates are compared by.
     watch : callable, optional
         Wraps the iteration, for a progress bar.
 
@@ -158,7 +166,7 @@ def advise(
     Raises
     ------
     TuningError
-        When the log cannot be tuned from at all, no candidate is certified, or a non-minimum-phase zero forbids all.
+        When the log cannot be tuned from, no candidate is certified, or a non-minimum-phase zero is too slow for all.
     """
     doublet = doublet or Doublet()
     measured = PlantEstimates(experiment)
@@ -166,11 +174,11 @@ def advise(
     candidates: list[Candidate] = []
     cutoffs = _cutoffs(experiment, spec)
     zero = _slowest_zero(experiment, cutoffs[0])
-    bandwidths = [omega for omega in BANDWIDTHS if zero is None or omega <= zero / 2]
+    bandwidths = [omega for omega in BANDWIDTHS if zero is None or omega <= ZERO_SHARE * zero]
     if zero is not None and not bandwidths:
         raise TuningError(
             f"{experiment.source}: the plant has a non-minimum-phase zero at {zero:.1f} rad/s, too slow for every rate "
-            f"loop of the scan; ask `tune` for one below {zero / 2:.1f} rad/s"
+            f"loop of the scan; tune with --inner below {ZERO_SHARE * zero:.1f} rad/s"
         )
     spec = spec.model_copy(update={"doublet_s": doublet.period_s})
     for inner, cutoff in watch(list(product(product(bandwidths, DAMPINGS, DELAYS), cutoffs))):
@@ -182,11 +190,21 @@ def advise(
             candidates.append(Candidate(inner, cutoff, None, "refused", str(error)))
             continue
         verdict, reason = gains.verdict()
-        fit = min(gains.provenance.fit)
         figures = gains.certificate.figures if gains.certificate else {}
-        delta = (figures.get("delta", np.inf), figures.get("delta_error", np.inf))
+        follow_deg, offaxis_deg, effort = predict_doublet(gains, plant, spec, doublet)
         candidates.append(
-            Candidate(inner, cutoff, gains, verdict, reason, delta, fit, *predict(gains, plant, spec, doublet))
+            Candidate(
+                inner=inner,
+                cutoff_hz=cutoff,
+                gains=gains,
+                verdict=verdict,
+                reason=reason,
+                delta=(figures.get("delta", np.inf), figures.get("delta_error", np.inf)),
+                fit=min(gains.provenance.fit),
+                follow_deg=follow_deg,
+                offaxis_deg=offaxis_deg,
+                effort=effort,
+            )
         )
     good = [candidate for candidate in candidates if candidate.verdict == Verdict.CERTIFIED]
     if not good:
@@ -200,7 +218,7 @@ def advise(
 
 
 def _slowest_zero(experiment: Experiment, cutoff_hz: float) -> float | None:
-    """Slowest non-minimum-phase zero from moment to rate of the two axes, rad/s; None: there is none."""
+    """Slowest non-minimum-phase zero from torque to rate of the two axes, rad/s; None: there is none."""
     start, external = second_order(*FLEXIBLE, experiment.Ts), external_signal(experiment)[0]
     models = [
         flexible_model(

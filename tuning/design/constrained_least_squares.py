@@ -1,4 +1,4 @@
-"""Least squares within limits: how gains are refined."""
+"""Least squares with inequality constraints, by the augmented Lagrangian."""
 
 from __future__ import annotations
 
@@ -8,47 +8,55 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-#: A round ends where a step gains less than this share of the cost, or after so many points.
-TOLERANCE, POINTS = 1e-6, 60
-#: Squares of what a limit is missed by count so often, beside a cost that begins at 1; so much more often from a round
-#: on that does not bring what is missed down to a share.
-STIFFNESS, STIFFER, SHARE = 100.0, 4.0, 0.3
-#: Rounds, at most; how closely the limits are met where they end; more than the last is too much, all relative.
-ROUNDS, MET, MISSED = 12, 1e-4, 2e-3
+# All numbers are relative, and chosen by trial on the simulated airframes.
+#: A round ends when a step lowers the cost by less than this share.
+TOLERANCE = 1e-6
+#: Most evaluations of the residuals in a round.
+MAX_EVALUATIONS = 60
+#: Penalty weight on squared constraint violation, where the cost begins at 1.
+PENALTY = 100.0
+#: The weight is multiplied by this after a round that leaves more than `ENOUGH` of the violation.
+PENALTY_GROWTH = 4.0
+ENOUGH = 0.3
+MAX_ROUNDS = 12
+#: The iteration ends when no constraint is violated by more than this.
+CONSTRAINT_TOLERANCE = 1e-4
+#: A result that violates a constraint by more than this is infeasible.
+INFEASIBLE = 2e-3
 
 Signal = NDArray[np.float64]
 Examine = Callable[[Signal], tuple[Signal, Signal]]
 
 
-def descend(examine: Examine, first: Signal, step: float) -> tuple[Signal, float]:
-    """The point with the least sum of squared residuals within the limits, near a first one.
+def constrained_least_squares(examine: Examine, first: Signal, step: float) -> tuple[Signal, float]:
+    """Point near a first one with the least sum of squared residuals within the constraints.
 
-    Limits are residuals, too, as far as they are missed, each shifted by its price from round to round until it is met
-    (the augmented Lagrangian of Hestenes, Powell and Rockafellar); within a round scipy's trust region goes by Gauss
-    and Newton's curvature.
+    The augmented Lagrangian of Hestenes, Powell and Rockafellar: a violated constraint is one more residual, shifted by
+    its multiplier from round to round until the constraint holds. Within a round scipy's trust region takes
+    Gauss-Newton steps.
 
     Parameters
     ----------
     examine : callable
-        Points (B, n) -> residuals (B, R) and what is left of every limit (B, m): negative is too much.
+        Points (B, n) -> residuals (B, R) and the remaining margin of each constraint (B, m): negative is a violation.
     first : (n,) array
-        Where to begin; every number of about the size 1. It need not keep the limits.
+        Where to begin, every number of about the size 1. It may violate the constraints.
     step : float
-        Of the differences.
+        Step of the finite differences.
 
     Returns
     -------
     point : (n,) array
     cost : float
-        Its sum of squares; infinite where a limit is missed.
+        Its sum of squares; infinite when a constraint is violated.
     """
     residuals, left = examine(first[None])
-    unit, prices, stiffness, before = float(np.linalg.norm(residuals)), np.zeros(left.shape[1]), STIFFNESS, np.inf
+    unit, multipliers, penalty, before = float(np.linalg.norm(residuals)), np.zeros(left.shape[1]), PENALTY, np.inf
 
     def values(points: Signal) -> Signal:
         residuals, left = examine(points)
-        missed = np.sqrt(stiffness) * np.maximum(prices / stiffness - left, 0.0)
-        every: Signal = np.nan_to_num(np.hstack([residuals / unit, missed]), nan=1e3, posinf=1e3, neginf=-1e3)
+        violated = np.sqrt(penalty) * np.maximum(multipliers / penalty - left, 0.0)
+        every: Signal = np.nan_to_num(np.hstack([residuals / unit, violated]), nan=1e3, posinf=1e3, neginf=-1e3)
         return every
 
     def slopes(point: Signal) -> Signal:
@@ -57,7 +65,7 @@ def descend(examine: Examine, first: Signal, step: float) -> tuple[Signal, float
         return jacobian
 
     point = first
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         found = least_squares(
             lambda point: values(point[None])[0],
             point,
@@ -66,13 +74,13 @@ def descend(examine: Examine, first: Signal, step: float) -> tuple[Signal, float
             ftol=TOLERANCE,
             xtol=TOLERANCE,
             gtol=None,
-            max_nfev=POINTS,
+            max_nfev=MAX_EVALUATIONS,
         )
         point = found.x
         residuals, left = examine(point[None])
-        unmet = float(np.abs(np.minimum(left[0], prices / stiffness)).max())
-        if unmet < MET:
+        violation = float(np.abs(np.minimum(left[0], multipliers / penalty)).max())
+        if violation < CONSTRAINT_TOLERANCE:
             break
-        prices = np.maximum(prices - stiffness * left[0], 0.0)
-        stiffness, before = stiffness * (STIFFER if unmet > SHARE * before else 1.0), unmet
-    return point, float(np.sum(residuals**2)) if left.min() > -MISSED else np.inf
+        multipliers = np.maximum(multipliers - penalty * left[0], 0.0)
+        penalty, before = penalty * (PENALTY_GROWTH if violation > ENOUGH * before else 1.0), violation
+    return point, float(np.sum(residuals**2)) if left.min() > -INFEASIBLE else np.inf

@@ -1,4 +1,4 @@
-"""Tuning repeated experiments: how gains, their predicted deviations and certificates are distributed."""
+"""Tuning of repeated experiments: distributions of the gains, their predicted deviations and their verdicts."""
 
 from __future__ import annotations
 
@@ -11,28 +11,31 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from mimopilot.tuning.design.cascade import tune
-from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.logs.columns import Columns
-from mimopilot.tuning.logs.formats import SUFFIXES
-from mimopilot.tuning.logs.reader import read_log
-from mimopilot.tuning.parameters import MATRICES
-from mimopilot.tuning.spec import TuningSpec
 from numpy.typing import NDArray
 
 from mimopilot.common.charts import STYLES, svg
 from mimopilot.common.console import json_text, progress_console
 from mimopilot.common.files import inside, write_atomically
 from mimopilot.common.parallel import processes, run_all
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.logs.columns import Columns
+from mimopilot.tuning.logs.formats import SUFFIXES
+from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.parameters import MATRICES, Shape, rows
+from mimopilot.tuning.spec import TuningSpec
 
 QUANTILES = (0.05, 0.5, 0.95)
+#: Elements of a matrix, row by row: output <- error.
 PAIRS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
+UNITS = {row.key: row.unit or "-" for row in rows(Shape.MATRIX)}
+(CURVE, _), (BARS, _) = STYLES[:2]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of one log: gains, or the reason why there are none."""
+class LogOutcome:
+    """Result of one log: gains, or the reason why it was refused."""
 
     log: str
     gains: Gains | None
@@ -40,19 +43,19 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Element:
-    """The distribution of one gain over all tuned logs.
+class GainDistribution:
+    """Distribution of one gain over all tuned logs.
 
     Attributes
     ----------
     matrix, pair : str
-        Which.
+        Which gain.
     mean, deviation : float
         Observed.
     quantiles : tuple of 3 float
         5, 50 and 95 %.
     predicted : float
-        Mean of the standard deviations that each log predicts.
+        Mean of the standard deviations predicted from each log.
     """
 
     matrix: str
@@ -64,10 +67,10 @@ class Element:
 
 
 @dataclass(frozen=True, eq=False)
-class Repeated:
-    """All logs of a campaign, in order."""
+class RepeatedTuning:
+    """Results of all logs of a campaign, in order."""
 
-    outcomes: tuple[Outcome, ...]
+    outcomes: tuple[LogOutcome, ...]
 
     @property
     def tuned(self) -> list[Gains]:
@@ -81,7 +84,7 @@ class Repeated:
 
     @property
     def verdicts(self) -> dict[str, int]:
-        """Verdict -> how many sets have it, the most frequent first."""
+        """Verdict -> number of sets, the most frequent first."""
         return dict(Counter(gains.verdict()[0] for gains in self.tuned).most_common())
 
     def values(self, matrix: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -91,8 +94,8 @@ class Repeated:
         predicted = [np.ravel(one.provenance.standard_deviation.get(matrix, nothing)) for one in self.tuned]
         return gains, np.array(predicted, np.float64)
 
-    def elements(self) -> list[Element]:
-        """The distribution of every gain that was estimated."""
+    def elements(self) -> list[GainDistribution]:
+        """Distribution of every gain that was estimated."""
         found = []
         for matrix in MATRICES:
             gains, predicted = self.values(matrix)
@@ -104,7 +107,16 @@ class Repeated:
                     float(gains[:, i].mean()),
                     float(gains[:, i].std(ddof=1)) if len(gains) > 1 else np.nan,
                 )
-                found.append(Element(matrix, pair, mean, deviation, (low, middle, high), float(predicted[:, i].mean())))
+                found.append(
+                    GainDistribution(
+                        matrix=matrix,
+                        pair=pair,
+                        mean=mean,
+                        deviation=deviation,
+                        quantiles=(low, middle, high),
+                        predicted=float(predicted[:, i].mean()),
+                    )
+                )
         return found
 
     def as_json(self) -> dict[str, Any]:
@@ -119,29 +131,29 @@ class Repeated:
 
 
 def find_logs(paths: Sequence[Path]) -> list[Path]:
-    """Logs as they are named, and those of folders by name.
+    """The given logs, and those of the given folders in order of their names.
 
     Raises
     ------
     TuningError
-        When a folder holds none, or two have the same name.
+        When a folder holds no log, or two logs have the same name.
     """
     found: list[Path] = []
     for path in paths:
         inside = sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
         if not inside:
-            raise TuningError(f"{path}: no logs are in this folder; expected files ending in {', '.join(SUFFIXES)}")
+            raise TuningError(f"{path}: no logs in this folder; expected files ending in {', '.join(SUFFIXES)}")
         found += inside
     doubles = [name for name, count in Counter(path.stem for path in found).items() if count > 1]
     if doubles:
-        raise TuningError(f"two logs are called {doubles[0]}; the gains of one would take the place of the other's")
+        raise TuningError(f"two logs are called {doubles[0]}: their gains would share one file; rename one")
     return found
 
 
 def tune_all(
     logs: Sequence[Path], spec: TuningSpec, out: Path, workers: int, columns: Columns | None = None
-) -> Repeated:
-    """Tune each log by itself, and write each gain set, the figure and the summary.
+) -> RepeatedTuning:
+    """Tune each log by itself; write each gain set, a figure and a summary.
 
     Parameters
     ----------
@@ -152,9 +164,9 @@ def tune_all(
     out : Path
         Folder: `gains/`, `gains.svg` and `summary.json` are written.
     workers : int
-        Processes; nothing depends on their number.
+        Processes; results do not depend on their number.
     columns : Columns, optional
-        Of logs that are tables.
+        Columns of logs that are tables.
 
     Raises
     ------
@@ -165,18 +177,18 @@ def tune_all(
 
     summary, figure = inside(out, "summary.json"), inside(out, "gains.svg")
     inside(out, "gains")
-    outcomes: dict[Path, Outcome] = {}
+    outcomes: dict[Path, LogOutcome] = {}
     with processes(workers) as executor, Progress(console=progress_console(), transient=True) as bar:
         task = bar.add_task("tuning", total=len(logs))
 
-        def keep(log: Path, outcome: Outcome) -> None:
+        def keep(log: Path, outcome: LogOutcome) -> None:
             outcomes[log] = outcome
             bar.advance(task)
             if outcome.gains is not None:
                 outcome.gains.save(inside(out, f"gains/{log.stem}.gains.toml"))
 
         run_all(executor, 2 * workers, partial(_tune, spec, columns), logs, keep)
-    found = Repeated(tuple(outcomes[log] for log in logs))
+    found = RepeatedTuning(tuple(outcomes[log] for log in logs))
     if not found.tuned:
         raise TuningError(f"all {len(logs)} logs were refused, the first: {found.outcomes[0].refusal}")
     write_atomically(summary, json_text(found.as_json()))
@@ -184,15 +196,15 @@ def tune_all(
     return found
 
 
-def _tune(spec: TuningSpec, columns: Columns | None, log: Path) -> Outcome:
+def _tune(spec: TuningSpec, columns: Columns | None, log: Path) -> LogOutcome:
     try:
-        return Outcome(log.name, tune(read_log(log, columns), spec))
+        return LogOutcome(log.name, tune(read_log(log, columns), spec))
     except TuningError as error:
-        return Outcome(log.name, None, str(error))
+        return LogOutcome(log.name, None, str(error))
 
 
-def gains_figure(found: Repeated) -> Figure:
-    """Histogram of every gain, and the normal curve of the mean predicted deviation about the mean."""
+def gains_figure(found: RepeatedTuning) -> Figure:
+    """Histogram of every gain, with the normal distribution of its mean and mean predicted deviation."""
     matrices = list(dict.fromkeys(element.matrix for element in found.elements()))
     figure = Figure(figsize=(10, 0.8 + 2.0 * len(matrices)), layout="constrained")
     panels: Any = figure.subplots(len(matrices), 4, squeeze=False)
@@ -214,7 +226,3 @@ def gains_figure(found: Repeated) -> Figure:
     panels[0, 0].legend(fontsize=7)
     figure.suptitle(f"Gains from {len(found.tuned)} experiments", x=0.02, ha="left")
     return figure
-
-
-(CURVE, _), (BARS, _) = STYLES[:2]
-UNITS = {"Kp_o": "1/s", "Kp_i": "s", "Ki_i": "-", "Kd_i": "s^2", "Kff_i": "s"}

@@ -1,8 +1,8 @@
-"""Integral gains that a plant can bear: positive through it in every direction.
+"""Integral gains constrained to be positive through the plant, in every direction.
 
-Noise, gusts and short logs tell little of the integral gains, and VRFT then finds negative ones, which run away slowly.
-Where that happens the gains are moved to the nearest ones, in the metric of their own covariance, whose integral action
-through the measured plant is positive; the other gains follow as their correlation with the integral ones asks.
+Short logs, noise and gusts leave the integral gains uncertain. VRFT may then find negative ones, and the loop diverges
+slowly. They are replaced by the nearest gains, in the metric of their covariance, whose integral action through the
+measured plant is positive. The other gains change by their correlation with the integral ones.
 """
 
 from __future__ import annotations
@@ -11,18 +11,19 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.estimation.instrumental_variables import Stretches
-from mimopilot.tuning.estimation.vrft import LoopEstimate
-from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.optimize import nnls
 
-#: The least integral action over the least proportional one, 1/s: an offset is gone within some ten seconds.
-LEAST = 0.1
-#: Cutting planes at most, and how near to the limit is near enough.
-PLANES, CLOSE = 100, 1e-6
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.estimation.instrumental_variables import Stretches
+from mimopilot.tuning.estimation.vrft import LoopEstimate
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody
+
+#: Smallest integral action over the smallest proportional one, 1/s: an offset decays within about ten seconds.
+MIN_INTEGRAL_RATIO = 0.1
+#: Most cutting planes, and the relative tolerance of the limit.
+MAX_PLANES, TOLERANCE = 100, 1e-6
 
 Matrix = NDArray[np.float64]
 
@@ -35,9 +36,9 @@ def with_positive_integral(
     Parameters
     ----------
     loops : sequence of LoopEstimate
-        One for both axes, or one for each.
+        One for both axes, or one an axis.
     stretches : list of (axes, segments)
-        The axes of each.
+        The axes of each estimate.
     body : RigidBody
         Of the same experiment.
 
@@ -45,7 +46,7 @@ def with_positive_integral(
     -------
     loops : list of LoopEstimate
     warnings : list of str
-        What was moved; empty when nothing was.
+        One text for each estimate that was changed.
 
     Raises
     ------
@@ -55,19 +56,19 @@ def with_positive_integral(
     found, warnings = [], []
     for (axes, _), loop in zip(stretches, loops, strict=True):
         B = body.B[axes, axes]
-        floor = LEAST * _least(B @ loop.gain("P"))
+        floor = MIN_INTEGRAL_RATIO * _least(B @ loop.gain("P"))
         if floor <= 0:
             raise TuningError(
-                "the proportional gains that VRFT finds are not positive through the measured plant: the log is too "
-                "short or too noisy for this rate loop; record longer, or excite more strongly"
+                "the proportional gains from VRFT are not positive through the measured plant: the log is too short or "
+                "too noisy for this rate loop; record longer, or excite more strongly"
             )
         if "I" in loop.gains and _least(B @ loop.gains["I"]) < floor:
             before = loop.gains["I"]
-            loop = _moved(loop, _nearest(loop, B, floor))
+            loop = _with_integral(loop, _nearest(loop, B, floor))
             old, new = (", ".join(f"{v:.3g}" for v in matrix.ravel()) for matrix in (before, loop.gains["I"]))
             warnings.append(
-                f"the log asks for integral gains that run away ({old}): the nearest that do not are taken ({new}); "
-                "record longer or excite lower frequencies to know them"
+                f"the integral gains from this log diverge ({old}): replaced by the nearest that do not ({new}); "
+                "record longer or excite lower frequencies to measure them"
             )
         found.append(loop)
     return found, warnings
@@ -79,24 +80,25 @@ def _least(action: Matrix) -> float:
 
 
 def _columns(loop: LoopEstimate) -> slice:
-    """Where the integral gains of a row are among its coefficients."""
+    """Columns of the integral gains among the coefficients."""
     n, place = len(loop.gains["I"][0]), list(loop.gains).index("I")
     return slice(n * place, n * (place + 1))
 
 
 def _nearest(loop: LoopEstimate, B: Matrix, floor: float) -> Matrix:
-    """The integral gains, nearest to those estimated, whose action is at least `floor` in every direction.
+    """The integral gains nearest to those estimated whose action is at least `floor` in every direction.
 
-    Cutting planes: the direction v in which the action is least gives one, v' B Ki v >= floor; the nearest point within
-    all of them is a least distance problem (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems, chapter 23).
+    By cutting planes: the direction v with the smallest action gives the plane v' B Ki v >= floor. The nearest point
+    within all planes is a least distance problem (C. L. Lawson, R. J. Hanson, Solving Least Squares Problems,
+    chapter 23).
     """
     Ki, columns = loop.gains["I"], _columns(loop)
     blocks = [np.linalg.cholesky(C[columns, columns]) for C in loop.solution.covariance]
     root = block_diag(*blocks)  # Ki = estimate + root x has the metric of x
     found, planes, limits = Ki, np.empty((0, Ki.size)), np.empty(0)
-    for _ in range(PLANES):
+    for _ in range(MAX_PLANES):
         values, vectors = np.linalg.eigh((B @ found + found.T @ B.T) / 2)
-        if values[0] >= floor * (1 - CLOSE):
+        if values[0] >= floor * (1 - TOLERANCE):
             break
         plane = np.outer(B.T @ vectors[:, 0], vectors[:, 0]).ravel()
         planes, limits = np.vstack([planes, plane @ root]), np.append(limits, floor - plane @ Ki.ravel())
@@ -108,8 +110,8 @@ def _nearest(loop: LoopEstimate, B: Matrix, floor: float) -> Matrix:
     return found
 
 
-def _moved(loop: LoopEstimate, Ki: Matrix) -> LoopEstimate:
-    """The estimate with these integral gains, and the others as they are most likely then."""
+def _with_integral(loop: LoopEstimate, Ki: Matrix) -> LoopEstimate:
+    """The estimate with these integral gains, and the most likely values of the others given them."""
     columns, coefficients = _columns(loop), loop.solution.B.copy()
     for row, C, wanted in zip(coefficients, loop.solution.covariance, Ki, strict=True):
         row += C[:, columns] @ np.linalg.pinv(C[columns, columns], hermitian=True) @ (wanted - row[columns])

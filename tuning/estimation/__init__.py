@@ -1,1 +1,1 @@
-"""Estimators of gains: VRFT, its SISO form, and the methods that it is compared with."""
+"""Estimators of gains: VRFT, its SISO form, and the methods it is compared with."""

@@ -1,6 +1,6 @@
-"""What VRFT is compared with: Correlation-based Tuning and Iterative Feedback Tuning of a PI, each by experiments.
+"""Methods that VRFT is compared with: Correlation-based Tuning and Iterative Feedback Tuning of a PI.
 
-Both ask for experiments through one callable and count them: see `Experiment`.
+Both call for experiments through one function, see `RunExperiment`, and count them.
 """
 
 from __future__ import annotations
@@ -10,40 +10,42 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import lstsq
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import cross_correlation
 from mimopilot.tuning.law import Filters, regressors
 from mimopilot.tuning.loop_controller import LoopController
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Signal
-from scipy.linalg import lstsq
 
+#: Structure of both controllers.
 TERMS = "PI"
-#: Parts of the Gauss-Newton step of IFT that are tried, each by an experiment.
+#: Step lengths that IFT tries in each iteration, each by experiments; 1: the whole Gauss-Newton step.
 STEPS = (1.0, 0.5, 0.25)
 
 
-class Experiment(Protocol):
-    """One experiment on the plant, from rest."""
+class RunExperiment(Protocol):
+    """Runs one experiment on the plant, from rest."""
 
     def __call__(self, controller: LoopController | None, r: Signal, u_bar: Signal) -> tuple[Signal, Signal]:
         """Plant input u and measured output y, (N, n_u) and (N, n_y).
 
-        `controller` is in the loop (None: open loop), r (N, n_y) its set-point, u_bar (N, n_u) added at the
+        `controller` closes the loop (None: open loop), r (N, n_y) is its setpoint, u_bar (N, n_u) is added at the
         plant's input.
         """
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What a comparator found, and what it took.
+    """Result of a method that VRFT is compared with, and its number of experiments.
 
     Attributes
     ----------
     controller : LoopController
         The tuned PI.
     experiments : int
-        Experiments asked for.
+        Experiments that were run.
     costs : tuple of float
         IFT: measured cost (mean squared norm of y - M r) before the first iteration and after each; CbT: none.
     """
@@ -54,7 +56,7 @@ class Comparison:
 
 
 def correlation_based_tuning(
-    experiment: Experiment,
+    experiment: RunExperiment,
     models: Sequence[ReferenceModel],
     excitation: Signal,
     *,
@@ -65,15 +67,15 @@ def correlation_based_tuning(
     """Non-iterative Correlation-based Tuning of a PI for a stable plant.
 
     One input at a time is driven by the white signal w in open loop. With y^(i) = G e_i w + v the error
-    eps_j = (1 - m)(m w e_j - (1 - m) sum over i of C_ij y^(i)) is linear in column j of the controller; it is made
-    as little correlated with w as possible: least squares on the correlations at lags 0..l. (K. van Heusden,
+    eps_j = (1 - m)(m w e_j - (1 - m) sum over i of C_ij y^(i)) is linear in column j of the controller. Its
+    correlation with w is minimised: least squares on the correlations at lags 0..l. (K. van Heusden,
     A. Karimi, D. Bonvin, "Data-driven model reference control with asymptotically guaranteed stability",
     Int. J. Adaptive Control and Signal Processing 25 (2011), eq. (10), their weight 1 - M; one model for
     all outputs, so that it commutes with the plant.)
 
     Parameters
     ----------
-    experiment : Experiment
+    experiment : RunExperiment
     models : sequence of n_y ReferenceModel
         All equal.
     excitation : (N,) array
@@ -81,7 +83,7 @@ def correlation_based_tuning(
     inputs : int
         n_u.
     repetitions : int
-        Experiments an input; their mean has less noise.
+        Experiments for each input; their mean has less noise.
     lags : int, samples
 
     Returns
@@ -98,7 +100,7 @@ def correlation_based_tuning(
     if any(other != model for other in models):
         raise TuningError("Correlation-based Tuning: got different reference models; expected one for all outputs")
     if 4 * lags > N:
-        raise TuningError(f"too short: got {N} samples for {lags} lags, expected at least {4 * lags}")
+        raise TuningError(f"excitation: got {N} samples for {lags} lags, expected at least {4 * lags}")
     rest = np.zeros((N, len(models)))
     outputs = []
     for i in range(inputs):
@@ -111,10 +113,10 @@ def correlation_based_tuning(
 
     w = excitation[:, None]
     shaped = [sensitivity(sensitivity(y)) for y in outputs]
-    # Regressors of a controller's column: P part of each input, then I part.
+    # Regressors of a controller's column: P terms of all inputs, then I terms.
     filters = Filters(model.Ts)
-    parts = [regressors(term, y, y, y, filters) for term in "PI" for y in shaped]
-    # cross_correlation gives sums of w(k + tau) x(k): the answer to the past of w is at -tau.
+    parts = [regressors(term, y, y, y, filters) for term in TERMS for y in shaped]
+    # cross_correlation gives sums of w(k + tau) x(k): the response to the past of w is at -tau.
     S = np.stack([cross_correlation(w, part, lags)[lags::-1, 0] for part in parts], axis=-1)
     target = cross_correlation(w, sensitivity(model.response(w)), lags)[lags::-1, 0, 0]
     P, integral = np.zeros((inputs, len(models))), np.zeros((inputs, len(models)))
@@ -127,7 +129,7 @@ def correlation_based_tuning(
 
 
 def iterative_feedback_tuning(
-    experiment: Experiment,
+    experiment: RunExperiment,
     start: LoopController,
     models: Sequence[ReferenceModel],
     reference: Signal,
@@ -137,30 +139,29 @@ def iterative_feedback_tuning(
     repetitions: int = 7,
     most: int = 500,
 ) -> Comparison:
-    """Iterative Feedback Tuning of a PI: Gauss-Newton steps on gradients measured on the loop itself.
+    """Iterative Feedback Tuning of a PI: Gauss-Newton steps on gradients measured in the loop.
 
-    The cost is the mean squared norm of y - M r. Its gradient needs dy/dtheta = S G (dC/dtheta)(r - y): the
-    loop's own answer, with r = 0, to the signal (dC/dtheta)(r - y) recorded in the normal experiment and
-    injected at the plant's input; one gradient experiment a gain, repeated against noise, and scaled to
-    `amplitude`, which the loop's linearity allows. (H. Hjalmarsson, "Efficient tuning of linear
-    multivariable controllers using iterative feedback tuning", Int. J. Adaptive Control and Signal
-    Processing 13 (1999).) Of the step and its
-    parts `STEPS` the one with the least measured cost is taken.
+    The cost is the mean squared norm of y - M r. Its gradient needs dy/dtheta = S G (dC/dtheta)(r - y): the loop's
+    response, with r = 0, to the signal (dC/dtheta)(r - y) injected at the plant's input. That signal is recorded in
+    the normal experiment and scaled to `amplitude`, since the loop is linear. Each gain has its own gradient
+    experiment, repeated to reduce noise. (H. Hjalmarsson, "Efficient tuning of linear multivariable controllers using
+    iterative feedback tuning", Int. J. Adaptive Control and Signal Processing 13 (1999).) Of the step lengths `STEPS`
+    the one with the least measured cost is used.
 
     Parameters
     ----------
-    experiment : Experiment
+    experiment : RunExperiment
     start : LoopController
         PI of a stable loop.
     models : sequence of n_y ReferenceModel
     reference : (N, n_y) array
-        Set-point of the normal experiments.
+        Setpoint of the normal experiments.
     amplitude : float
-        Peak of the injected signal of the gradient experiments, in the unit of u.
+        Peak of the signal injected in the gradient experiments, in the unit of u.
     iterations, repetitions : int
-        Gauss-Newton steps, and experiments of each kind in one.
+        Gauss-Newton steps, and experiments of each kind in a step.
     most : int
-        Experiments that may be asked for at most.
+        Largest number of experiments.
 
     Returns
     -------
@@ -177,7 +178,9 @@ def iterative_feedback_tuning(
     wanted = np.column_stack([model.response(reference[:, j]) for j, model in enumerate(models)])
     each = repetitions * (start.matrix.size + len(STEPS))
     if most < each + repetitions:
-        raise TuningError(f"Iterative Feedback Tuning: got at most {most} experiments, one iteration may take {each}")
+        raise TuningError(
+            f"Iterative Feedback Tuning: got at most {most} experiments, expected {each + repetitions} or more"
+        )
     count = 0
 
     def averaged(controller: LoopController, r: Signal, u_bar: Signal) -> Signal:
@@ -197,7 +200,7 @@ def iterative_feedback_tuning(
         if count + each > most:
             break
         e = reference - y
-        shapes = regressors("PI", e, e, e, controller.filters)
+        shapes = regressors(TERMS, e, e, e, controller.filters)
         gradient = []
         for i in range(still_u.shape[1]):
             for shape in shapes.T:

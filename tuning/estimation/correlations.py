@@ -1,4 +1,4 @@
-"""Cross-correlations at many lags by FFT: what the instruments of VRFT reduce to."""
+"""Cross-correlations at many lags by FFT: all that VRFT needs of its instruments."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 
-#: Smallest transform, samples: of this order the blocks stay in the processor's cache.
+#: Smallest transform, samples: blocks of this order fit into the processor's cache.
 BLOCK = 4096
 
 
 def cross_correlation(w: NDArray[np.float64], x: NDArray[np.float64], lags: int) -> NDArray[np.float64]:
     """Sums over k of w(k + tau) x(k)' for tau = -lags..lags; samples beyond the ends count as zero.
 
-    These are S and Q of (3.28)-(3.31) for the instrument zeta(k) = [w(k-l); ...; w(k+l)], without ever
-    forming zeta. Block after block of x meets its stretch of w, longer by the lags on both sides; the products of
-    their transforms add up, so that time is linear in N and memory does not grow with it.
+    These are S and Q of (3.28)-(3.31) for the instrument zeta(k) = [w(k-l); ...; w(k+l)], without forming zeta. Each
+    block of x is correlated with its stretch of w, which is longer by the lags on both sides. The products of their
+    transforms are summed, so time is linear in N and memory is constant.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""What of an experiment is free of the loop's noise, and so can serve as instrument."""
+"""Instruments: signals of an experiment that are independent of the loop's noise."""
 
 from __future__ import annotations
 
@@ -7,17 +7,20 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.experiment import Experiment, external_signal
-from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
-from mimopilot.tuning.plant.local_polynomial import local_response
-from mimopilot.tuning.plant.rates_model import pbsid_by_response
 from numpy.typing import NDArray
 from scipy.signal import correlate
 
-AXES = ("roll", "pitch")
-#: Two flights count as one experiment flown twice when their excitations agree to this correlation.
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.parameters import ROLL_PITCH
+from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
+from mimopilot.tuning.plant.local_polynomial import local_response
+from mimopilot.tuning.plant.rates_model import pbsid_by_response
+
+#: Smallest correlation of the excitations of two flights of the same experiment.
 SAME_EXCITATION = 0.99
+#: Largest relative difference of the periods of two logs: their rows are paired.
+SAME_PERIOD = 1e-6
 
 Signal = NDArray[np.float64]
 Stretches = list[tuple[slice, list[tuple[int, int]]]]
@@ -25,18 +28,18 @@ Stretches = list[tuple[slice, list[tuple[int, int]]]]
 
 @dataclass(frozen=True, eq=False)
 class Instruments:
-    """What VRFT's instruments are made of.
+    """Signals that VRFT's instruments are made of.
 
     Attributes
     ----------
     external : (N, 2) array
-        External signal; noise is what it does not explain.
+        External signal; what it does not explain is noise.
     lagged : (N, 2) array
         Signal whose lags are the instruments: `external`, or u.
     name : str
-        Of what is used, for provenance.
+        For the provenance.
     y_i, y_o : (N, 2) arrays or None, rad/s, rad
-        Outputs with other noise, whose regressors replace the lags; None: lags are used.
+        Outputs with independent noise, whose regressors replace the lags; None: lags are used.
     """
 
     external: Signal
@@ -53,22 +56,22 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
     ----------
     experiment : Experiment
     kind : str
-        ``external``: lags of the external signal. ``u``: lags of u, the thesis' choice; in closed loop it carries
-        fed-back noise. ``model``: the outputs that a model identified by PBSID from the external signal to the outputs
-        gives. ``repeated``: the outputs of a second flight of the same experiment.
+        ``external``: lags of the external signal. ``u``: lags of u, the thesis' choice; in closed loop it contains
+        fed-back noise. ``model``: outputs simulated by a PBSID model from the external signal to the outputs.
+        ``repeated``: outputs of a second flight of the same experiment.
     repeat : Experiment, optional
-        The second flight, row for row the same excitation; see `align`.
+        The second flight, with the same excitation in each row; see `align`.
 
     Raises
     ------
     TuningError
-        When there is no external signal, the model is not stable, or the second flight is missing or not wanted.
+        When there is no external signal, the model is not stable, or the second flight is missing or unexpected.
     """
     external, name = external_signal(experiment)
     if (kind == "repeated") != (repeat is not None):
         raise TuningError(
-            f"instrument {kind!r} {'with' if repeat else 'without'} a second log: a second flight of the same "
-            "experiment goes with instrument 'repeated', and only with it"
+            f"instrument {kind!r} {'with' if repeat else 'without'} a second log: give a second flight of the same "
+            "experiment with instrument 'repeated', and only with it"
         )
     if repeat is not None:
         return Instruments(external, external, f"second experiment {repeat.source}", repeat.y_i, repeat.y_o)
@@ -76,11 +79,12 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
         y = np.hstack([experiment.y_i, experiment.y_o])
         found = local_response(external, y, experiment.Ts, experiment.segments)
         spread, size = (np.linalg.norm(part, axis=(1, 2)) for part in (found.deviation(), found.response))
-        well = spread < size  # what is worse tells nothing of a model
+        well = spread < size  # responses with larger errors do not help to fit a model
         if np.count_nonzero(well) < MIN_FREQUENCIES:
             raise TuningError(
                 f"{experiment.source}: not excited: the outputs' response is known at {np.count_nonzero(well)} "
-                "frequencies; inject a stronger or longer torque, or leave --instrument model out"
+                f"frequencies, {MIN_FREQUENCIES} are needed; inject a stronger or longer torque, or leave "
+                "--instrument model out"
             )
         model, _ = pbsid_by_response(
             external,
@@ -90,7 +94,7 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
             found.response[well],
             found.deviation()[well],
             segments=experiment.segments,
-            least_fit=-np.inf,  # an instrument need only resemble the outputs; its strength is judged later
+            least_fit=-np.inf,  # an instrument only needs to resemble the outputs; its strength is checked later
         )
         simulated = np.zeros_like(y)
         for start, stop in experiment.segments:
@@ -103,7 +107,7 @@ def instruments(experiment: Experiment, kind: str, repeat: Experiment | None = N
 
 
 def excited_stretches(experiment: Experiment, external: Signal, method: str) -> Stretches:
-    """Which axes are tuned together, and on which samples: SISO uses an axis' own part of the flight.
+    """Axes that are tuned together, and their samples: SISO uses only the part of a flight that excites the axis.
 
     Raises
     ------
@@ -119,13 +123,14 @@ def excited_stretches(experiment: Experiment, external: Signal, method: str) -> 
             if len(moving):
                 active.append((int(moving[0]), int(moving[-1]) + 1))
         if not active:
-            raise TuningError(f"{experiment.source}: not excited on {AXES[axis]}; inject a moment on that axis too")
+            name = ROLL_PITCH[axis]
+            raise TuningError(f"{experiment.source}: not excited on {name}; inject a torque on that axis too")
         stretches.append((slice(axis, axis + 1), active))
     return stretches if method == "siso" else [(slice(0, 2), list(experiment.segments))]
 
 
 def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment]:
-    """Two flights of the same experiment, cut to the rows that both have, so that row k of both has one excitation.
+    """Two flights of the same experiment, cut so that each row has the same excitation in both.
 
     Raises
     ------
@@ -133,14 +138,17 @@ def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment
         When their periods or their excitations differ.
     """
     one, other = external_signal(first)[0], external_signal(second)[0]
-    if abs(first.Ts / second.Ts - 1) > 1e-6:
-        raise TuningError(f"{second.source}: sampled every {second.Ts:g} s, {first.source} every {first.Ts:g} s")
+    if abs(first.Ts / second.Ts - 1) > SAME_PERIOD:
+        raise TuningError(
+            f"{second.source}: sampled every {second.Ts:g} s, {first.source} every {first.Ts:g} s; give a second "
+            "flight with the same period"
+        )
     likeness = sum(correlate(one[:, i], other[:, i], method="fft") for i in range(2))
     shift = int(np.argmax(likeness)) - (len(other) - 1)
     size = np.sqrt(np.sum(one**2) * np.sum(other**2))
     if np.max(likeness) < SAME_EXCITATION * size:
         raise TuningError(
-            f"{second.source}: its excitation is not that of {first.source} (correlation "
+            f"{second.source}: its excitation differs from that of {first.source} (correlation "
             f"{np.max(likeness) / size:.2f}); give a second flight with the same amplitude, hold times and seed"
         )
     start, stop = max(shift, 0), min(len(one), len(other) + shift)
@@ -150,10 +158,11 @@ def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment
         for c, d in second.segments
         if max(a, c + shift) < min(b, d + shift)
     ]
-    return _rows(first, start, stop, shared), _rows(second, start - shift, stop - shift, shared)
+    return _cut(first, start, stop, shared), _cut(second, start - shift, stop - shift, shared)
 
 
-def _rows(experiment: Experiment, start: int, stop: int, segments: Sequence[tuple[int, int]]) -> Experiment:
+def _cut(experiment: Experiment, start: int, stop: int, segments: Sequence[tuple[int, int]]) -> Experiment:
+    """Rows start..stop of all signals."""
     values = {f.name: getattr(experiment, f.name) for f in fields(experiment)}
     cut: dict[str, Any] = {name: value[start:stop] for name, value in values.items() if isinstance(value, np.ndarray)}
     return replace(experiment, **cut, segments=tuple(segments))

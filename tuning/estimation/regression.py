@@ -1,4 +1,4 @@
-"""Linear regression with extended instrumental variables: the estimator behind VRFT, (3.28)-(3.31).
+"""Linear regression with extended instrumental variables, (3.28)-(3.31): VRFT's estimator.
 
 u(k) = B x(k) + eps(k) is solved from the correlations of both sides with the instrument
 zeta(k) = [w(k-l); ...; w(k+l)]; the thesis' Kronecker form splits into one small problem for each row of B.
@@ -11,40 +11,43 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.estimation.correlations import autocorrelation, cross_correlation
-from mimopilot.tuning.plant.local_polynomial import LocalResponse, local_response
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, lstsq
 
-#: Diagonal loading of the residual covariance: the instruments at neighbouring lags are almost the same.
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.estimation.correlations import autocorrelation, cross_correlation
+from mimopilot.tuning.plant.local_polynomial import LocalResponse, local_response
+
+#: Diagonal loading of the residual covariance, relative: the instruments at neighbouring lags are almost equal.
 LOADING = 1e-3
-#: Windows of the noise spectrum: share of their frequency.
+#: Width of the noise spectrum's windows over their frequency.
 GROWTH = 0.1
-#: Share of the instrument's power below the highest frequency at which the noise is looked at.
+#: Share of the instrument's power below the highest frequency of the noise spectrum.
 POWER = 0.9999
+#: Fewest frequencies of the noise spectrum, in units of the resolution pi / N.
+MIN_BINS = 60
 
 Signal = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """One regression problem; each list holds one array a segment.
+    """One regression problem; each list has one array for each segment.
 
     Attributes
     ----------
     x : list of (N_s, n_x) arrays
         Regressors.
     u : list of (N_s, n_u) arrays
-        What they explain.
+        Signals to be explained.
     w : list of (N_s, n_w) arrays
-        What the instrument is made of, at 2 l + 1 lags.
+        Signals whose 2 l + 1 lags are the instruments.
     lags : int, samples
         l.
     memory : int, samples
-        How long the residual may remember, for (3.30).
+        Longest lag of the residual's correlation, for (3.30).
     external : list of (N_s, n_e) arrays
-        External signal: what it does not explain is noise. The same as `w` where that is external.
+        External signal: what it does not explain is noise. Equal to `w` if that is external.
     """
 
     x: list[Signal]
@@ -62,7 +65,7 @@ class Regression:
 
 @dataclass(frozen=True, eq=False)
 class _Row:
-    """How one row of B follows from the correlations, all in regressors of unit size."""
+    """Maps from the correlations to one row of B, for regressors scaled to unit RMS."""
 
     gain: Signal
     projected: Signal
@@ -71,14 +74,14 @@ class _Row:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What a regression gives; everything beside B costs more than B and is computed when it is asked for.
+    """Result of a regression; everything but B is expensive and computed on demand.
 
     Attributes
     ----------
     B : (n_u, n_x) array
         Coefficients.
     condition : float
-        Condition number of the problem in regressors of unit size: how far the gains can be told apart.
+        Condition number for regressors of unit RMS: a large one means that gains are hardly distinguishable.
     problem : Regression
         The data.
     scale : (n_x,) array
@@ -102,7 +105,7 @@ class Solution:
 
     @cached_property
     def least_squares(self) -> Signal:
-        """The coefficients without instruments, (n_u, n_x), biased by noise: a large difference is a warning."""
+        """Coefficients without instruments, (n_u, n_x), biased by noise: a large difference indicates a noisy log."""
         moment = sum(x.T @ x for x in self.problem.x)
         target = sum(x.T @ u for x, u in zip(self.problem.x, self.problem.u, strict=True))
         found: Signal = lstsq(moment / np.outer(self.scale, self.scale), target / self.scale[:, None])[0]
@@ -110,21 +113,20 @@ class Solution:
 
     @cached_property
     def _noise(self) -> LocalResponse:
-        """Spectrum of what the external signal does not explain of [u, x]; frequencies are in rad/sample."""
+        """Spectrum of the part of [u, x] that the external signal does not explain; frequencies in rad/sample."""
         problem = self.problem
         lengths = np.cumsum([0, *(len(signal) for signal in problem.x)])
         segments = [(int(a), int(b)) for a, b in itertools.pairwise(lengths)]
         w = np.vstack(problem.external)
         power = np.cumsum((np.abs(np.fft.rfft(w, axis=0)) ** 2).sum(axis=1))
         upper = np.pi * (np.searchsorted(power, POWER * power[-1]) + 1) / len(power)
-        # Never so narrow that only a handful of frequencies are left.
-        upper = min(np.pi, max(upper, 60 * np.pi / lengths[-1]))
+        upper = min(np.pi, max(upper, MIN_BINS * np.pi / lengths[-1]))
         signals = np.hstack([np.vstack(problem.u), np.vstack(problem.x) / self.scale])
         return local_response(w, signals, 1.0, segments, upper, growth=GROWTH)
 
     @cached_property
     def covariance(self) -> Signal:
-        """Of each row of B, (n_u, n_x, n_x), under repeated noise, the excitation being the same."""
+        """Covariance of each row of B, (n_u, n_x, n_x), over repeated noise with the same excitation."""
         unit = self.B * self.scale
         covariance = np.empty((*self.B.shape, self.B.shape[1]))
         for i, row in enumerate(self.rows):
@@ -152,7 +154,7 @@ def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: f
     weight : str
         ``identity``: least squares on the correlations, (3.28). ``optimal``: (3.30), in two steps.
     prior : (n_u, n_x) array, optional
-        Coefficients towards which the estimate is pulled.
+        Coefficients that the estimate is pulled towards.
     pull : float
         lambda of the pull, relative to the curvature of each coefficient; 0: none.
 
@@ -163,12 +165,12 @@ def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: f
     Raises
     ------
     TuningError
-        When a regressor is constant, or the instrument does not reach all of them.
+        When a regressor is constant, or the instrument does not excite all of them.
     """
     samples = problem.samples
     scale: Signal = np.sqrt(np.sum([_power(x) for x in problem.x], axis=0) / samples)
     if not (scale > 0).all():
-        raise TuningError("not excited: a measured signal is constant, so its gains cannot be found")
+        raise TuningError("not excited: a measured signal is constant; inject a torque on every axis, check the log")
 
     def correlate(signals: list[Signal]) -> Signal:
         terms = [cross_correlation(w, s, problem.lags) for w, s in zip(problem.w, signals, strict=True)]
@@ -177,7 +179,7 @@ def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: f
     S, Q = correlate(problem.x) / scale, correlate(problem.u)
     first, _, rank, singular = lstsq(S, Q)
     if rank < S.shape[1]:
-        raise TuningError("not excited: the injected signal does not reach every axis, so some gains cannot be found")
+        raise TuningError("not excited: the injected signal does not excite every axis; inject a torque on each axis")
     B = np.empty((Q.shape[1], S.shape[1]))
     rows: list[_Row] = []
     for i in range(len(B)):
@@ -208,8 +210,8 @@ def _power(signal: Signal) -> Signal:
 def _residual_covariance(problem: Regression, residual: list[Signal]) -> Signal:
     """Newey-West covariance of zeta(k) eps(k), Gamma of (3.30), for one row of the controller.
 
-    The residual is independent of the external instrument, so the covariance at lag h is the product of
-    their autocorrelations and Gamma is block Toeplitz: sum over h of R_eps(h) R_w(h + tau_1 - tau_2).
+    The residual is independent of the external instrument. So the covariance at lag h is the product of their
+    autocorrelations, and Gamma is block Toeplitz: sum over h of R_eps(h) R_w(h + tau_1 - tau_2).
     """
     lags, memory, samples = problem.lags, problem.memory, problem.samples
     taper = 1 - np.abs(np.arange(-memory, memory + 1)) / (memory + 1)
@@ -228,11 +230,11 @@ def _residual_covariance(problem: Regression, residual: list[Signal]) -> Signal:
 
 
 def _score_covariance(problem: Regression, noise: LocalResponse, row: _Row, b: Signal, i: int) -> Signal:
-    """Covariance of what noise adds to S' W^-1 (q - S b), (n_x, n_x).
+    """Covariance of the noise in S' W^-1 (q - S b), (n_x, n_x).
 
-    Noise enters as (1/N) sum of z(k) eps(k) + g(k) x_n(k): eps and x_n are the noise in the residual and in the
-    regressors, z = S' W^-1 zeta and g = zeta' W^-1 (q - S b) filters of the external signal. By Parseval its
-    covariance is a sum over frequency of their spectra.
+    Noise enters as (1/N) sum of z(k) eps(k) + g(k) x_n(k). Here eps and x_n are the noise in the residual and in the
+    regressors; z = S' W^-1 zeta and g = zeta' W^-1 (q - S b) are the external signal, filtered. By Parseval the
+    covariance is a sum of their spectra over frequency.
     """
     n_x, n_u = len(b), problem.u[0].shape[1]
     taps = np.column_stack([row.projected, row.weighted]).reshape(2 * problem.lags + 1, -1, n_x + 1)

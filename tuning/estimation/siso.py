@@ -1,4 +1,4 @@
-"""SISO VRFT as the thesis has it: one axis by itself, the baseline of its tables."""
+"""SISO VRFT of the thesis: one axis by itself, the baseline of its tables."""
 
 from __future__ import annotations
 
@@ -6,20 +6,21 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import autocorrelation
 from mimopilot.tuning.estimation.vrft import LoopEstimate, Segments, vrft
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Signal
-from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 #: Order of the autoregressive model of u whose inverse is 1/Phi_u.
 WHITENING_ORDER = 10
 
 
 def whitening_filter(u: Signal) -> Signal:
-    """Taps a of the minimum-phase filter with |a(z)|^2 proportional to 1/Phi_u, by the Yule-Walker equations.
+    """Taps of the minimum-phase filter a with |a(z)|^2 proportional to 1/Phi_u, by the Yule-Walker equations.
 
     Parameters
     ----------
@@ -32,13 +33,13 @@ def whitening_filter(u: Signal) -> Signal:
     """
     covariance = autocorrelation(u[:, None], WHITENING_ORDER)[WHITENING_ORDER:, 0, 0]
     if not covariance[0] > 0:
-        raise TuningError("not excited: the plant input is zero")
+        raise TuningError("not excited: the plant input u is zero; check the log's torque")
     prediction = solve_toeplitz(covariance[:-1], covariance[1:])
     return np.concatenate([[1.0], -prediction])
 
 
 def prefilter(u: Signal, model: ReferenceModel) -> Callable[[Signal], Signal]:
-    """The part of the optimal filter |L|^2 = |1 - M|^2 |M|^2 / Phi_u, (3.12) with W = 1, that comes before l = m.
+    """Optimal prefilter |L|^2 = |1 - M|^2 |M|^2 / Phi_u, (3.12) with W = 1, without its factor l = m.
 
     Parameters
     ----------
@@ -78,15 +79,15 @@ def siso_vrft(
     Parameters
     ----------
     u, y, instrument : (N, 1) arrays
-        As in `vrft`; give `repeated` too for the basic instruments of the thesis: the output of a second
-        experiment (3.13) or of an identified model, or `y` itself for plain least squares.
+        As in `vrft`. For the thesis' basic instruments give `repeated` as well: the output of a second experiment
+        (3.13) or of an identified model, or `y` itself for plain least squares.
     model : ReferenceModel
     terms : str
         Letters of ``PIDF``.
     segments : sequence of (start, stop), optional
     settling : int, samples
     **options
-        The others of `tuning.estimation.vrft.vrft`.
+        Further arguments of `tuning.estimation.vrft.vrft`.
 
     Raises
     ------

@@ -1,9 +1,8 @@
 """Multivariable Virtual Reference Feedback Tuning of one loop, with extended instrumental variables.
 
-Given one experiment {u, y} and a diagonal reference model M, the controller C(B) that would make the closed
-loop look like M is the one that turns the virtual error e_V = (M^-1 - I) y into u. All signals pass one
-scalar filter l, so that nothing improper is ever computed; the controller is linear in its gains, and the
-instrument is an external signal of the experiment at 2 l + 1 lags.
+Given one experiment {u, y} and a diagonal reference model M, the controller C(B) whose closed loop equals M turns the
+virtual error e_V = (M^-1 - I) y into u. All signals pass one scalar filter l, so that every filter is proper. The
+controller is linear in its gains, and the instrument is an external signal of the experiment at 2 l + 1 lags.
 """
 
 from __future__ import annotations
@@ -13,14 +12,18 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.regression import Regression, Solution, solve
 from mimopilot.tuning.law import TERMS, Filters, regressors
 from mimopilot.tuning.reference_model import ReferenceModel
-from numpy.typing import NDArray
 
 Signal = NDArray[np.float64]
 Segments = Sequence[tuple[int, int]]
+
+#: Share of its peak to which the reference model's transient decays within the instrument's lags.
+DECAY = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +39,7 @@ class LoopEstimate:
     window : int
         Lags l of the instrument.
     solution : Solution
-        The regression behind it: covariance, strength of the instrument, fit.
+        The regression: covariance, strength of the instrument, fit.
     """
 
     gains: dict[str, Signal]
@@ -46,20 +49,20 @@ class LoopEstimate:
 
     @cached_property
     def deviations(self) -> dict[str, Signal]:
-        """Term -> (n_u, n_y) standard deviations under repeated noise."""
+        """Term -> (n_u, n_y) standard deviations over repeated noise."""
         variances = np.diagonal(self.solution.covariance, axis1=1, axis2=2)
         found = np.split(np.sqrt(np.maximum(variances, 0.0)), len(self.gains), axis=1)
         return dict(zip(self.gains, found, strict=True))
 
     def gain(self, term: str) -> Signal:
-        """Matrix of a term; zeros when the structure does not have it."""
+        """Matrix of a term; zeros if the structure lacks it."""
         first = next(iter(self.gains.values()))
         return self.gains.get(term, np.zeros_like(first))
 
 
 def default_window(models: Sequence[ReferenceModel]) -> int:
-    """Lags of the instrument: long enough for the slowest reference model to decay to 10 %."""
-    return max(model.settling_samples(0.1) for model in models)
+    """Lags of the instrument: until the slowest reference model has decayed to `DECAY`."""
+    return max(model.settling_samples(DECAY) for model in models)
 
 
 def virtual_signals(y: Signal, models: Sequence[ReferenceModel]) -> tuple[Signal, Signal, Signal, list[ReferenceModel]]:
@@ -88,27 +91,27 @@ def virtual_signals(y: Signal, models: Sequence[ReferenceModel]) -> tuple[Signal
 
 
 def filter_by(signal: Signal, factors: Sequence[ReferenceModel]) -> Signal:
-    """The scalar filter l on every column."""
+    """Filter every column by the scalar l."""
     for factor in factors:
         signal = factor.response(signal)
     return signal
 
 
 def filter_by_inverse(signal: Signal, factors: Sequence[ReferenceModel], models: Sequence[ReferenceModel]) -> Signal:
-    """Filter by l and M^-1, as the proper filters l m_j^-1, one a column.
+    """Filter by l and M^-1, as one proper filter l m_j^-1 for each column.
 
     Parameters
     ----------
     signal : (N, n) array
     factors : sequence of ReferenceModel
-        Whose product is l.
+        Models whose product is l.
     models : sequence of n ReferenceModel
         M.
 
     Raises
     ------
     TuningError
-        When l answers faster than M, or M cannot be inverted.
+        When l has less delay than M, or M cannot be inverted.
     """
     filtered = filter_by(signal, factors[1:])
     columns = [factors[0].over(model).response(filtered[:, j]) for j, model in enumerate(models)]
@@ -140,40 +143,40 @@ def vrft(
     Parameters
     ----------
     u : (N, n_u) array
-        Input of the plant that the controller makes.
+        Input of the plant: the controller's output.
     y : (N, n_y) array
         Output of the plant.
     instrument : (N, n_w) array
-        Signal whose lags are the instruments: an external one (the injected excitation, or the set-point), or `u`
-        itself, the thesis' choice, which in closed loop carries fed-back noise.
+        Signal whose lags are the instruments: an external one (the injected excitation, or the setpoint), or `u`
+        itself, the thesis' choice, which in closed loop contains fed-back noise.
     models : sequence of n_y ReferenceModel
-        Wanted complementary sensitivity of each output.
+        Complementary sensitivity asked of each output.
     terms : str
         Structure of the controller: ``P``, ``PI``, ``PID``, ``PIDF``...
     segments : sequence of (start, stop), optional
-        Stretches without a gap; all of the data by default. Filters start anew and a constant (trim and
-        initial integrator) is estimated on each.
+        Stretches without a gap; all of the data by default. Filters restart and a constant (trim and initial
+        integrator) is estimated on each.
     window : int, optional
         Lags l of the instrument; see `default_window`.
     filters : Filters, optional
-        Of the flown law; by default the models' period and no filter.
+        Filters of the flown law; by default the models' period and no filter.
     settling : int, samples
         Further samples to drop at the start of each segment.
     weight : str
         ``identity``: least squares on the correlations, (3.28). ``optimal``: (3.30), in two steps.
     trim : bool
-        False: no constant, as the thesis has it; right only for data without offsets.
+        False: no constant, as in the thesis; only for data without offsets.
     external : (N, n_e) array, optional
-        External signal that noise is told from, where `instrument` is not external.
+        External signal if `instrument` is not external; what it does not explain is noise.
     repeated : (N, n_y) array, optional
-        y with other noise, of a second experiment (3.13) or simulated by an identified model: its regressors are
-        the instruments, in place of lags; `instrument` then is what noise is told from.
+        y with independent noise, from a second experiment (3.13) or simulated by an identified model. Its regressors
+        are then the instruments instead of lags, and `instrument` is the external signal.
     prefilter : callable, optional
         Filter of every signal before l, such as `tuning.estimation.siso.prefilter`.
     inverse : sequence of n_u ReferenceModel, optional
-        M_i of an inner loop: `u` holds that loop's outputs and M_i^-1 u is meant.
+        M_i of an inner loop: `u` then holds that loop's outputs, and M_i^-1 u is used.
     prior : mapping, optional
-        Term -> (n_u, n_y) gains towards which the estimate is pulled.
+        Term -> (n_u, n_y) gains that the estimate is pulled towards.
     pull : float
         lambda of the pull, relative to the curvature of each gain: 1 goes half of the way.
 
@@ -189,9 +192,11 @@ def vrft(
     letters = "".join(term for term in TERMS if term in terms)
     if not letters or len(letters) != len(terms) or weight not in ("optimal", "identity"):
         known = "".join(TERMS)
-        raise TuningError(f"terms {terms!r}, weight {weight!r}: expected letters of {known}, and optimal or identity")
+        raise TuningError(
+            f"got terms {terms!r} and weight {weight!r}, expected letters of {known}, and optimal or identity"
+        )
     if len(models) != y.shape[1]:
-        raise TuningError(f"got {len(models)} reference models for {y.shape[1]} outputs")
+        raise TuningError(f"got {len(models)} reference models for {y.shape[1]} outputs, expected one for each")
     lags = default_window(models) if window is None else window
     Ts = models[0].Ts
     flown = filters or Filters(Ts)
@@ -219,8 +224,8 @@ def vrft(
         if repeated is not None:
             w = regressor(repeated[part])[0]
         if trim:
-            # The constant (trim, initial integrator), filtered like the rest, is regressor and instrument at once:
-            # to take its part off all others is the same as to estimate it.
+            # The constant (trim, initial integrator), filtered like the rest, is both regressor and instrument:
+            # removing its projection from all other signals is equivalent to estimating it.
             constant = filter_by(np.ones((stop - start, 1)), factors)[drop:]
             _remove_projection(constant, x)
             _remove_projection(constant, u_l)
@@ -230,12 +235,12 @@ def vrft(
             signals.append(signal)
     if not xs:
         raise TuningError(
-            f"too short: no stretch without a gap is longer than {needed * Ts:.2f} s, which these reference "
-            "models need; record a longer flight, or ask for faster models"
+            f"too short: these reference models need a stretch without a gap longer than {needed * Ts:.2f} s; record a "
+            "longer flight, or ask for faster models"
         )
     if repeated is not None:
         lags = 0
-        # The units of P, I and D differ: brought to one size, over all stretches, the problem is well conditioned.
+        # P, I and D have different units: scaled to unit norm over all stretches, the problem is well conditioned.
         size = np.sqrt(np.sum([np.einsum("ij,ij->j", w, w) for w in ws], axis=0))
         ws = [w / np.where(size > 0, size, 1.0) for w in ws]
     problem = Regression(xs, us, ws, lags, memory=max(lags, 2 * drop), external=vs)

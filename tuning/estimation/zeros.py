@@ -1,11 +1,11 @@
-"""Non-minimum-phase zeros of a plant, by the flexible reference model.
+"""Non-minimum-phase zeros of a plant, by a flexible reference model.
 
-A reference model that must keep a zero of the plant outside the unit circle cannot be chosen before that zero is
-known. So its numerator is left free, M(z, eta) = eta' F(z) with M(1) = 1, and found together with the controller:
-|| M(eta) (u + C(rho) y) - C(rho) y ||^2 is a linear problem in eta for a given rho and the other way round. The zeros
-of M outside the unit circle are those of the plant. (L. Campestrini, D. Eckhard, M. Gevers, A. S. Bazanella, "Virtual
-Reference Feedback Tuning for non-minimum phase plants", Automatica 47 (2011).) Here all signals enter by their
-correlations with an external one, so that noise does not bias it.
+A reference model must keep the plant's zeros outside the unit circle, so it cannot be chosen before they are known.
+Its numerator is therefore free, M(z, eta) = eta' F(z) with M(1) = 1, and found together with the controller:
+|| M(eta) (u + C(rho) y) - C(rho) y ||^2 is linear least squares in eta for a given rho, and in rho for a given eta. The
+zeros of M outside the unit circle are those of the plant. (L. Campestrini, D. Eckhard, M. Gevers, A. S. Bazanella,
+"Virtual Reference Feedback Tuning for non-minimum phase plants", Automatica 47 (2011).) Here all signals enter by their
+correlations with an external one, so noise causes no bias.
 """
 
 from __future__ import annotations
@@ -14,44 +14,48 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import lstsq
+from scipy.signal import lfilter
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import cross_correlation
 from mimopilot.tuning.estimation.vrft import Segments, default_window
 from mimopilot.tuning.law import Filters, regressors
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Signal
-from scipy.linalg import lstsq
-from scipy.signal import lfilter
 
 #: Free coefficients of the numerator.
 NUMERATOR = 3
+#: Most iterations, each a least-squares problem in rho and one in eta.
 ITERATIONS = 200
-#: Sweeps end when the criterion falls by less than this share.
+#: Iterations end when the criterion falls by less than this share.
 SETTLED = 1e-7
+#: Largest imaginary part of a zero that counts as real: rounding of `numpy.roots`.
+REAL = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class FlexibleModel:
-    """What the flexible criterion found for one axis.
+    """Flexible reference model of one axis.
 
     Attributes
     ----------
     model : ReferenceModel
         M(z, eta), M(1) = 1.
     misfit : float
-        Criterion over the power of C y: 0 where M is reached exactly.
+        Criterion over the power of C y; 0 when the loop equals M.
     """
 
     model: ReferenceModel
     misfit: float
 
     def nonminimum_phase_zeros(self) -> list[float]:
-        """Real zeros beyond z = 1 as frequencies ln(z)/Ts, rad/s, slowest first: what bounds the bandwidth.
+        """Real zeros beyond z = 1 as frequencies ln(z)/Ts, rad/s, slowest first: they bound the bandwidth.
 
-        Zeros outside the circle elsewhere come from sampling and dead time, and bound nothing of interest.
+        Other zeros outside the unit circle come from sampling and dead time, and do not bound the bandwidth.
         """
         zeros = np.roots(self.model.num)
-        outside = zeros[(np.abs(zeros.imag) < 1e-9) & (zeros.real > 1)].real
+        outside = zeros[(np.abs(zeros.imag) < REAL) & (zeros.real > 1)].real
         return sorted(float(np.log(z) / self.model.Ts) for z in outside)
 
 
@@ -65,7 +69,7 @@ def flexible_model(
     segments: Segments | None = None,
     filters: Filters | None = None,
 ) -> FlexibleModel:
-    """Find M(z, eta) with the poles and the delay of `start`, and with it its zeros.
+    """Find M(z, eta) with the poles and the delay of `start`.
 
     Parameters
     ----------
@@ -74,12 +78,12 @@ def flexible_model(
     external : (N, n_w) array
         External signals of the experiment.
     start : ReferenceModel
-        Its poles are kept, its numerator is where the search begins.
+        Its poles are kept; its numerator is the initial one.
     terms : str
         Structure of the controller, letters of ``PID``.
     segments : sequence of (start, stop), optional
     filters : Filters, optional
-        Of the flown law; by default the model's period and no filter.
+        Filters of the flown law; by default the model's period and no filter.
 
     Raises
     ------
@@ -88,7 +92,7 @@ def flexible_model(
     """
     lags, drop = default_window([start]), 2 * start.settling_samples()
     lag = len(start.den) - len(start.num) + start.delay
-    # F_i: one over the denominator, i samples later each.
+    # F_i: one over the denominator, delayed by i samples.
     taps = [np.concatenate([np.zeros(lag + i), [1.0]]) for i in range(NUMERATOR)]
     A: list[Signal] = []
     B: list[Signal] = []
@@ -105,24 +109,27 @@ def flexible_model(
         B.append(np.stack([part[:, 1:] for part in correlated], axis=1))
         c.append(cross_correlation(w, x[drop:], lags).reshape(-1, x.shape[1]))
     if not c:
-        raise TuningError(f"too short: the flexible model needs stretches of {(drop + 4 * lags) * start.Ts:.2f} s")
+        raise TuningError(
+            f"too short: the search for zeros needs a stretch of {(drop + 4 * lags) * start.Ts:.2f} s without a gap; "
+            "record a longer flight"
+        )
     return _alternate(np.sum(A, axis=0), np.sum(B, axis=0), np.sum(c, axis=0), start, lag)
 
 
 def _alternate(A: Signal, B: Signal, c: Signal, start: ReferenceModel, lag: int) -> FlexibleModel:
-    """Two least squares in turn: A (L, n_eta), B (L, n_eta, n_rho), c (L, n_rho)."""
+    """Alternate between both least-squares problems: A (L, n_eta), B (L, n_eta, n_rho), c (L, n_rho)."""
     gain_at_one = 1 / float(np.sum(start.den))  # of every F_i
     eta = np.zeros(NUMERATOR)
     eta[: len(start.num)] = start.num
     scale = np.sqrt(np.sum(c**2, axis=0))
     if not (scale > 0).all():
-        raise TuningError("not excited: the external signal does not reach the output")
+        raise TuningError("not excited: the output does not respond to the external signal; inject a stronger torque")
     B, c = B / scale, c / scale
     last = np.inf
     for _ in range(ITERATIONS):
         rho = lstsq(np.einsum("lij,i->lj", B, eta) - c, -A @ eta)[0]
         rows, target = A + B @ rho, c @ rho
-        # eta sums to 1/F(1): the last coefficient is what the others leave.
+        # eta sums to 1/F(1): the last coefficient follows from the others.
         free = lstsq(rows[:, :-1] - rows[:, -1:], target - rows[:, -1] / gain_at_one)[0]
         eta = np.append(free, 1 / gain_at_one - free.sum())
         misfit = float(np.sum((rows @ eta - target) ** 2) / np.sum(target**2))

@@ -7,10 +7,10 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from mimopilot.tuning.errors import TuningError
 from pydantic import BaseModel, ConfigDict, Field
 
 from mimopilot.common.toml import checked, read_toml, shown_text
+from mimopilot.tuning.errors import TuningError
 
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _FACTORS = TIME_UNITS | {"rad": 1.0, "deg": math.pi / 180, "rad/s": 1.0, "deg/s": math.pi / 180}

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.dataflash_file import DataflashFile, open_dataflash
 from mimopilot.tuning.logs.flight_phase import intervals
 from mimopilot.tuning.logs.recording import MAX_OUTLIERS, RANGES, Recording
 from mimopilot.tuning.logs.resample import MAX_GAP, MIN_RATE, Interval, Series, monotone, sampling_period
 from mimopilot.tuning.logs.vehicle_type import ardupilot_vehicle
-from numpy.typing import NDArray
 
 DEGREE = np.pi / 180
 

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mimopilot.tuning.logs.recording import listed
 from numpy.typing import NDArray
+
+from mimopilot.tuning.logs.recording import listed
 
 HEAD = b"\xa3\x95"
 FMT, FMT_LENGTH = 0x80, 89  # message that defines the others; its own layout is in AP_Logger's LogStructure.h

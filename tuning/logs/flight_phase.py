@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, Series
-from numpy.typing import NDArray
 
 STILL_RATE = 0.01  # rad/s, standard deviation over `STILL_WINDOW`: every hover is noisier
 STILL_WINDOW = 1.0  # s

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
+
 from mimopilot.tuning.gains import Gains, Limits, Triple, YawGains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameters import LIMITS, MATRICES, PREFIX, cutoff_of

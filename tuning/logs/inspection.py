@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
 from mimopilot.tuning.experiment import Experiment, external_signal
@@ -16,7 +18,6 @@ from mimopilot.tuning.logs.log_checks import check_log
 from mimopilot.tuning.logs.reader import open_log, unchecked_experiment
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import MAX_GAP, Interval, Series, held_samples, sampling_period
-from numpy.typing import NDArray
 
 AXES = ("roll", "pitch")
 BAND_POWER = (0.05, 0.95)  # the band of a signal is between these fractions of its cumulative power

@@ -6,10 +6,9 @@ import math
 from dataclasses import asdict
 from typing import Any
 
+from mimopilot.common.console import print_table
 from mimopilot.tuning.logs.inspection import Inspection
 from mimopilot.tuning.parameters import MATRICES
-
-from mimopilot.common.console import print_table
 
 #: Signal -> its name, its unit in the table, and the factor from SI to that unit.
 _NAMES = {

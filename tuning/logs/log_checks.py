@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.estimation.instrumental_variables import AXES, excited_stretches
+from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.logs.column_corrections import SignalNames
 from mimopilot.tuning.logs.recording import Recording
@@ -23,6 +24,7 @@ from mimopilot.tuning.logs.signal_relations import (
     injected_in_torque,
     measure_kinematics,
 )
+from mimopilot.tuning.parameters import ROLL_PITCH
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
 
@@ -91,8 +93,9 @@ def _check_contained(injected: Matrix | None, names: SignalNames) -> None:
         return
     shares = np.linalg.norm(injected, axis=1)
     if shares.min() < CONTAINED:
+        axis = ROLL_PITCH[int(np.argmin(shares))]
         raise TuningError(
-            f"{names.path}: {names.of('u')} does not contain the torque injected on {AXES[int(np.argmin(shares))]} "
+            f"{names.path}: {names.of('u')} does not contain the torque injected on {axis} "
             f"({shares.min():.2f} of it, expected 1): log the torque after the injection, at the same rate"
         )
 
@@ -109,7 +112,7 @@ def check_angles(recording: Recording) -> None:
     beyond = np.mean(angles > 1.01 * np.array(LARGEST), axis=0) > IMPOSSIBLE
     if beyond.any():
         wrong = tuple(int(axis) for axis in np.flatnonzero(beyond))
-        found = " and ".join(f"{AXES[axis]} reaches {angles[:, axis].max():.3g} rad" for axis in wrong)
+        found = " and ".join(f"{ROLL_PITCH[axis]} reaches {angles[:, axis].max():.3g} rad" for axis in wrong)
         most = " and ".join(f"{LARGEST[axis]:.3g}" for axis in wrong)
         raise TuningError(
             f"{names.path}: {names.of('y_o')}: {found}, expected at most {most}: degrees are taken for radians; "
@@ -159,7 +162,7 @@ def _check_order_and_signs(
             f"{names.path}: {found}: roll and pitch are exchanged in {names.all(signals)}; "
             f"{names.correction(signals, (0, 1), 'other')}{_alternative(names.all(other))}"
         )
-    for axis, name in enumerate(AXES):
+    for axis, name in enumerate(ROLL_PITCH):
         first, second, third = (relation.reversed[axis] for relation in relations)
         faulty = faulty_signals(first, second, third, injected is not None)
         if faulty:
@@ -176,7 +179,7 @@ def _alternative(names: str) -> str:
 
 def _check_derivative(kinematics: Kinematics, names: SignalNames) -> None:
     """Check that the rates explain the movement of the angles."""
-    for axis, name in enumerate(AXES):
+    for axis, name in enumerate(ROLL_PITCH):
         if kinematics.moves.all() and kinematics.explained[axis] < EXPLAINED:
             raise TuningError(
                 f"{names.path}: the rates in {names.of('y_i')} explain {max(kinematics.explained[axis], 0):.0%} of "
@@ -189,7 +192,7 @@ def _check_units(kinematics: Matrix, body: RigidBody | None, names: SignalNames)
     """Check the units of rates and angles: degrees taken for radians or the reverse, in one or both."""
     wrong: list[str] = []
     lines: list[tuple[tuple[str, ...], int]] = []
-    for axis, name in enumerate(AXES):
+    for axis, name in enumerate(ROLL_PITCH):
         factor, extreme = float(kinematics[axis, axis]), _extreme(body, axis)
         if SAME_UNIT[0] < factor < SAME_UNIT[1]:
             if not extreme:
@@ -238,7 +241,7 @@ def _extreme(body: RigidBody | None, axis: int) -> int:
 def _check_clear(body: RigidBody, names: SignalNames) -> None:
     """Check that the signs of the response are certain."""
     determinant, deviation = body.determinant()
-    for axis, name in enumerate(AXES):
+    for axis, name in enumerate(ROLL_PITCH):
         value, error = body.B[axis, axis], body.deviation[axis, axis]
         if value < CLEAR * error:
             raise TuningError(

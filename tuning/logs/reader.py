@@ -7,6 +7,8 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+
+from mimopilot.common.files import sha256
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.logs.columns import Columns
@@ -17,8 +19,6 @@ from mimopilot.tuning.logs.log_checks import check_angles, check_log
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, on_common_grid
 from mimopilot.tuning.motors import Motors, fit_motors, saturation_warnings
-
-from mimopilot.common.files import sha256
 
 CHANGED = "parameters changed in the part that is used; the values before the change count as flown: "
 

@@ -8,10 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.resample import REQUIRED, Interval, Series, monotone
-from numpy.typing import NDArray
 
 #: Largest plausible magnitude of a signal: torque (normalised), rad/s, rad. Gyros saturate at 35 rad/s (2000 deg/s).
 #: y_o in degrees passes here, so that `check_angles` can name the wrong unit.

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
+
+from mimopilot.tuning.errors import TuningError
 
 MIN_RATE = 100.0  # Hz, of torque, rates and angles: gains from slower logs are wrong
 MAX_GAP = 5  # periods; a longer pause cuts the log

@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from mimopilot.tuning.experiment import Experiment
 from numpy.typing import NDArray
+
+from mimopilot.tuning.experiment import Experiment
 
 #: s. Angles are compared with rates integrated over this time: long enough to divide down the noise of the angles.
 INTEGRATION = 0.1

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import SIGNALS, TIME_UNITS, Columns
 from mimopilot.tuning.logs.matlab_sizes import check_sizes
 from mimopilot.tuning.logs.recording import Recording, listed
 from mimopilot.tuning.logs.resample import MIN_RATE, MIN_SECONDS, REQUIRED, Series
-from numpy.typing import NDArray
 
 ADVICE = (
     "log it at 100 Hz or more on the vehicle (PX4: SDLOG_PROFILE 49, ArduPilot: LOG_BITMASK bit 0) and export every "

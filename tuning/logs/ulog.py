@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.logs.flight_phase import bridged, intersection, intervals
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, Series, sampling_period
 from mimopilot.tuning.logs.ulog_file import UlogFile, open_ulog
 from mimopilot.tuning.logs.vehicle_type import px4_vehicle
-from numpy.typing import NDArray
 
 #: Signal -> (topic, fields) that hold it, newest PX4 first.
 LAYOUTS = {

@@ -12,9 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.recording import listed
-from numpy.typing import NDArray
 
 FIRST = 16  # bytes of the file header; the first message follows
 KINDS = b"ABCDFILMOPQRS"

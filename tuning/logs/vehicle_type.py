@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.logs.flight_phase import intersection, intervals
 from mimopilot.tuning.logs.resample import Interval
-from numpy.typing import NDArray
 
 #: MAV_TYPE (MAVLink, common.xml) of vehicles that are not multirotors.
 OTHERS = {

@@ -6,11 +6,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.plant.local_polynomial import local_response
 from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, fit_shape, shape_response
-from numpy.typing import NDArray
 
 #: Least multiple coherence of a rate with the excitation at a coherent frequency.
 COHERENT = 0.7

@@ -12,8 +12,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
 from numpy.typing import NDArray
+
+from mimopilot.tuning.errors import TuningError
 
 ORDER = 2  # of the local polynomials
 FREEDOM = 8  # least degrees of freedom of the noise estimate in a window

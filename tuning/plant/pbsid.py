@@ -14,10 +14,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.statespace import Signal, StateSpace
 from numpy.typing import NDArray
 from scipy.linalg import lstsq, qr, svd
+
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.statespace import Signal, StateSpace
 
 #: Largest order tried when none is given.
 MAX_ORDER = 20

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, fit_shape
-from numpy.typing import NDArray
 
 #: rad/s. Above it frame modes and filters shape the response.
 UPPER = 60.0

@@ -9,6 +9,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
     INT32,
@@ -34,7 +36,6 @@ from mimopilot.sitl.mavlink.ground_station.events import (
 from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from mimopilot.sitl.mavlink.wire.sockets import udp_socket
-from pymavlink.dialects.v20 import common as mavlink
 
 #: System and component number that ground stations use.
 GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER

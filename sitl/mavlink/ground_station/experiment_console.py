@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import typer
+
+from mimopilot.common.console import print_json, print_table
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.experiment import (
@@ -23,8 +25,6 @@ from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES
 from mimopilot.tuning.excitation import hold_from_bandwidth
 from mimopilot.tuning.parameters import EXCITATION
-
-from mimopilot.common.console import print_json, print_table
 
 PX4 = 12  # MAV_AUTOPILOT_PX4
 #: Bits of SDLOG_PROFILE that tuning from a log needs: default, high rate, debug topics.

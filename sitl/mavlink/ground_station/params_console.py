@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from mimopilot.common.console import print_json, print_table
+from mimopilot.common.files import write_atomically
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
@@ -14,9 +16,6 @@ from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameters import PARAMETERS
-
-from mimopilot.common.console import print_json, print_table
-from mimopilot.common.files import write_atomically
 
 #: Format -> code generation target that emits it, and its path there.
 GENERATED = {

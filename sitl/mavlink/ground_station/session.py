@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mimopilot.common.console import progress_console
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.connection import Connection
 from mimopilot.sitl.mavlink.ground_station.events import Exchange, Heartbeat, T, run_exchange
@@ -18,8 +19,6 @@ from mimopilot.sitl.mavlink.ground_station.vehicle_contact import TRY_S
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import STOCK_PARAMETERS, check_kind, describe_missing_module
 from mimopilot.sitl.mavlink.wire.signing import read_key
 from mimopilot.tuning.parameters import PREFIX
-
-from mimopilot.common.console import progress_console
 
 
 @dataclass(frozen=True)

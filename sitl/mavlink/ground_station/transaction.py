@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Protocol
 
+from mimopilot.common.files import write_atomically
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Heartbeat
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S
@@ -17,8 +18,6 @@ from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.gains import Gains, Triple
-
-from mimopilot.common.files import write_atomically
 
 STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 import typer
+
+from mimopilot.common.console import print_json, print_table
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Heartbeat
 from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan
@@ -16,8 +18,6 @@ from mimopilot.sitl.mavlink.ground_station.transaction import STORAGE, Upload, u
 from mimopilot.sitl.mavlink.ground_station.upload import SMALLEST_CHANGE
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.tuning.gains import Gains, Triple
-
-from mimopilot.common.console import print_json, print_table
 
 
 def parse_scale(text: str | None) -> Triple | Literal["flown"] | None:

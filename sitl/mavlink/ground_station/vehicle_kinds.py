@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import GENERIC, Heartbeat
-from pymavlink.dialects.v20 import common as mavlink
 
 #: MAV_TYPE flown by a multirotor's rate controller; VTOLs in hover included.
 MULTIROTORS = frozenset(

@@ -11,12 +11,13 @@ import time
 from typing import Any
 
 import serial
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import MAX_CATCH_UP_S, SimulatedVehicle
 from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, READ_BYTES
 from mimopilot.sitl.physics.rigid_body import MAX_ROTORS
-from pymavlink.dialects.v20 import common as mavlink
 
 STALE_S = 0.5  # s without commands after which the motors stop, as speed controllers do; chosen
 REOPEN_S = 0.5  # s between attempts to reopen a disconnected port; chosen

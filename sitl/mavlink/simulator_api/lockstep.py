@@ -7,6 +7,8 @@ import socket
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import Scenario
@@ -15,7 +17,6 @@ from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
 from mimopilot.sitl.mavlink.wire.fast_codec import SPIN_S, STATE, FastCodec, receive
 from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK
 from mimopilot.sitl.physics.state_estimate import MEASUREMENT_SIZE
-from numpy.typing import NDArray
 
 CONNECT_S = 10.0  # s, timeout of the connection; chosen
 

@@ -8,12 +8,13 @@ import socket
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
 from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
 from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, ARMED, LOCKSTEP, READ_BYTES, FastCodec, Message
 from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK
-from numpy.typing import NDArray
 
 RETRY_S = 0.2  # s between attempts to connect; chosen
 RESTART_S = 1.0  # s between attempts to start the plant process; chosen

@@ -9,6 +9,9 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.faults.kinds import Fault
 from mimopilot.sitl.flight.simulator import Simulator
@@ -27,8 +30,6 @@ from mimopilot.sitl.physics.imu_baro_gps import (
     global_position,
 )
 from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS
-from numpy.typing import NDArray
-from pymavlink.dialects.v20 import common as mavlink
 
 NOISE_BLOCK = 250  # periods of sensor noise drawn at once: one second at 250 Hz
 EPOCH_US = 1_000_000  # us, start of the simulated clock: autopilots treat time zero as "no time"

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from mimopilot.common.files import write_atomically
 from mimopilot.sitl.autopilot.autopilot import RECORD
 from mimopilot.sitl.autopilot.flight_modes import Commander
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.flight_log import vehicle_log
 from mimopilot.sitl.physics.airframe import Airframe
-from numpy.typing import NDArray
-
-from mimopilot.common.files import write_atomically
 
 BLOCK = 15_000  # rows allocated at once: one minute at 250 Hz
 

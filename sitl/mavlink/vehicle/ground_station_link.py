@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.autopilot.flight_modes import Denied, Failed, Refused, Severity
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.setpoint_messages import SetpointReceiver
@@ -13,7 +15,6 @@ from mimopilot.sitl.mavlink.vehicle.small_protocols import PROTOCOLS
 from mimopilot.sitl.mavlink.vehicle.stations import BUDGET_S, Stations
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry, texts
 from mimopilot.sitl.mavlink.vehicle.vehicle_commands import Command, VehicleCommands
-from pymavlink.dialects.v20 import common as mavlink
 
 HEARTBEAT_TIMEOUT_S = 5.0  # s without a ground station's heartbeat before it is reported; chosen: five heartbeats
 MAX_TEXT_ID = 65535  # STATUSTEXT.id is a uint16; 0: a text of one chunk

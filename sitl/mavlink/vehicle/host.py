@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot, tick
 from mimopilot.sitl.autopilot.flight_modes import Commander, Severity
 from mimopilot.sitl.autopilot.vertical import Estimate
@@ -24,7 +26,6 @@ from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.fast_codec import GPS, SENSOR, STATE
 from mimopilot.sitl.physics.state_estimate import MEASUREMENT_SIZE, euler_angles
 from mimopilot.tuning.parameters import PARAMETERS
-from numpy.typing import NDArray
 
 # All chosen:
 PLANT_TIMEOUT_S = 0.9  # s without a frame before it is reported: within one second

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.codegen.cortex_m4 import EmulatedController
 from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.native import NativeController
@@ -17,7 +19,6 @@ from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
 from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest, single
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
-from pymavlink.dialects.v20 import common as mavlink
 
 #: MAV_PARAM_ERROR, the reasons of PARAM_ERROR; pymavlink's enumeration ends before the last.
 DOES_NOT_EXIST: int = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST

@@ -10,10 +10,9 @@ import threading
 from collections.abc import Mapping
 from pathlib import Path
 
+from mimopilot.common.files import write_atomically
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
-
-from mimopilot.common.files import write_atomically
 
 #: Delay from a change to its write, s; chosen: changes that follow are written together.
 DELAY_S = 0.2

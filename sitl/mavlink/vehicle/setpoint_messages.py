@@ -6,12 +6,13 @@ import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.autopilot.flight_modes import Commander, Severity
 from mimopilot.sitl.autopilot.setpoints import AttitudeSetpoint, Pose, Sticks
 from mimopilot.sitl.mavlink.wire.codec import SYSTEM
 from mimopilot.sitl.physics.state_estimate import euler_angles
-from pymavlink.dialects.v20 import common as mavlink
 
 RATES_IGNORED = (
     mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE,

@@ -6,10 +6,11 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.autopilot.flight_modes import Severity
 from mimopilot.sitl.mavlink.vehicle.telemetry_messages import NO_STREAM, TELEMETRY_MESSAGES
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
-from pymavlink.dialects.v20 import common as mavlink
 
 MAX_RATE = 250.0  # Hz, of one message: the default control rate
 STATUSTEXT_BYTES = 50  # length of STATUSTEXT.text

@@ -7,13 +7,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.autopilot.flight_modes import Mode
 from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, quaternions
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from mimopilot.sitl.physics.rigid_body import GRAVITY
-from pymavlink.dialects.v20 import common as mavlink
 
 UNKNOWN_16 = 65535  # "unknown" in a uint16 field, MAVLink common.xml
 CAPABILITIES = (

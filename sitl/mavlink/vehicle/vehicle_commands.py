@@ -7,11 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.autopilot.flight_modes import Commander, Denied, Failed, Mode, Refused, Severity
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
 from mimopilot.sitl.mavlink.vehicle.telemetry_messages import TELEMETRY_MESSAGES
 from mimopilot.sitl.mavlink.wire.px4_modes import mode_of, mode_of_pair
-from pymavlink.dialects.v20 import common as mavlink
 
 FORCE = 21196  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: override the checks
 TAKEOFF_HEIGHT = 2.5  # m, when none is given: PX4's default of MIS_TAKEOFF_ALT

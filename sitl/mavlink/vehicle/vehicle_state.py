@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+
 from mimopilot.sitl.autopilot.autopilot import RECORD
 from mimopilot.sitl.autopilot.flight_modes import Commander
 from mimopilot.sitl.autopilot.setpoints import earth_to_heading

@@ -6,8 +6,9 @@ import re
 from collections.abc import Container, Iterator
 from typing import Any
 
-from mimopilot.sitl.mavlink.wire.signing import SIGNATURE_BYTES, Signer
 from pymavlink.dialects.v20 import common as mavlink
+
+from mimopilot.sitl.mavlink.wire.signing import SIGNATURE_BYTES, Signer
 
 #: Identity of the simulated vehicle: the first system, component MAV_COMP_ID_AUTOPILOT1.
 SYSTEM, COMPONENT = 1, 1

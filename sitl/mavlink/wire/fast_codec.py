@@ -12,9 +12,10 @@ import struct
 import time
 from typing import Any
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.mavlink.wire.codec import CRC_BYTES, SIGNED, checksum
 from mimopilot.sitl.mavlink.wire.signing import SIGNATURE_BYTES
-from pymavlink.dialects.v20 import common as mavlink
 
 # Fields in wire order, arrays flattened:
 SENSOR = mavlink.MAVLink_hil_sensor_message  # time_usec, acc 3, gyro 3, mag 3, 4 of pressure, fields_updated, id

@@ -5,8 +5,9 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from mimopilot.sitl.errors import SitlError
 from pymavlink.dialects.v20 import common as mavlink
+
+from mimopilot.sitl.errors import SitlError
 
 #: param_type of a float32.
 REAL32: int = mavlink.MAV_PARAM_TYPE_REAL32

@@ -11,12 +11,11 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from mimopilot.common.files import read_text, sha256
+from mimopilot.common.toml import shown
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
 from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest, single
-
-from mimopilot.common.files import read_text, sha256
-from mimopilot.common.toml import shown
 
 CHECKSUM_LINE = re.compile(r"# mimopilot: (\d+) parameters, sha256 ([0-9a-f]{64})")
 NAME = re.compile(r"[A-Z][A-Z0-9_]{0,15}")  # 16 characters: MAVLink's param_id

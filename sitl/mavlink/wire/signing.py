@@ -12,9 +12,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from mimopilot.sitl.errors import SitlError
-
 from mimopilot.common.files import read_bytes
+from mimopilot.sitl.errors import SitlError
 
 KEY_BYTES = 32
 EPOCH_S, UNITS_PER_S = 1420070400, 100_000  # 2015-01-01

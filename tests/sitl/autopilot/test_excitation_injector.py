@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from mimopilot.sitl.autopilot.excitation_injector import NO_MOMENT, Conditions, ExcitationPhase, Injector
 from mimopilot.tuning.excitation import prbs
 from mimopilot.tuning.parameters import EXCITATION

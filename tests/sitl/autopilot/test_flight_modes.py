@@ -5,6 +5,7 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mimopilot.sitl.autopilot.autopilot import altitude_hold
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.autopilot.flight_modes import Commander, Mode, Refused, Severity

@@ -16,6 +16,12 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pyulog import ULog
+from scipy.special import ndtri
+from scipy.stats import binom
+
+from mimopilot.common.errors import InputFileError
+from mimopilot.common.intervals import quantile, wilson
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.campaign.campaign_figures import choose_map, parse_map
 from mimopilot.sitl.campaign.draws import RunSampler
@@ -30,12 +36,6 @@ from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY, checked_inertia
-from pyulog import ULog
-from scipy.special import ndtri
-from scipy.stats import binom
-
-from mimopilot.common.errors import InputFileError
-from mimopilot.common.intervals import quantile, wilson
 from tests.conftest import assert_one_clear_line
 from tests.paths import TOP
 from tests.sitl.mavlink.running import PATIENCE_S

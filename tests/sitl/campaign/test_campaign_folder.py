@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+
 from mimopilot.sitl.campaign.execution import run_campaign
 from mimopilot.sitl.campaign.flights import CHUNK, fly_chunk
 from mimopilot.sitl.campaign.plan import LOCK, PARTS, RESULTS, make_plan, write_plan_files

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.common.errors import InputFileError
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS
 from mimopilot.sitl.errors import SitlError
@@ -21,8 +23,6 @@ from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.spec import load_spec
-
-from mimopilot.common.errors import InputFileError
 from tests.conftest import assert_one_clear_line
 
 TS = 0.004

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pyulog import ULog
+
 from mimopilot.codegen.cortex_m4 import load_emulated
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot
 from mimopilot.sitl.errors import SitlError
@@ -17,7 +19,6 @@ from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import PARAMETERS
 from mimopilot.tuning.reference_model import second_order
-from pyulog import ULog
 
 TS = 0.004
 

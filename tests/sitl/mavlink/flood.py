@@ -10,10 +10,10 @@ import socket
 import time
 from typing import NamedTuple
 
-from mimopilot.sitl.mavlink.wire.codec import Codec
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.common.console import print_table
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from tests.sitl.mavlink.running import running_sitl
 
 

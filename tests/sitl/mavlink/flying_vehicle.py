@@ -11,7 +11,6 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     StatusText,
 )
 from mimopilot.tuning.parameters import EXCITATION
-
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle
 
 HOLD = 4 << 16 | 3 << 24

@@ -12,7 +12,10 @@ import sys
 import time
 from collections import Counter
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.common.console import print_table
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.excitation_injector import Injector
 from mimopilot.sitl.autopilot.flight_modes import Commander, Mode
@@ -27,9 +30,6 @@ from mimopilot.sitl.mavlink.wire.codec import KINDS, Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.state_estimate import euler_angles
-from pymavlink.dialects.v20 import common as mavlink
-
-from mimopilot.common.console import print_table
 from tests.sitl.mavlink.running import PATIENCE_S
 
 KEY = bytes(range(32))

@@ -9,9 +9,10 @@ import threading
 import time
 from contextlib import contextmanager
 
-from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
+
+from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 
 #: Timeout for any expected event, s: so long that a busy machine does not fail a test.
 PATIENCE_S = 180.0

@@ -16,6 +16,8 @@ import threading
 import time
 import tty
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.mavlink.ground_station.events import (
     HEARTBEAT,
     SOLE_PEER,
@@ -29,7 +31,6 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     SetParameter,
     StoreParameters,
 )
-from pymavlink.dialects.v20 import common as mavlink
 
 SYSTEM, COMPONENT = 1, 1
 STREAM_S = 0.1

@@ -5,6 +5,7 @@ import signal
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SetParameter, run_exchange
@@ -12,7 +13,6 @@ from mimopilot.sitl.mavlink.ground_station.experiment import INTEGERS, excite, s
 from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions, settings
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.tuning.logs.reader import read_log
-
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
 from tests.sitl.mavlink.running import PATIENCE_S, Pilot, running_sitl, start

@@ -1,6 +1,7 @@
 """Failures after every write was acknowledged, old HEARTBEATs, and other vehicles on the link, in simulated time."""
 
 import pytest
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
     AttitudeReport,
@@ -16,7 +17,6 @@ from mimopilot.sitl.mavlink.ground_station.events import (
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
 from mimopilot.sitl.mavlink.wire.float32 import single
-
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, SimulatedLink
 
 NAMES = [f"MIMO_X_{i:02d}" for i in range(20)]

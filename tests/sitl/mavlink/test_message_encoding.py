@@ -6,6 +6,8 @@ import struct
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.mavlink.ground_station.connection import from_mavlink, to_mavlink
 from mimopilot.sitl.mavlink.ground_station.events import (
     GroundHeartbeat,
@@ -18,8 +20,6 @@ from mimopilot.sitl.mavlink.ground_station.events import (
 )
 from mimopilot.sitl.mavlink.wire.link import Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
-from pymavlink.dialects.v20 import common as mavlink
-
 from tests.sitl.mavlink.scripted_vehicle import encode, float32
 
 KEY = bytes(range(32))

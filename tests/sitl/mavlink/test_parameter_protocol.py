@@ -6,6 +6,7 @@ from itertools import pairwise
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
     SOLE_PEER,
@@ -22,7 +23,6 @@ from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S,
 from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
 from mimopilot.sitl.mavlink.ground_station.vehicle_contact import LISTEN_S
 from mimopilot.sitl.mavlink.wire.float32 import single
-
 from tests.sitl.mavlink.scripted_vehicle import FAILING, ScriptedVehicle, SimulatedLink
 
 NAMES = [f"MIMO_X_{i:02d}" for i in range(20)]

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.errors import SitlError

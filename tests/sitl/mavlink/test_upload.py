@@ -6,13 +6,13 @@ import signal
 import subprocess
 
 import pytest
+
 from mimopilot.codegen.render import render
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameters import PARAMETERS
-
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.running import PATIENCE_S, QUICK, Pilot, running_sitl, wait_for
 from tests.sitl.mavlink.scripted_vehicle import (

@@ -3,12 +3,12 @@
 import json
 
 import pytest
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.connection import Connection
 from mimopilot.sitl.mavlink.ground_station.events import ParameterValue
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.mavlink.wire.signing import read_key
-
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.running import wait_for
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, UdpVehicle, float32

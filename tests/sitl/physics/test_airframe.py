@@ -4,6 +4,8 @@ import dataclasses
 
 import numpy as np
 import pytest
+
+from mimopilot.common.errors import InputFileError
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import doublet
@@ -13,8 +15,6 @@ from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.provenance import Provenance
-
-from mimopilot.common.errors import InputFileError
 from tests.conftest import assert_one_clear_line
 
 TS = 0.004

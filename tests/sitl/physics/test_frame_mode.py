@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import doublet, excitation_flight

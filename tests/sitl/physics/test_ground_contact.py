@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mimopilot.sitl.physics.airframe import known_airframes, load_airframe
 from mimopilot.sitl.physics.ground_contact import FRICTION, apply_ground_contact, ground_state
 from mimopilot.sitl.physics.rigid_body import GRAVITY, advance, hover_state

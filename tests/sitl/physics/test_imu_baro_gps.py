@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.flight.simulator import Simulator
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.ground_contact import ground_state

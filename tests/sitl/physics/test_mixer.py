@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.physics.mixer import allocate, make_allocation, moment_scale

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import ellipj
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.airframe import PointMass, combine_masses, load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, advance, hover_state, integrate_moments
-from scipy.special import ellipj
 
 
 def rotate(q, v):

@@ -4,6 +4,9 @@ import json
 
 import numpy as np
 import pytest
+
+from mimopilot.cli.studies import Study as Choice
+from mimopilot.common.parallel import processes
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.studies.attitude_report import study_sections
@@ -14,9 +17,6 @@ from mimopilot.sitl.studies.autotune import autotune, identify_arx, minimum_vari
 from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.sitl.studies.expectations import EFFORT, expectations
 from mimopilot.sitl.studies.reproduce import ALL, STUDIES, reproduce
-
-from mimopilot.cli.studies import Study as Choice
-from mimopilot.common.parallel import processes
 
 PRINTED = json.loads(TABLES.read_text())
 SEEDS = 3

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
+
 from mimopilot.sitl.studies.benchmarks import excitation, lv100, numerical_example
-from mimopilot.tuning.design.refine import refine
+from mimopilot.tuning.design.refine_on_model import refine_on_model
 from mimopilot.tuning.estimation.vrft import vrft
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.loop_controller import LoopController, closed_loop
@@ -33,7 +34,7 @@ def test_the_best_pi_has_its_known_cost_and_refinement_on_the_true_plant_finds_i
         [[0.4432, 0.4428], [22.94, -3.797]], [[-0.1291, -0.3331], [-22.17, 2.363]], TS
     )
     assert task.cost(best) == pytest.approx(BEST, abs=5e-5)
-    found = refine(printed("IFT"), task.plant, task.models)
+    found = refine_on_model(printed("IFT"), task.plant, task.models)
     assert task.cost(found.controller) <= task.cost(best) + 1e-6
     for got, known in zip(found.controller.polynomial(), best.polynomial(), strict=True):
         assert got == pytest.approx(known, rel=2e-3)
@@ -84,7 +85,7 @@ def test_one_lv100_experiment_gives_a_controller_close_to_the_best_possible(desi
         start = LoopController(vrft(u, y, u_bar, task.models, "PI").gains, Filters(TS))
         model = pbsid(u, y, TS, external=u_bar)
         plain.append(task.cost(start))
-        refined.append(task.cost(refine(start, model.plant, task.models).controller))
+        refined.append(task.cost(refine_on_model(start, model.plant, task.models).controller))
     assert np.median(refined) <= 0.0535
     assert max(refined) <= 0.058
     # Only by refinement: VRFT alone does not reach it.

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binomtest
+
 from mimopilot.sitl.autopilot.autopilot import RECORD
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import parse_fault
@@ -15,8 +17,6 @@ from mimopilot.sitl.flight.simulator import TRUTH, Flight
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.studies.fault_table import FaultTableRequest, fault_table
 from mimopilot.sitl.studies.standard_faults import standard_faults
-from scipy.stats import binomtest
-
 from tests.conftest import assert_one_clear_line
 
 TS = 0.004

@@ -6,9 +6,10 @@ without coupling between roll and pitch. Nobody here wrote the plant that flew.
 
 from dataclasses import replace
 
-import mimopilot.tuning.design.advise as advisor
 import numpy as np
 import pytest
+
+import mimopilot.tuning.design.advise as advisor
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
@@ -19,7 +20,6 @@ from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import load_spec
-
 from tests.paths import DATA
 
 TS = 0.004

@@ -2,12 +2,12 @@ import json
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.studies.benchmark_studies import gain_spread, run_cbt, run_ift, study_lv100
 from mimopilot.sitl.studies.benchmarks import excitation, lv100
 from mimopilot.sitl.studies.reproduce import reproduce
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.cbt_ift import correlation_based_tuning, iterative_feedback_tuning
-
 from tests.conftest import assert_one_clear_line
 
 

@@ -1,32 +1,26 @@
-"""The certificate against plants whose closed loop is known exactly."""
+"""The certificate against the exact closed loop of simulated airframes, for random gain sets."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+
+from mimopilot.common.errors import InputFileError
 from mimopilot.sitl.physics.airframe import Frame, load_airframe
-from mimopilot.tuning.analysis.certificate import certify, large_again
+from mimopilot.tuning.analysis.beyond_band import find_structural_mode
+from mimopilot.tuning.analysis.certificate import certify
 from mimopilot.tuning.certificate import Thresholds, Verdict
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
-from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import load_spec
-
+from tests.tuning.analysis.loops import MODELS, exact, random_set
 from tests.tuning.truth import TS, Truth, experiment
 
-MODELS = ((second_order(20, 0.4, 0, TS),) * 2, (second_order(10, 0.7, 0, TS),) * 2)
-#: Amplitude of the excitation: ANT-R hovers at 14 % of its thrust, where a larger one is no longer linear.
+#: Amplitude of the excitation; ANT-R hovers at 14 % of its thrust and is not linear for a larger one.
 PLANTS = {"adam0": 0.15, "adam0_perturbed": 0.15, "adam0_boom": 0.15, "antr": 0.05, "px4_sih": 0.15}
-
-
-def exact(plant, omega):
-    """A response without error."""
-    G = plant.frequency_response(omega)
-    empty = np.zeros((len(omega), 6, 6)), np.zeros((len(omega), 2, 2))
-    return PlantResponse(omega, G[:, :2], G[:, 2:], *empty, np.ones((len(omega), 2)), TS)
 
 
 @pytest.fixture(scope="module")
@@ -46,29 +40,14 @@ def test_the_measured_response_is_that_of_the_plant(flights):
         for got, wanted in ((plant.G_i, true.G_i), (plant.G_o, true.G_o)):
             error = np.linalg.norm(got - wanted, axis=(1, 2)) / np.linalg.norm(wanted, axis=(1, 2))
             assert np.median(error[band]) < 0.03
-        # What is claimed of its error is what it is, in the part that noise decides.
+        # The estimated error is the true one where noise dominates.
         noisy = plant.known() & (plant.omega > 60)
         error = np.linalg.norm(plant.G_i - true.G_i, axis=(1, 2)) / np.linalg.norm(plant.deviation(), axis=(1, 2))
         assert 0.4 < np.sqrt(np.mean(error[noisy] ** 2)) < 1.6
 
 
-def random_set(base, rng):
-    """A set of another loop gain, another balance of its terms, and other coupling."""
-    scale = {code: np.exp(rng.uniform(-1.2, 1.3)) for code in ("AP", "RP", "RI", "RD")}
-    changes = {}
-    for code, value in base.elements().items():
-        if code[:2] not in scale or code.endswith("Y"):
-            continue
-        diagonal = base.elements()[code[:4] + code[3]]
-        if code[3] == code[4]:
-            changes[code] = float(value * scale[code[:2]] * np.exp(0.25 * rng.normal()))
-        else:
-            changes[code] = float(value + 0.25 * scale[code[:2]] * abs(diagonal) * rng.normal())
-    return base.with_elements(changes)
-
-
 def judged(measured, truth, count, rng):
-    """Verdicts of sets with good margins, and of unstable ones, by the true loop."""
+    """Verdicts on sets that have good margins in the true loop, and on unstable ones."""
     bases = (measured.experiment.flown, tune(measured.experiment))
     good, unstable = [], []
     while len(good) < count or len(unstable) < count:
@@ -102,7 +81,7 @@ def flexible(request):
     return frequency, PlantEstimates(experiment("adam0", airframe=airframe)), Truth.of(airframe)
 
 
-def test_a_mode_of_the_frame_is_seen_and_what_it_makes_thin_or_unstable_is_not_certified(flexible):
+def test_a_structural_mode_is_detected_and_sets_that_it_destabilises_are_not_certified(flexible):
     frequency, measured, truth = flexible
     omega = 2 * np.pi * frequency
     near = np.abs(measured.response.omega / omega - 1) < 0.05
@@ -117,26 +96,26 @@ def test_a_mode_of_the_frame_is_seen_and_what_it_makes_thin_or_unstable_is_not_c
             assert found.verdict in (Verdict.UNSTABLE, Verdict.NOT_CERTIFIED)
         elif truth.margins(gains, 500)[0] > 2.6:
             assert found.verdict not in (Verdict.CERTIFIED, Verdict.THIN)
-        again = large_again(gains, measured.response)
+        again = find_structural_mode(gains, measured.response)
         named += again is not None and abs(again[0] / omega - 1) < 0.05
     assert named >= 10
 
 
-def test_without_excitation_at_a_mode_its_neighbourhood_is_needed_and_noise_is_no_mode(flights):
+def test_noise_is_not_taken_for_a_structural_mode(flights):
     _, measured, _ = flights["adam0"]
-    assert large_again(load_airframe("adam0").default_gains(), measured.response) is None
+    assert find_structural_mode(load_airframe("adam0").default_gains(), measured.response) is None
 
 
 @pytest.mark.parametrize("name", ["y_i", "y_o"])
-def test_a_log_with_roll_in_place_of_pitch_is_refused(flights, name):
+def test_a_log_with_roll_in_the_pitch_column_is_refused(flights, name):
     log = flights["adam0"][0]
     twice = dataclasses.replace(log, **{name: np.repeat(getattr(log, name)[:, :1], 2, axis=1)})
     with pytest.raises(TuningError, match="are the same signal"):
         certify_from_log(twice, log.flown)
 
 
-def test_the_response_between_its_frequencies_is_that_of_a_body(flights):
-    """Exact for a body with damping, and near for a vehicle with motors."""
+def test_interpolation_between_frequencies_follows_a_rigid_body(flights):
+    """Exact for a body with damping, and close for a vehicle with motors."""
     omega = np.arange(1.3, 100.0, 1.3)
     K = np.array([[80.0, -8.0], [-7.0, 90.0]])
     empty = np.zeros((len(omega), 6, 6)), np.zeros((len(omega), 2, 2))
@@ -156,8 +135,8 @@ def test_the_response_between_its_frequencies_is_that_of_a_body(flights):
     assert error.max() < 0.02
 
 
-def test_every_margin_is_the_true_one(flights):
-    """Ms and phase against the exact loop, each within its own error and the motors' square law."""
+def test_margins_are_those_of_the_exact_loop(flights):
+    """Ms and phase margin, within their errors and the motors' square law."""
     for log, measured, truth in flights.values():
         for gains in (log.flown, tune(log)):
             figures = certify(gains, measured.response, *MODELS).figures
@@ -166,7 +145,7 @@ def test_every_margin_is_the_true_one(flights):
             assert min(figures["phase_margin_deg"].values()) == pytest.approx(phase, abs=4)
 
 
-def test_the_errors_of_the_peak_and_of_the_phase_are_their_spread_over_logs():
+def test_the_errors_of_peak_and_phase_margin_are_their_spread_over_logs():
     truth = Truth.of(load_airframe("px4_sih").airframe)
     gains = load_airframe("px4_sih").default_gains()
     found = [certify(gains, PlantEstimates(experiment("px4_sih", seed=s)).response, *MODELS).figures for s in range(12)]
@@ -189,26 +168,26 @@ def test_each_verdict_is_given_with_its_reason(flights):
     found = certify(reversed_axis, plant, *MODELS)
     assert (found.verdict, "rate loop" in found.reason) == (Verdict.UNSTABLE, True)
     thinner = (1.75, Verdict.THIN, "is above 1.8"), (2.6, Verdict.NOT_CERTIFIED, "the margin is too thin")
-    for factor, verdict, words in thinner:
+    for factor, verdict, text in thinner:
         outer = base.with_elements({"AP_RR": 6.5 * factor, "AP_PP": 6.5 * factor})
         assert truth.spectral_radius(outer) < 1
         found = certify(outer, plant, *MODELS)
         assert found.verdict == verdict
-        assert words in found.reason
+        assert text in found.reason
     narrow = plant.at(plant.omega < 12)
     found = certify(base, narrow, *MODELS)
     assert found.verdict == Verdict.NOT_CERTIFIED
     assert "excitation ends at" in found.reason
-    runaway = base.with_elements({"RI_RP": 0.3, "RI_PR": -0.05})
-    assert "Ki_i through the measured plant" in certify(runaway, plant, *MODELS).reason
+    diverging = base.with_elements({"RI_RP": 0.3, "RI_PR": -0.05})
+    assert "Ki_i through the measured plant" in certify(diverging, plant, *MODELS).reason
     late = plant.at(plant.omega > 9)
     assert "excitation begins at 9" in certify(base, late, *MODELS).reason
 
 
-def test_a_controller_without_an_integral_is_judged_as_well(flights):
+def test_a_controller_without_an_integral_can_be_certified(flights):
     for _, measured, truth in flights.values():
         gains = dataclasses.replace(measured.experiment.flown, Ki_i=np.zeros((2, 2)))
-        assert truth.spectral_radius(gains) == pytest.approx(1.0)  # the integrals stand still
+        assert truth.spectral_radius(gains) == pytest.approx(1.0)  # the unused integrals stay constant
         assert certify(gains, measured.response, *MODELS).verdict in (Verdict.CERTIFIED, Verdict.THIN)
         one = dataclasses.replace(gains, Ki_i=np.diag([0.05, 0.0]))
         assert certify(one, measured.response, *MODELS).verdict != Verdict.UNSTABLE
@@ -217,7 +196,7 @@ def test_a_controller_without_an_integral_is_judged_as_well(flights):
         assert certify(bad, measured.response, *MODELS, model=lambda m=measured: m.model).verdict == Verdict.UNSTABLE
 
 
-def test_thresholds_are_settable_stored_and_bound(flights):
+def test_thresholds_can_be_set_are_stored_and_are_sealed(flights):
     log, measured, _ = flights["adam0"]
     gains = log.flown
     strict = certify_from_log(log, gains, load_spec(certificate={"Ms": 1.2, "phase_deg": 60.0}))
@@ -227,13 +206,13 @@ def test_thresholds_are_settable_stored_and_bound(flights):
     outer = gains.with_elements({"AP_RR": 16.0, "AP_PP": 16.0})
     assert certify(outer, measured.response, *MODELS).verdict == Verdict.NOT_CERTIFIED
     assert certify(outer, measured.response, *MODELS, thresholds=loose).verdict == Verdict.THIN
-    with pytest.raises(TuningError, match="thin_Ms must be at least Ms"):
+    with pytest.raises(InputFileError, match="thin_Ms must be at least Ms"):
         load_spec(certificate={"Ms": 3.0})
     edited = dataclasses.replace(strict.certificate, thresholds={**strict.certificate.thresholds, "Ms": 1.8})
     assert dataclasses.replace(strict, certificate=edited).verdict()[0] == "void"
 
 
-def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_open(flights):
+def test_the_identified_model_decides_only_if_the_response_leaves_the_verdict_open(flights):
     _, measured, _ = flights["adam0"]
     base = measured.experiment.flown
     response, model = measured.response, measured.model
@@ -269,7 +248,7 @@ def test_the_identified_model_says_unstable_only_where_the_response_leaves_it_op
         lambda g: dataclasses.replace(g, certificate=dataclasses.replace(g.certificate, seal="")),
     ],
 )
-def test_whatever_is_edited_voids_the_certificate(flights, tmp_path, edit):
+def test_any_edit_voids_the_certificate(flights, tmp_path, edit):
     from mimopilot.tuning.gains_file import load_gains
 
     log = flights["adam0"][0]
@@ -281,24 +260,24 @@ def test_whatever_is_edited_voids_the_certificate(flights, tmp_path, edit):
     assert load_gains(tmp_path / "y.gains.toml").verdict()[0] == "void"
 
 
-def test_a_log_of_another_unit_of_torque_does_not_certify(flights):
+def test_a_log_with_another_unit_of_torque_is_refused(flights):
     log = flights["adam0"][0]
     other_unit = dataclasses.replace(log.flown, moment_scale=(25.0, 25.0, 2.7))
-    with pytest.raises(TuningError, match=r"stands for 2\.546, 2\.546 N m .* in the gains for 25, 25"):
+    with pytest.raises(TuningError, match=r"u = 1 stands for 2\.546, 2\.546 N m .* in the gains for 25, 25"):
         certify_from_log(log, other_unit)
     assert dataclasses.replace(log.flown, certificate=None).verdict()[0] == "none"
 
 
-def test_margins_are_where_the_loop_becomes_unstable(flights):
+def test_the_loop_becomes_unstable_beyond_its_margins(flights):
     _, measured, _ = flights["adam0"]
     airframe = load_airframe("adam0").airframe
     gains = measured.experiment.flown.with_elements({"RP_RR": 0.5, "RP_PP": 0.5, "AP_RR": 4.0, "AP_PP": 4.0})
     figures = certify(gains, measured.response, *MODELS).figures
-    # All axes late at once: no axis has less than it has by itself with the other one on time.
+    # Both axes are delayed: the margin of each is with the other one on time.
     late = min(figures["delay_margin_ms"].values()) / 1e3 / TS
     assert Truth.of(airframe, int(0.8 * late)).spectral_radius(gains) < 1
     assert Truth.of(airframe, int(1.25 * late) + 1).spectral_radius(gains) > 1
-    # The gain margin is one that can be vouched for: the truth may be larger.
+    # The gain margin is a lower bound: the true one may be larger.
     assert set(figures["gain_margin"].values()) <= {"exact", "at least"}
     margin = 10 ** (figures["gain_margin_db"]["roll"] / 20)
     assert margin > 1.5

@@ -1,8 +1,9 @@
-"""Margins of loops that are known in closed form, or to python-control."""
+"""Margins of loops with known closed-form margins, and against python-control."""
 
 import control
 import numpy as np
 import pytest
+
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop
 from mimopilot.tuning.analysis.margins import (
     axis_loops,
@@ -12,17 +13,17 @@ from mimopilot.tuning.analysis.margins import (
     peak,
     phase_margin,
     sensitivity,
-    simultaneous,
+    simultaneous_margins,
 )
 
 OMEGA = np.geomspace(1e-2, 1e2, 8000)
 S = 1j * OMEGA
-#: Every crossing is interpolated on this grid, 0.12 % a step.
+#: Tolerance of crossings interpolated on this grid of 0.12 % steps.
 EXACT = 1e-4
 
 
 def diagonal(*loops):
-    """Loops of axes that do not touch each other, (K, 2, 2)."""
+    """Loops of uncoupled axes, (K, 2, 2)."""
     matrix = np.zeros((len(OMEGA), len(loops), len(loops)), complex)
     for i, loop in enumerate(loops):
         matrix[:, i, i] = loop
@@ -34,7 +35,7 @@ def sensitivity_of(L):
     return sensitivity(CascadeLoop(empty, L, empty, empty))
 
 
-def test_an_integrator_has_all_the_margin_there_is():
+def test_an_integrator_has_90_degrees_and_infinite_gain_margin():
     loop = 2 / S
     sensitivities = sensitivity_of(diagonal(loop, loop))
     assert peak(sensitivities) == pytest.approx(1.0, abs=1e-3)
@@ -46,7 +47,7 @@ def test_an_integrator_has_all_the_margin_there_is():
 
 
 @pytest.mark.parametrize("T", [0.3, 1.0])
-def test_a_delay_takes_its_phase_and_its_time(T):
+def test_a_delay_reduces_phase_and_delay_margin(T):
     loop = np.exp(-S * T) / S
     phase, late = phase_margin(loop, OMEGA)
     assert phase == pytest.approx(90 - np.degrees(T), rel=EXACT)
@@ -54,26 +55,26 @@ def test_a_delay_takes_its_phase_and_its_time(T):
     assert gain_margin(loop) == pytest.approx(20 * np.log10(np.pi / 2 / T), rel=EXACT)
 
 
-def test_three_lags_have_the_gain_margin_of_the_textbook():
+def test_three_lags_have_their_textbook_gain_margin():
     """1 / (s (s + 1)^2) crosses the real axis at -1/2; 1 / (s + 1)^3 at -1/8."""
     assert gain_margin(1 / (S * (S + 1) ** 2)) == pytest.approx(20 * np.log10(2), rel=EXACT)
     assert gain_margin(1 / (S + 1) ** 3) == pytest.approx(20 * np.log10(8), rel=EXACT)
 
 
-def test_a_loop_that_too_little_gain_makes_unstable_has_that_margin():
+def test_a_conditionally_stable_loop_has_the_margin_of_a_lower_gain():
     """(s + 1)^2 / s^3 is stable above a gain of 1/2, without an upper bound."""
     assert gain_margin((S + 1) ** 2 / S**3) == pytest.approx(20 * np.log10(2), rel=EXACT)
 
 
-def test_a_loop_that_leads_has_a_delay_margin_of_most_of_a_turn():
-    """s crosses 1 at +90 degrees: 90 degrees of phase on its near side, 270 of delay."""
+def test_a_leading_loop_has_a_delay_margin_of_270_degrees():
+    """s crosses 1 at +90 degrees: the phase margin is 90 degrees, the delay margin 270 degrees."""
     phase, late = phase_margin(S, OMEGA)
     assert phase == pytest.approx(90.0, rel=EXACT)
     assert late == pytest.approx(1.5 * np.pi * 1e3, rel=EXACT)
 
 
 def test_the_smallest_delay_may_be_at_another_crossing_than_the_smallest_phase():
-    """A crossing at 1 rad/s with 30 degrees; a resonance at 30 rad/s that has more phase, but less time."""
+    """A crossing at 1 rad/s with 30 degrees; a resonance at 30 rad/s with more phase, but less delay margin."""
     resonance = 0.02 * S / (S**2 + 2 * 0.005 * 30 * S + 900) * 30
     loop = np.exp(-S * np.pi / 3) / S + resonance * np.exp(S * np.pi / 6)
     found = phase_margin(loop, OMEGA)
@@ -86,7 +87,7 @@ def test_the_smallest_delay_may_be_at_another_crossing_than_the_smallest_phase()
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_one_loop_has_the_margins_that_python_control_finds(seed):
+def test_a_single_loop_has_the_margins_of_python_control(seed):
     rng = np.random.default_rng(seed)
     poles, gain = rng.uniform(0.5, 8, 3), rng.uniform(0.5, 1.5)
     system = control.tf([gain * poles.prod()], np.poly([0, *-poles]))
@@ -98,20 +99,20 @@ def test_one_loop_has_the_margins_that_python_control_finds(seed):
     assert peak(sensitivities) == pytest.approx(1 / sm, rel=1e-3)
     disk, gain_db, phase = control.disk_margins(system, OMEGA, skew=0.0)
     assert disk_margin(sensitivities) == pytest.approx(disk, rel=1e-6)
-    assert simultaneous(disk_margin(sensitivities)) == pytest.approx((gain_db, phase), rel=1e-6)
+    assert simultaneous_margins(disk_margin(sensitivities)) == pytest.approx((gain_db, phase), rel=1e-6)
 
 
 def test_a_disk_margin_of_one_is_a_factor_of_three_and_53_degrees():
-    assert simultaneous(1.0) == pytest.approx((20 * np.log10(3), 2 * np.degrees(np.arctan(0.5))))
-    assert simultaneous(2.0) == (np.inf, 90.0)
+    assert simultaneous_margins(1.0) == pytest.approx((20 * np.log10(3), 2 * np.degrees(np.arctan(0.5))))
+    assert simultaneous_margins(2.0) == (np.inf, 90.0)
 
 
 def coupled():
-    """A loop of two axes with unlike gains and much of one in the other."""
+    """A strongly coupled loop of two axes with different gains."""
     return np.array([[6.0, 2.5], [-1.5, 4.0]]) / (S * (0.1 * S + 1) ** 2)[:, None, None]
 
 
-def test_factors_just_beyond_the_disk_margin_make_two_axes_unstable_and_none_within_it():
+def test_factors_beyond_the_disk_margin_can_destabilise_and_those_within_cannot():
     L = coupled()
     sensitivities = sensitivity_of(L)
     radius = disk_margin(sensitivities)
@@ -134,15 +135,15 @@ def test_factors_just_beyond_the_disk_margin_make_two_axes_unstable_and_none_wit
         assert distance(0.9 * radius, at, X / np.linalg.norm(X, ord=2)) > 0.01
 
 
-def test_the_loop_of_an_axis_is_that_with_the_other_one_closed():
+def test_the_loop_of_an_axis_has_the_other_axis_closed():
     L = coupled()
     roll, pitch = axis_loops(sensitivity_of(L))
     assert roll == pytest.approx(L[:, 0, 0] - L[:, 0, 1] * L[:, 1, 0] / (1 + L[:, 1, 1]), rel=1e-9)
     assert pitch == pytest.approx(L[:, 1, 1] - L[:, 1, 0] * L[:, 0, 1] / (1 + L[:, 0, 0]), rel=1e-9)
 
 
-def test_the_peak_is_that_of_the_worst_direction():
-    """The largest singular value, not that of an axis: of a known matrix it is 1 + sqrt(2)."""
+def test_the_peak_is_the_largest_singular_value():
+    """Not that of a single axis: of this matrix it is 1 + sqrt(2)."""
     L = np.broadcast_to(np.linalg.inv([[1.0, 2.0], [0.0, 1.0]]) - np.eye(2), (5, 2, 2)).astype(complex)
     assert peak(sensitivity_of(L)) == pytest.approx(1 + np.sqrt(2))
 
@@ -158,7 +159,7 @@ def test_the_peak_is_that_of_the_worst_direction():
         (0.0, [(20 * np.log10(2), "exact"), (20 * np.log10(8), "exact")]),
     ],
 )
-def test_a_gain_margin_is_claimed_only_as_far_as_the_loop_is_known(above, expected):
+def test_no_gain_margin_is_claimed_beyond_the_bound_above_the_band(above, expected):
     loops = np.stack([1 / (S * (S + 1) ** 2), 1 / (S + 1) ** 3])
     found = gain_margins(loops, above)
     for axis, (margin, kind) in zip(("roll", "pitch"), expected, strict=True):

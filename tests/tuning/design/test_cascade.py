@@ -1,19 +1,20 @@
-"""The whole cascade from one flight: what comes out, how sure it is, and what is refused."""
+"""Tuning of the whole cascade from one flight: gains, their errors, and logs that are refused."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.metrics import performance
 from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.design.cascade import estimate, tune
-from mimopilot.tuning.design.estimate_checks import examine_estimates, examine_saturation
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.cascade_estimate import estimate
+from mimopilot.tuning.design.quality_checks import check_estimates, check_saturation
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.reference_model import second_order
-
 from tests.tuning.analysis.test_certificate import experiment
 from tests.tuning.truth import thesis
 
@@ -34,7 +35,7 @@ def test_the_rate_gains_have_the_structure_of_the_inertia(tuned):
     airframe = load_airframe("adam0").airframe
     J = np.array(airframe.inertia)[:2, :2]
     Kp = tuned["mimo"].Kp_i
-    # K_p is proportional to the inertia, so that the moment decouples the axes.
+    # K_p is proportional to the inertia, so that the torque decouples the axes.
     assert Kp / Kp[0, 0] == pytest.approx(J / J[0, 0], abs=0.01)
     # mu = M_max/J, d and the motor's lag give the ideal 400 (s + d)(tau s + 1)/(mu s (s + 16)) at low frequency.
     assert Kp[0, 0] == pytest.approx(0.1464, rel=0.02)
@@ -61,7 +62,7 @@ def test_refined_attitude_gains_follow_the_outer_model_better(log, tuned):
         assert figures["refined"].offaxis_peak_deg < figures["siso"].offaxis_peak_deg / 5
 
 
-def test_the_pull_goes_from_the_estimate_to_the_flying_gains(log, tuned):
+def test_the_pull_moves_the_estimate_towards_the_flown_gains(log, tuned):
     flown = log.flown.Kp_i
     near = tune(log, thesis(pull=1e4))
     assert near.Kp_i == pytest.approx(flown, abs=1e-3)
@@ -69,7 +70,7 @@ def test_the_pull_goes_from_the_estimate_to_the_flying_gains(log, tuned):
     assert slight.Kp_i == pytest.approx(tuned["mimo"].Kp_i, rel=1e-3)
 
 
-def test_a_log_that_does_not_say_what_flew_needs_a_specification(log):
+def test_a_log_without_the_flown_gains_needs_a_specification(log):
     unknown = dataclasses.replace(log, flown=None)
     with pytest.raises(TuningError, match="yaw gains"):
         tune(unknown, thesis())
@@ -90,32 +91,33 @@ def test_a_flight_without_excitation_or_on_one_axis_only_is_refused(log):
             tune(dataclasses.replace(log, u_bar=one_axis), thesis(method=method))
 
 
-def test_noise_in_place_of_flight_is_refused_by_the_gates(log):
+def test_a_log_of_noise_is_refused_by_the_quality_checks(log):
     rng = np.random.default_rng(0)
     noise = dataclasses.replace(log, u=0.1 * rng.standard_normal(log.u.shape), y_i=rng.standard_normal(log.u.shape))
     with pytest.raises(TuningError, match="not excited: the response from torque to rates is known at 0 frequencies"):
         tune(noise, thesis())
     found = estimate(noise, thesis())
-    with pytest.raises(TuningError, match=r"the excitation explains .* of what the roll gains are found from"):
-        examine_estimates("log", found.stretches, found.inner, noise.Ts)
+    explained = r"the excitation explains .* of the signals that the roll gains are found from"
+    with pytest.raises(TuningError, match=explained):
+        check_estimates("log", found.stretches, found.inner, noise.Ts)
 
 
-def test_a_saturated_flight_is_refused_and_an_occasional_limit_warned_about(log):
+def test_a_saturated_flight_is_refused_and_occasional_saturation_gives_a_warning(log):
     limit = 0.999 * log.flown.limits.moment_max[0]
     often, sometimes = log.u.copy(), log.u.copy()
     often[::3] = limit + 0.01
     sometimes[::20] = limit + 0.01
-    with pytest.raises(TuningError, match="saturated: the roll moment is at its limit for 33%"):
-        examine_saturation(dataclasses.replace(log, u=often))
-    assert len(examine_saturation(dataclasses.replace(log, u=sometimes))) == 2
-    assert examine_saturation(log) == []
+    with pytest.raises(TuningError, match="saturated: the roll torque is at its limit for 33%"):
+        check_saturation(dataclasses.replace(log, u=often))
+    assert len(check_saturation(dataclasses.replace(log, u=sometimes))) == 2
+    assert check_saturation(log) == []
 
 
-def test_a_vibration_is_no_reason_to_refuse_and_is_told(log):
-    """A tone of 110 Hz on the gyro: what is below it is explained as before."""
+def test_a_vibration_gives_a_warning_and_is_not_refused(log):
+    """A tone of 110 Hz on the gyro: signals below it are explained as before."""
     t = np.arange(len(log.u)) * log.Ts
     tone = 3.0 * np.sin(2 * np.pi * 110 * t)[:, None] * np.ones(2)
     gains = tune(dataclasses.replace(log, y_i=log.y_i + tone), thesis())
-    told = [text for text in gains.provenance.warnings if "a vibration" in text]
-    assert told
-    assert "of what is below 40 Hz" in told[0]
+    warnings = [text for text in gains.provenance.warnings if "a vibration" in text]
+    assert warnings
+    assert "of it below 40 Hz" in warnings[0]

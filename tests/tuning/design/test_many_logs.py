@@ -1,9 +1,10 @@
-"""Repeated experiments: each log is tuned by itself, and the distributions are those of the gains."""
+"""Repeated experiments: each log is tuned by itself, and the distributions of the gains are reported."""
 
 import json
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, log_name, repeat_experiment
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.design.cascade import tune
@@ -12,13 +13,12 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import MATRICES
-
 from tests.conftest import assert_one_clear_line
 
 
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory):
-    """Four experiments with the same excitation, and a file that is no log."""
+    """Four experiments with the same excitation, and a file that is not a log."""
     folder = tmp_path_factory.mktemp("logs")
     vehicle = load_airframe("adam0")
     plan = ExperimentPlan(vehicle.airframe, vehicle.default_gains(), 10.0, 0.15, 50.0, 7)
@@ -29,9 +29,7 @@ def logs(tmp_path_factory):
     return folder
 
 
-def test_runs_of_an_experiment_are_those_of_its_seeds_and_share_the_excitation_that_was_asked_for(
-    logs, mimopilot, tmp_path
-):
+def test_runs_of_an_experiment_differ_by_their_seeds_and_share_the_excitation(logs, mimopilot, tmp_path):
     options = ["--seconds-per-axis", 10, "--seed", 5, "--excitation-seed", 7, "--out", "one.ulg"]
     assert mimopilot("experiment", "adam0", *options).returncode == 0
     assert log_name(logs, 5).read_bytes() == (tmp_path / "one.ulg").read_bytes()
@@ -40,7 +38,7 @@ def test_runs_of_an_experiment_are_those_of_its_seeds_and_share_the_excitation_t
     assert (first.y_i != second.y_i).any()
 
 
-def test_a_campaign_tunes_each_log_as_if_it_were_alone_and_sums_them_up(logs, mimopilot, tmp_path):
+def test_a_campaign_tunes_each_log_by_itself_and_reports_the_distributions(logs, mimopilot, tmp_path):
     finished = mimopilot("tune", logs, "--campaign", "--out", "tuned", "--json")
     assert finished.returncode == 0, finished.stderr
     found = json.loads(finished.stdout)
@@ -67,7 +65,7 @@ def test_many_logs_without_campaign_and_a_campaign_without_logs_are_refused(logs
     two = [log_name(logs, 3), log_name(logs, 4)]
     assert_one_clear_line(mimopilot("tune", *two, "--out", "x.gains.toml"), "2 logs", "--campaign")
     (tmp_path / "empty").mkdir()
-    assert_one_clear_line(mimopilot("tune", "empty", "--campaign", "--out", "t"), "no logs are in this folder")
+    assert_one_clear_line(mimopilot("tune", "empty", "--campaign", "--out", "t"), "no logs in this folder")
     assert_one_clear_line(
         mimopilot("tune", logs / "notes.ulg", "--campaign", "--out", "t"), "all 1 logs were refused", "notes.ulg"
     )

@@ -1,8 +1,9 @@
-"""95 % intervals against repeated noise: each gain by itself, 200 runs of one excitation."""
+"""Coverage of the 95 % confidence intervals of each gain, over 200 runs with the same excitation."""
 
 import dataclasses
 
 import numpy as np
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import excitation_flight
 from mimopilot.sitl.flight.simulator import fly
@@ -37,8 +38,8 @@ def test_intervals_of_adam_0_cover_the_noise_free_estimate():
     coverage = {name: np.mean(hit, axis=0) for name, hit in hits.items()}
     assert coverage["Kp_o"].min() >= 0.90
     assert coverage["Kp_o"].max() <= 0.98
-    # What the motors' square law adds to the response repeats with the excitation, but counts as noise: the intervals
-    # of the rate gains are up to a third too wide, never too narrow.
+    # The response of the motors' square law repeats with the excitation but counts as noise: the intervals of the rate
+    # gains are up to a third too wide, never too narrow.
     for name in ("Kp_i", "Ki_i", "Kd_i"):
         assert coverage[name].min() >= 0.94
     assert np.mean([coverage[name] for name in ("Kp_i", "Ki_i", "Kd_i")]) <= 0.99

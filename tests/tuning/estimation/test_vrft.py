@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import cross_correlation
 from mimopilot.tuning.estimation.vrft import vrft
 from mimopilot.tuning.reference_model import ReferenceModel, second_order
-
 from tests.paths import TOP
 
 #: theory: G = [[0.09516, 0.03807], [-0.02974, 0.04758]]/(z - 0.9048), Ts = 1 s, as the thesis prints it.
@@ -122,7 +122,7 @@ def test_correlations_by_fft_are_the_sums_themselves(n, lags, seed):
 def test_segments_are_not_joined_across_a_gap():
     u = white(3000)
     y = plant(u)
-    # The second half restarts from another state: joined, the gap would look like plant behaviour.
+    # The second half restarts from another state: if joined, the jump would look like plant behaviour.
     u2, y2 = np.vstack([u[:1500], u[1700:]]), np.vstack([y[:1500], y[1700:]])
     models = [first_order(0.9)] * 2
     estimate = vrft(u2, y2, u2, models, "PI", window=10, segments=[(0, 1500), (1500, 2800)])
@@ -131,7 +131,7 @@ def test_segments_are_not_joined_across_a_gap():
 
 def test_a_flight_that_is_too_short_or_not_excited_is_refused():
     u = white(60)
-    with pytest.raises(TuningError, match=r"too short: .* longer than"):
+    with pytest.raises(TuningError, match=r"too short: .* without a gap longer than"):
         vrft(u, plant(u), u, [second_order(0.1, 0.7, 0, 1.0)] * 2, "PI")
     still = np.column_stack([white(2000)[:, 0], np.zeros(2000)])
     with pytest.raises(TuningError, match="not excited"):

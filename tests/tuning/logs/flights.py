@@ -4,6 +4,7 @@ import struct
 from dataclasses import dataclass
 
 import numpy as np
+
 from mimopilot.sitl.flight.flight_log import quaternions
 from mimopilot.sitl.flight.ulog_writer import HEADER, _declare, _keyed, _message
 

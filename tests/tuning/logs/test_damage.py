@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.io import savemat
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.inspection import inspect_log
 from mimopilot.tuning.logs.reader import read_log
-from scipy.io import savemat
-
 from tests.tuning.logs.flights import (
     ardupilot_messages,
     dataflash_bytes,

@@ -5,14 +5,14 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from pyulog import ULog
+
 from mimopilot.sitl.flight.ulog_writer import HEADER, _message
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.dataflash_file import open_dataflash
 from mimopilot.tuning.logs.inspection import inspect_log
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.logs.ulog_file import open_ulog
-from pyulog import ULog
-
 from tests.tuning.logs.flights import (
     ardupilot_messages,
     dataflash_bytes,

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.dataflash_file import open_dataflash
 from mimopilot.tuning.logs.reader import open_log, read_log
-
 from tests.tuning.logs.flights import (
     ardupilot_messages,
     dataflash_bytes,

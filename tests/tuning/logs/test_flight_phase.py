@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.flight_phase import bridged, intersection, intervals
 from mimopilot.tuning.logs.reader import read_log
-
 from tests.tuning.logs.flights import make_flight, microseconds, px4_topics, table, write_csv, write_ulog
 
 

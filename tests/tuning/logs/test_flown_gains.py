@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from mimopilot.tuning.logs.flown_gains import flown_gains
 
 PX4 = {

@@ -3,11 +3,11 @@ from importlib import import_module
 from typing import get_args
 
 import pytest
+
+from mimopilot.cli.tuning import LOG
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.formats import FORMATS, known_formats
 from mimopilot.tuning.logs.reader import open_log
-
-from mimopilot.cli.tuning import LOG
 from tests.paths import TOP
 
 

@@ -2,8 +2,8 @@ import json
 
 import numpy as np
 import pytest
-from mimopilot.tuning.logs.inspection import inspect_log
 
+from mimopilot.tuning.logs.inspection import inspect_log
 from tests.conftest import assert_one_clear_line
 from tests.tuning.logs.flights import (
     ardupilot_messages,

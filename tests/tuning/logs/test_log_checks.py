@@ -5,13 +5,13 @@ import tomllib
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import SIGNALS, Columns
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.rigid_body_fit import rigid_body
-
 from tests.tuning.truth import experiment
 
 NAMES = ("t", *SIGNALS["u"], *SIGNALS["y_i"], *SIGNALS["y_o"], *SIGNALS["u_bar"])

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from mimopilot.tuning.logs.reader import open_log, read_log
 
+from mimopilot.tuning.logs.reader import open_log, read_log
 from tests.tuning.logs.flights import (
     ardupilot_messages,
     dataflash_bytes,

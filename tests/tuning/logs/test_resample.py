@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.resample import Series, held_samples, monotone, on_common_grid
 

@@ -4,13 +4,13 @@ import zlib
 
 import numpy as np
 import pytest
+from scipy.io import savemat
+
+from mimopilot.common.errors import Error
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import load_columns
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.spec import load_spec
-from scipy.io import savemat
-
-from mimopilot.common.errors import Error
 from tests.paths import TOP
 from tests.tuning.logs.flights import COLUMNS, make_flight, table, write_csv
 

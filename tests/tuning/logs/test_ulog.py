@@ -4,9 +4,9 @@ import struct
 
 import numpy as np
 import pytest
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.reader import open_log, read_log
-
 from tests.tuning.logs.flights import (
     attitude,
     injected,

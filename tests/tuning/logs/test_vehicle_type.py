@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.inspection import inspect_log
 from mimopilot.tuning.logs.reader import read_log
-
 from tests.tuning.logs.flights import (
     ardupilot_messages,
     dataflash_bytes,

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.physics.airframe import Frame, load_airframe
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.plant.frequency_response import PlantResponse, measured_plant, plant_response
-
 from tests.tuning.truth import TS, experiment, linear_plant
 
 AIRFRAMES = ("adam0", "adam0_boom", "adam0_flexible", "adam0_nominal", "adam0_perturbed", "antr", "px4_sih")

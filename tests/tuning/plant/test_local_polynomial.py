@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
+from scipy.signal import lfilter
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.plant.local_polynomial import local_response
-from scipy.signal import lfilter
 
 
 def signals(n=4000, noise=0.0, seed=0):

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.logs.reader import read_log
@@ -11,7 +12,6 @@ from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.pbsid import pbsid
 from mimopilot.tuning.plant.rates_model import fit, identify_rates, pbsid_by_response
 from mimopilot.tuning.statespace import StateSpace
-
 from tests.paths import DATA
 
 TS = 0.1

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.plant.frequency_response import PlantResponse, measured_plant
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
-
 from tests.paths import DATA
 from tests.tuning.truth import TS, experiment, linear_plant
 

@@ -5,6 +5,8 @@ import threading
 import time
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import doublet
@@ -14,8 +16,6 @@ from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
 from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.sockets import listen
 from mimopilot.sitl.physics.airframe import load_airframe
-from pymavlink.dialects.v20 import common as mavlink
-
 from tests.sitl.mavlink.running import PATIENCE_S
 
 TS = 0.004

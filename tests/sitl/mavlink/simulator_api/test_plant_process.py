@@ -13,6 +13,8 @@ import tty
 from itertools import pairwise
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import parse_fault
 from mimopilot.sitl.mavlink.simulator_api.hitl import SerialPlant
@@ -21,8 +23,6 @@ from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import SimulatedVehi
 from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, ARMED, GPS, SENSOR, STATE, FastCodec
 from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, listen
 from mimopilot.sitl.physics.airframe import load_airframe
-from pymavlink.dialects.v20 import common as mavlink
-
 from tests.conftest import assert_one_clear_line
 from tests.paths import TOP
 from tests.sitl.mavlink.running import PATIENCE_S, wait_for

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.setpoints import AttitudeSetpoint
@@ -17,7 +18,6 @@ from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantState
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
 from mimopilot.sitl.mavlink.vehicle.host import Host
 from mimopilot.sitl.physics.airframe import load_airframe
-
 from tests.conftest import assert_one_clear_line
 
 TS = 0.004

@@ -1,12 +1,13 @@
 """The flight recorder: file numbers, and files that cannot be written."""
 
 import pytest
+from pyulog import ULog
+
 from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.autopilot.flight_modes import Commander
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightRecorder
 from mimopilot.sitl.physics.airframe import load_airframe
-from pyulog import ULog
 
 TS = 0.004
 

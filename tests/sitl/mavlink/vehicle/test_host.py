@@ -7,9 +7,9 @@ import time
 from contextlib import suppress
 
 import pytest
-from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, STATE, FastCodec
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, STATE, FastCodec
 from tests.sitl.mavlink.running import Pilot, running_sitl
 
 TS_US = 4000

@@ -1,10 +1,10 @@
 """Hostile datagrams, a few tens of thousands; `python -m tests.sitl.mavlink.hostile` sends a million."""
 
 import pytest
-from mimopilot.sitl.mavlink.vehicle import stations
-from mimopilot.sitl.mavlink.wire import codec
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.sitl.mavlink.vehicle import stations
+from mimopilot.sitl.mavlink.wire import codec
 from tests.sitl.mavlink.hostile import KEY, VehicleUnderAttack, attack, drain
 
 SEED = 7

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+
 from mimopilot.codegen.layout import INPUT
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.autopilot.excitation_injector import Injector
@@ -15,7 +16,6 @@ from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
-
 from tests.sitl.mavlink.running import wait_for
 
 ALL = len(PARAMETERS + IDENTITY + EXCITATION)

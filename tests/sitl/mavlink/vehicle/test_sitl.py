@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mimopilot.sitl.autopilot.flight_modes import Mode
-from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
-from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from pymavlink.dialects.v20 import common as mavlink
 from pyulog import ULog
 
+from mimopilot.sitl.autopilot.flight_modes import Mode
+from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
+from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from tests.sitl.mavlink.running import PATIENCE_S, Pilot, Program, free_port, running_sitl, start, wait_for
 
 ARM, TAKEOFF, LAND, SET_MODE = 400, 22, 21, 176

@@ -4,10 +4,10 @@ import socket
 
 import numpy as np
 import pytest
-from mimopilot.sitl.mavlink.wire.sockets import listen
-from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.sitl.mavlink.wire.sockets import listen
+from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.running import Pilot, free_port, running_sitl
 

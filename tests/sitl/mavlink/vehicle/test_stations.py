@@ -5,12 +5,12 @@ import socket
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.vehicle import stations as module
 from mimopilot.sitl.mavlink.vehicle.stations import MAX_STATIONS, Stations
 from mimopilot.sitl.mavlink.wire.codec import Codec
-from pymavlink.dialects.v20 import common as mavlink
-
 from tests.sitl.mavlink.running import PATIENCE_S, wait_for
 
 BEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)

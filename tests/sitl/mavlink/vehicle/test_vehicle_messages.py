@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.autopilot.autopilot import RECORD
 from mimopilot.sitl.autopilot.flight_modes import Commander, Mode, Refused, Severity
 from mimopilot.sitl.autopilot.setpoints import Pose
@@ -19,7 +21,6 @@ from mimopilot.sitl.mavlink.vehicle.vehicle_commands import VehicleCommands
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
-from pymavlink.dialects.v20 import common as mavlink
 
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = 0, 1, 2, 3
 IGNORE_RATES, IGNORE_THRUST, IGNORE_ATTITUDE = 7, 64, 128

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, GPS, SENSOR, STATE, FastCodec
-from pymavlink.dialects.v20 import common as mavlink
 
 KINDS = [SENSOR, STATE, GPS, ACTUATORS, mavlink.MAVLink_heartbeat_message, mavlink.MAVLink_command_long_message]
 BITS = {"B": 8, "H": 16, "h": 16, "I": 32, "i": 32, "Q": 64}

@@ -6,13 +6,13 @@ import struct
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pymavlink.mavparm import MAVParmDict
+
+from mimopilot.common.errors import InputFileError
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, NAME, parameter_text, read_parameters
 from mimopilot.tuning.parameters import PARAMETERS
-from pymavlink.mavparm import MAVParmDict
-
-from mimopilot.common.errors import InputFileError
 
 names = st.from_regex(NAME, fullmatch=True)
 #: -0.0 is read back as 0.0 on purpose: zero has no sign here.

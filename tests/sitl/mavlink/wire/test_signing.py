@@ -3,9 +3,10 @@
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.signing import EPOCH_S, UNITS_PER_S, Signer
-from pymavlink.dialects.v20 import common as mavlink
 
 KEY = bytes(range(32))
 NOW = 1.7e9

@@ -1,21 +1,22 @@
-"""VRFT of the cascade by itself: its oracle, the thesis' choices, other instruments, its fall-back."""
+"""VRFT of the cascade alone: against the thesis' pseudo-code, with each instrument, and its fallback."""
 
 import dataclasses
 
 import numpy as np
 import pytest
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import excitation_flight
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import Noise, load_airframe
-from mimopilot.tuning.design.cascade import estimate, tune
-from mimopilot.tuning.design.estimate_checks import examine_band, examine_estimates
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.cascade_estimate import estimate
+from mimopilot.tuning.design.quality_checks import check_band, check_estimates
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import align, instruments
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import second_order
-
 from tests.tuning.analysis.test_certificate import experiment
 from tests.tuning.literal import literal_cascade
 from tests.tuning.truth import thesis
@@ -29,7 +30,7 @@ def log():
     return experiment("adam0")
 
 
-def test_the_fast_estimator_is_the_pseudo_code_of_the_thesis(log):
+def test_the_fast_estimator_equals_the_pseudo_code_of_the_thesis(log):
     models = second_order(20, 0.4, 0, TS), second_order(10, 0.7, 0, TS)
     oracle = literal_cascade(log.u, log.y_i, log.y_o, *models, TS, log.flown.derivative_cutoff_hz, 50)
     spec = thesis(weight="identity", instrument="u", trim=False, window=50)
@@ -39,7 +40,7 @@ def test_the_fast_estimator_is_the_pseudo_code_of_the_thesis(log):
 
 
 def noisy_flight(seed, excitation_seed=0, late=0, times=10.0):
-    """ADAM-0 with many `times` its noise, so that the instrument matters; `late` samples of hover in front."""
+    """ADAM-0 with `times` its noise, so that the instrument matters; `late` samples of hover come first."""
     vehicle = load_airframe("adam0")
     airframe = vehicle.airframe.model_copy(update={"noise": Noise(angle=0.003 * times, rate=0.01 * times)})
     gains = vehicle.default_gains()
@@ -56,7 +57,7 @@ def noisy():
 
 
 @pytest.mark.parametrize("method", ["mimo", "siso"])
-def test_noise_moves_what_every_instrument_gives_by_no_more_than_its_error(noisy, method):
+def test_noise_changes_the_gains_of_every_instrument_by_at_most_three_deviations(noisy, method):
     still, second = noisy_flight(0, times=0.01), noisy_flight(2)
     for name in ("external", "model", "repeated"):
         spec = thesis(method=method, instrument=name, weight="identity")
@@ -66,7 +67,7 @@ def test_noise_moves_what_every_instrument_gives_by_no_more_than_its_error(noisy
         assert np.abs(error / np.diag(found.deviations()["Kp_i"])).max() < 3.0, name
 
 
-def test_a_stretch_without_excitation_does_no_harm_to_an_identified_models_instrument(log):
+def test_an_unexcited_stretch_does_not_harm_the_instrument_of_an_identified_model(log):
     segments = ((0, 5000), (5050, 9950))
     quiet = dataclasses.replace(log, segments=segments, u_bar=log.u_bar * (np.arange(len(log.u)) < 5000)[:, None])
     spec = thesis(instrument="model", structure="P")
@@ -99,13 +100,13 @@ def test_a_second_flight_is_aligned_by_its_excitation(noisy):
     assert np.array_equal(first.u_bar, second.u_bar)
     assert len(first.u) == len(noisy.u)
     assert second.segments == first.segments == ((0, len(noisy.u)),)
-    with pytest.raises(TuningError, match="its excitation is not that of flight 1"):
+    with pytest.raises(TuningError, match="its excitation differs from that of flight 1"):
         align(noisy, noisy_flight(2, excitation_seed=5))
     with pytest.raises(TuningError, match=r"sampled every 0\.005 s"):
         align(noisy, dataclasses.replace(late, Ts=0.005))
 
 
-def test_gaps_of_both_flights_are_left_out(noisy):
+def test_gaps_of_both_flights_are_excluded(noisy):
     second = noisy_flight(2, late=100)
     a = dataclasses.replace(noisy, segments=((0, 3000), (3100, 8000)))
     b = dataclasses.replace(second, segments=((200, 5100), (5150, 8100)))
@@ -113,60 +114,60 @@ def test_gaps_of_both_flights_are_left_out(noisy):
     assert first.segments == other.segments == ((100, 3000), (3100, 5000), (5050, 8000))
 
 
-def test_a_second_log_and_its_instrument_go_together(noisy):
+def test_a_second_log_needs_the_instrument_repeated_and_the_other_way_round(noisy):
     for kind, repeat in (("repeated", None), ("external", noisy)):
         with pytest.raises(TuningError, match="only with it"):
             instruments(noisy, kind, repeat)
 
 
 def negatively_damped(log):
-    """As if the rates fed themselves: less moment than it takes to hold a rate, which asks for a negative Ki."""
+    """A plant with negative damping: holding a rate takes negative torque, which gives a negative Ki."""
     return dataclasses.replace(log, u=log.u - 0.02 * log.y_i)
 
 
-def test_an_inner_controller_that_cannot_be_inverted_falls_back_loudly(log):
+def test_a_rate_controller_without_inverse_is_replaced_by_its_model_with_a_warning(log):
     found = estimate(negatively_damped(log), thesis(refine=False))
     assert np.linalg.eigvalsh(found.gains.Ki_i + found.gains.Ki_i.T)[0] < 0
     (warning,) = found.warnings
-    for words in ("not minimum phase: eigenvalues", "r_i = M_i^-1 y_i", "--structure PD"):
-        assert words in warning
-    # The rate loop that the outer gain sees is its reference model: closed form s Kp_o M_i = M_o at low frequency.
+    for text in ("not minimum phase: eigenvalues", "r_i = M_i^-1 y_i", "--structure PD"):
+        assert text in warning
+    # The rate loop is then its reference model: in closed form s Kp_o M_i = M_o at low frequency.
     assert np.diag(found.gains.Kp_o) == pytest.approx(4.5, rel=0.15)
     tuned = tune(negatively_damped(log), thesis(refine=False))
     assert PlantEstimates(log).body.least(tuned.Ki_i) > 0
     kept, slow = tuned.provenance.warnings[:2]
-    assert "the log asks for integral gains that run away" in kept
-    assert "to forget where it began" in slow
+    assert "the integral gains from this log diverge" in kept
+    assert "the inverse rate controller takes" in slow
 
 
-def test_the_fall_back_needs_an_outer_model_that_is_no_faster(log):
+def test_the_fallback_needs_an_outer_model_with_as_much_delay(log):
     with pytest.raises(TuningError, match="not a proper, stable filter"):
         estimate(negatively_damped(log), thesis(inner=(20.0, 0.4, 3)))
 
 
-def test_gains_that_cannot_be_told_apart_are_refused_and_hardly_warned_about(log):
+def test_a_bad_condition_number_gives_a_warning_and_a_worse_one_an_error(log):
     found = estimate(log, thesis())
     for condition, refused in ((2e3, False), (2e4, True)):
         solution = dataclasses.replace(found.inner[0].solution, condition=condition)
         loops = [dataclasses.replace(found.inner[0], solution=solution)]
         if refused:
-            with pytest.raises(TuningError, match="hardly be told apart"):
-                examine_estimates("log", found.stretches, loops, TS)
+            with pytest.raises(TuningError, match="hardly distinguishable"):
+                check_estimates("log", found.stretches, loops, TS)
         else:
-            assert any("told apart" in text for text in examine_estimates("log", found.stretches, loops, TS))
+            assert any("hardly distinguishable" in text for text in check_estimates("log", found.stretches, loops, TS))
 
 
-def test_the_band_of_the_excitation_is_named_by_axis(log):
+def test_an_excitation_below_the_bandwidth_is_reported_for_each_axis(log):
     from mimopilot.tuning.plant.frequency_response import measured_plant
 
     plant = measured_plant(log)
-    assert examine_band("log", plant, (20.0, 20.0)) == []
-    fast = examine_band("log", plant, (20.0, 250.0))
+    assert check_band("log", plant, (20.0, 20.0)) == []
+    fast = check_band("log", plant, (20.0, 250.0))
     assert len(fast) == 1
-    assert fast[0].startswith("pitch is excited from")
-    deaf = dataclasses.replace(plant, coherence=plant.coherence * [1.0, 0.5])
+    assert fast[0].startswith("pitch is excited only from")
+    unexcited = dataclasses.replace(plant, coherence=plant.coherence * [1.0, 0.5])
     with pytest.raises(TuningError, match="not excited on pitch"):
-        examine_band("log", deaf, (20.0, 20.0))
+        check_band("log", unexcited, (20.0, 20.0))
 
 
 def test_a_quotient_of_models_is_one_filter():

@@ -1,9 +1,9 @@
-"""Model-assisted refinement: from VRFT's gains to the minimum of the model-reference cost itself.
+"""One loop refined on an identified plant: from VRFT's gains to the minimum of the model-reference cost.
 
-VRFT minimises the error of the controller's output over the recorded signals. Where the structure cannot
-reach the reference model, that is not where ||M - T||^2 is smallest: on LV100 the minimum of VRFT without
-any noise has J_MR 0.057, the best 2x2 PI 0.0515. Here a plant identified from the same experiment (PBSID)
-stands in for the true one in (3.1), and a Gauss-Newton iteration goes from VRFT's gains to its minimum.
+VRFT minimises the error of the controller's output over the recorded signals. If the structure cannot reach the
+reference model, ||M - T||^2 is smallest elsewhere: on LV100 the minimum of VRFT without noise has J_MR 0.057, the best
+2x2 PI 0.0515. Here a plant identified from the same experiment (PBSID) replaces the true one in (3.1), and a
+Levenberg-Marquardt iteration goes from VRFT's gains to the minimum.
 """
 
 from __future__ import annotations
@@ -12,25 +12,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Response, Signal, StateSpace
-from scipy.optimize import least_squares
 
+#: Frequencies of the mean over (0, pi/Ts) in (3.1).
 FREQUENCIES = 500
 
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """A refined controller, with (3.1) as the identified plant predicts it before and after.
+    """A refined controller, and (3.1) predicted by the identified plant before and after.
 
     Attributes
     ----------
     controller : LoopController
-        The structure it started from, with new gains.
+        The initial structure with new gains.
     before, after : float
-        Predicted J_MR of the start and of `controller`.
+        Predicted J_MR of the initial controller and of `controller`.
     """
 
     controller: LoopController
@@ -52,27 +54,27 @@ def model_reference_cost(
     ----------
     plant : StateSpace
     controller : LoopController
-        Of a stable loop: for another the figure means nothing.
+        Of a stable loop; the cost of an unstable one is meaningless.
     models : sequence of n_y ReferenceModel
     count : int
-        Frequencies.
+        Number of frequencies.
     """
     omega = frequency_grid(plant.Ts, count)
     T = complementary_sensitivity(plant.frequency_response(omega), controller, omega)
     return float(np.mean(np.sum(np.abs(_wanted(models, omega) - T) ** 2, axis=(1, 2))))
 
 
-def refine(controller: LoopController, plant: StateSpace, models: Sequence[ReferenceModel]) -> Refinement:
+def refine_on_model(controller: LoopController, plant: StateSpace, models: Sequence[ReferenceModel]) -> Refinement:
     """Gains of the same structure that minimise J_MR (3.1) on an identified plant.
 
     Levenberg-Marquardt with the exact derivative: T = (I + G B Phi_y)^-1 G B Phi_r gives
-    dT = S G dB (Phi_r - Phi_y T), S = (I + G B Phi_y)^-1. The cost grows without bound where the loop
-    loses its stability, so the descent stays on the side it starts on; the result is checked all the same.
+    dT = S G dB (Phi_r - Phi_y T), S = (I + G B Phi_y)^-1. The cost is unbounded at the limit of stability,
+    so the iteration stays on the stable side; the result is checked nevertheless.
 
     Parameters
     ----------
     controller : LoopController
-        Start, such as VRFT's gains; the loop must be stable with it.
+        Initial controller, such as VRFT's; its loop must be stable.
     plant : StateSpace
         Identified plant, such as `tuning.plant.pbsid.pbsid` gives.
     models : sequence of n_y ReferenceModel
@@ -85,11 +87,13 @@ def refine(controller: LoopController, plant: StateSpace, models: Sequence[Refer
     Raises
     ------
     TuningError
-        When the loop is not stable on the identified plant, before or after.
+        When the loop around the identified plant is not stable, before or after.
     """
     if {controller.filters.Ts, *(model.Ts for model in models)} != {plant.Ts} or len(models) != len(plant.C):
-        raise TuningError("refinement: plant, controller and one reference model an output must share one period")
-    _check_stable(plant, controller, "the gains to start from")
+        raise TuningError(
+            "refinement: expected one reference model for each output, and one period for plant, controller and models"
+        )
+    _check_stable(plant, controller, "the initial gains")
     omega = frequency_grid(plant.Ts, FREQUENCIES)
     G, M = plant.frequency_response(omega), _wanted(models, omega)
     of_r, of_y = controller.shapes(omega)
@@ -125,7 +129,7 @@ def _wanted(models: Sequence[ReferenceModel], omega: Signal) -> Response:
 
 
 def _real(values: Response) -> Signal:
-    """Real parts and imaginary parts, one after the other: the norm of complex numbers as one of real ones."""
+    """Real parts, then imaginary parts: the complex norm as a real one."""
     return np.stack([values.real, values.imag])
 
 

@@ -1,47 +1,16 @@
+"""SISO VRFT: the ideal controller, and the bias that each instrument removes."""
+
 import numpy as np
 import pytest
-from mimopilot.tuning.design.refine import frequency_grid, refine
+
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.siso import siso_vrft, whitening_filter
-from mimopilot.tuning.law import Filters
-from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 from mimopilot.tuning.plant.pbsid import pbsid
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
 
 TS = 0.004
 PLANT = StateSpace(np.array([[0.9]]), np.array([[1.0]]), np.array([[0.5]]), np.zeros((1, 1)), TS)
-
-
-def test_refinement_finds_a_controller_that_reaches_the_model_with_derivative_on_the_measurement():
-    # P, I and D on 0.5/(z - 0.9) without derivative filter: the closed loop in polynomials is the model.
-    kp, ki, kd = 0.2, 4.0, 0.0004
-    c, d = (kp + TS * ki, -kp), kd / TS
-    num = 0.5 * np.array([c[0], c[1], 0.0])
-    den = np.polymul(np.polymul([1, -0.9], [1, -1]), [1, 0]) + np.r_[0.0, num] + np.r_[0.0, 0.5 * d * np.poly([1, 1])]
-    model = ReferenceModel(tuple(num), tuple(den), 0, TS)
-    start = LoopController({t: np.array([[v]]) for t, v in (("P", 0.1), ("I", 2.0), ("D", 0.0001))}, Filters(TS))
-    found = refine(start, PLANT, [model])
-    assert found.after < 1e-12 < found.before
-    assert found.controller.matrix == pytest.approx(np.array([[kp, ki, kd]]), rel=1e-5)
-
-
-def test_the_state_space_of_the_loop_has_the_frequency_response_of_the_formula():
-    controller = LoopController(
-        {t: np.array([[v]]) for t, v in zip("PIDF", (0.2, 4.0, 0.0004, 0.05), strict=True)}, Filters(TS, 30.0)
-    )
-    omega = frequency_grid(TS, 50)
-    T = closed_loop(PLANT, controller).frequency_response(omega)[:, 1:, :1]
-    formula = complementary_sensitivity(PLANT.frequency_response(omega), controller, omega)
-    assert np.allclose(T, formula, rtol=1e-9, atol=0)
-
-
-def test_refinement_from_gains_that_are_not_stable_is_refused():
-    wild = LoopController({"P": np.array([[10.0]])}, Filters(TS))
-    with pytest.raises(TuningError, match="not stable"):
-        refine(wild, PLANT, [ReferenceModel((0.1,), (1.0, -0.9), 0, TS)])
-
-
 MODEL = ReferenceModel((0.2,), (1.0, -0.8), 0, TS)
 #: C = G^-1 M/(1 - M) = 0.4 (z - 0.9)/(z - 1).
 IDEAL = (0.36, (0.4 - 0.36) / TS)
@@ -65,13 +34,13 @@ def tuned(u, y, **options):
     return siso_vrft(u, y, u, MODEL, "PI", weight="identity", **options)
 
 
-def test_siso_vrft_without_noise_is_the_ideal_controller_for_white_and_coloured_input():
+def test_siso_vrft_without_noise_gives_the_ideal_controller_for_white_and_coloured_input():
     for coloured in (False, True):
         u, y, _ = siso_data(0, 0.0, coloured)
         assert gains(tuned(u, y, repeated=y)) == pytest.approx(IDEAL, rel=1e-3)
 
 
-def test_every_instrument_removes_the_bias_that_least_squares_has():
+def test_every_instrument_removes_the_bias_of_least_squares():
     found = {name: [] for name in ("none", "second experiment", "model", "external")}
     for seed in range(8):
         u, clean, y = siso_data(seed, 0.3)
@@ -95,7 +64,7 @@ def test_the_whitening_filter_of_an_autoregression_is_its_denominator():
     assert np.abs(taps[3:]).max() < 0.02
 
 
-def test_a_dead_input_is_refused():
+def test_a_zero_input_is_refused():
     u, _, y = siso_data(0, 0.1)
     with pytest.raises(TuningError, match="not excited"):
         tuned(0 * u, y)
