@@ -50,7 +50,7 @@ def test_the_inverse_rate_controller_returns_the_rate_setpoint(gains):
 def test_the_transient_of_the_unknown_integrator_decays_within_the_settling_time(gains):
     gains = unlimited(gains)
     u, r_i, y_i = fly(gains)
-    rebuilt, settling = rebuild_rate_setpoint(gains, u + 0.1, y_i)  # as if I had started at 0.1
+    rebuilt, settling = rebuild_rate_setpoint(gains, u + 0.1, y_i)  # as with an initial I of 0.1
     longer, _ = rebuild_rate_setpoint(
         gains, np.vstack([u + 0.1, np.full((settling, 2), 0.1)]), np.vstack([y_i, np.zeros((settling, 2))])
     )

@@ -32,10 +32,10 @@ def log():
 
 def test_the_fast_estimator_equals_the_pseudo_code_of_the_thesis(log):
     models = second_order(20, 0.4, 0, TS), second_order(10, 0.7, 0, TS)
-    oracle = literal_cascade(log.u, log.y_i, log.y_o, *models, TS, log.flown.derivative_cutoff_hz, 50)
+    literal = literal_cascade(log.u, log.y_i, log.y_o, *models, TS, log.flown.derivative_cutoff_hz, 50)
     spec = thesis(weight="identity", instrument="u", trim=False, window=50)
     found = estimate(log, spec).gains
-    for name, matrix in zip(MATRICES, oracle, strict=True):
+    for name, matrix in zip(MATRICES, literal, strict=True):
         assert getattr(found, name) == pytest.approx(matrix, rel=1e-9, abs=1e-9 * np.abs(matrix).max())
 
 

@@ -102,7 +102,7 @@ def test_the_standard_deviation_is_that_of_repeated_experiments():
         estimates.append(estimate.gain("P"))
         predicted.append(estimate.deviations["P"])
     ratio = np.std(estimates, axis=0) / np.mean(predicted, axis=0)
-    # 60 runs know a standard deviation to about 9 %; three of those, and the two-step weight's own error.
+    # 60 runs determine a standard deviation to about 9 %: three of those, and the two-step weight's own error.
     assert (ratio > 0.6).all()
     assert (ratio < 1.4).all()
 
