@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import PARAMETERS, ROWS, Row
+from mimopilot.tuning.parameter_row import Row
+from mimopilot.tuning.parameters import PARAMETERS, ROWS
 
 GAINS = np.dtype(("<f4", (len(PARAMETERS),)))
 

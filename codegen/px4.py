@@ -8,14 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import (
-    ENABLE,
-    EXCITATION,
-    IDENTITY,
-    PARAMETERS,
-    Parameter,
-    Setting,
-)
+from mimopilot.tuning.parameter_row import Parameter
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Setting
 
 #: Our unit -> PX4's; PX4 does not list our other units.
 _UNITS = {"1/s": "1/s", "s": "s", "rad": "rad", "rad/s": "rad/s", "norm": "norm", "N m": "Nm"}

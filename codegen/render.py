@@ -23,7 +23,8 @@ from mimopilot.codegen.vectors import emitted_vectors
 from mimopilot.common.files import inside, read_text, sha256, write_atomically
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains, gains_to_toml
-from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, Row, Shape, check_names
+from mimopilot.tuning.parameter_row import Row, Shape
+from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, check_names
 
 #: These and the parameter table define the C interface.
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
@@ -134,7 +135,7 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
 
 
 def _validity() -> Iterator[str]:
-    """C++ conditions of `tuning.parameters.Valid`, for every element with a bound."""
+    """C++ conditions of `tuning.parameter_row.Valid`, for every element with a bound."""
     for row in ROWS:
         for i, _ in enumerate(row.codes):
             member = f"gains.{row.member}" + (f"[{i}]" if row.shape is Shape.AXES else "")

@@ -22,16 +22,8 @@ from mimopilot.common.toml import toml_entries, toml_value
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
-from mimopilot.tuning.parameters import (
-    AXES,
-    IDENTITY,
-    MATRICES,
-    POSITIVE,
-    ROWS,
-    Row,
-    Shape,
-    rows,
-)
+from mimopilot.tuning.parameter_row import AXES, POSITIVE, Row, Shape
+from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, rows
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
 

@@ -14,7 +14,8 @@ from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, Gains, Limits, YawGains
 from mimopilot.tuning.law import Filters
-from mimopilot.tuning.parameters import ROWS, Row, Shape, rows
+from mimopilot.tuning.parameter_row import Row, Shape
+from mimopilot.tuning.parameters import ROWS, rows
 from mimopilot.tuning.provenance import Provenance
 
 #: Tables and entries other than the parameter table's keys.

@@ -228,7 +228,7 @@ def advise(
 
 def print_certificate(gains: Gains) -> None:
     """Verdict, reason and margins of a certified set."""
-    from mimopilot.tuning.parameters import ROLL_PITCH
+    from mimopilot.tuning.parameter_row import ROLL_PITCH
 
     certificate = gains.certificate
     assert certificate is not None

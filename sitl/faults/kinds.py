@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from mimopilot.common.toml import complaint
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.airframe import Vector
-from mimopilot.tuning.parameters import AXES
+from mimopilot.tuning.parameter_row import AXES
 
 NOTATION = re.compile(r"([a-z-]+)(?::([^=@]+))?(?:=([^@]+))?@([^+]+)(?:\+(.+))?")
 FOR_EVER = 1 << 62  # periods; more than any flight has

@@ -8,7 +8,8 @@ import pytest
 from mimopilot.codegen.layout import INPUT, offset
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.tuning.law import TERMS, Filters, response
-from mimopilot.tuning.parameters import PARAMETERS, ROWS, Shape
+from mimopilot.tuning.parameter_row import Shape
+from mimopilot.tuning.parameters import PARAMETERS, ROWS
 from tests.conftest import coupled_gains
 
 INPUTS = ("attitude_setpoint", "attitude", "rates", "excitation")

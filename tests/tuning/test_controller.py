@@ -8,7 +8,8 @@ import pytest
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
-from mimopilot.tuning.law import Filters, inverse_eigenvalues, rate_matrices, rebuild_rate_setpoint, regressors
+from mimopilot.tuning.law import Filters, rate_matrices, regressors
+from mimopilot.tuning.law_inverse import inverse_eigenvalues, rebuild_rate_setpoint
 
 N = 400
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop
-from mimopilot.tuning.parameters import ROLL_PITCH
+from mimopilot.tuning.parameter_row import ROLL_PITCH
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]

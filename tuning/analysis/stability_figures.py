@@ -10,7 +10,7 @@ import numpy as np
 from mimopilot.tuning.analysis import margins
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop, cascade_loop
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import ROLL_PITCH
+from mimopilot.tuning.parameter_row import ROLL_PITCH
 from mimopilot.tuning.plant.frequency_response import DRAWS, PlantResponse
 from mimopilot.tuning.reference_model import ReferenceModel
 

@@ -23,7 +23,8 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.formats import SUFFIXES
 from mimopilot.tuning.logs.reader import read_log
-from mimopilot.tuning.parameters import MATRICES, Shape, rows
+from mimopilot.tuning.parameter_row import Shape
+from mimopilot.tuning.parameters import MATRICES, rows
 from mimopilot.tuning.spec import TuningSpec
 
 QUANTILES = (0.05, 0.5, 0.95)

@@ -16,7 +16,7 @@ from mimopilot.tuning.estimation.instrumental_variables import Stretches
 from mimopilot.tuning.estimation.regression import Solution
 from mimopilot.tuning.estimation.vrft import LoopEstimate
 from mimopilot.tuning.experiment import Experiment
-from mimopilot.tuning.parameters import ROLL_PITCH
+from mimopilot.tuning.parameter_row import ROLL_PITCH
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 
 #: Share of a regressor's power that the excitation explains: below the first the log is refused, below the second

@@ -12,7 +12,7 @@ from scipy.signal import correlate
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, external_signal
-from mimopilot.tuning.parameters import ROLL_PITCH
+from mimopilot.tuning.parameter_row import ROLL_PITCH
 from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
 from mimopilot.tuning.plant.local_polynomial import local_response
 from mimopilot.tuning.plant.rates_model import pbsid_by_response

@@ -9,7 +9,8 @@ import numpy as np
 
 from mimopilot.tuning.gains import Gains, Limits, Triple, YawGains
 from mimopilot.tuning.law import Filters
-from mimopilot.tuning.parameters import LIMITS, MATRICES, PREFIX, cutoff_of
+from mimopilot.tuning.parameter_row import PREFIX, cutoff_of
+from mimopilot.tuning.parameters import LIMITS, MATRICES
 from mimopilot.tuning.provenance import Provenance
 
 SCALE = "SCALE"

@@ -24,7 +24,7 @@ from mimopilot.tuning.logs.signal_relations import (
     injected_in_torque,
     measure_kinematics,
 )
-from mimopilot.tuning.parameters import ROLL_PITCH
+from mimopilot.tuning.parameter_row import ROLL_PITCH
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
 

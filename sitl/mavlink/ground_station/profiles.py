@@ -18,18 +18,8 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import (
-    AXES,
-    AXIS_LETTERS,
-    ENABLE,
-    EXCITATION,
-    IDENTITY,
-    MATRICES,
-    PARAMETERS,
-    PREFIX,
-    Parameter,
-    Setting,
-)
+from mimopilot.tuning.parameter_row import AXES, AXIS_LETTERS, PREFIX, Parameter
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, MATRICES, PARAMETERS, Setting
 
 #: Largest off-diagonal gain, as a share of its row's diagonal, that a stock profile drops without the option; chosen.
 DROPPED_SHARE = 0.1

@@ -18,7 +18,7 @@ from mimopilot.sitl.mavlink.ground_station.upload import NoParametersError, read
 from mimopilot.sitl.mavlink.ground_station.vehicle_contact import TRY_S
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import STOCK_PARAMETERS, check_kind, describe_missing_module
 from mimopilot.sitl.mavlink.wire.signing import read_key
-from mimopilot.tuning.parameters import PREFIX
+from mimopilot.tuning.parameter_row import PREFIX
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,120 @@
+"""The inverse of the rate controller: the rate setpoint that a recorded torque came from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag, schur
+from scipy.signal import lfilter
+
+from mimopilot.tuning.errors import NotMinimumPhaseError
+from mimopilot.tuning.law import (
+    ERROR,
+    RATE,
+    SINGULAR,
+    TERMS,
+    Filters,
+    Matrices,
+    Signal,
+    rate_matrices,
+    regressors,
+)
+
+#: Remaining share of the unknown initial state at which the inverse counts as settled.
+SETTLED = 0.01
+#: Rounding of an eigenvalue of exactly 1.
+ROUNDING = 1e-12
+
+
+def inverse_eigenvalues(matrices: Mapping[str, Signal], filters: Filters) -> Any:
+    """Poles of the inverse rate controller; with an integral alone the eigenvalues of I - Ts Ki (Kp + Ts Ki + Kff)^-1.
+
+    Raises
+    ------
+    NotMinimumPhaseError
+        When the controller has no inverse.
+    """
+    return np.linalg.eigvals(_inverse(matrices, filters)[0])
+
+
+def _inverse(matrices: Mapping[str, Signal], filters: Filters) -> tuple[Signal, Signal, Signal]:
+    """A and B of the inverse from u to e, in the coordinates of the terms' parts of u, and its direct gain."""
+    direct: Any = 0.0
+    poles, pushes = [], []
+    for letter, term in TERMS.items():
+        if letter in matrices and term.signal != RATE:
+            shape, matrix = term.filter(filters), matrices[letter]
+            direct = direct + (matrix if shape is None else shape.direct * matrix)
+            if shape is not None:
+                poles.append(shape.pole * np.eye(len(matrix)))
+                pushes.append(shape.memory * matrix)
+    if np.linalg.cond(direct) > SINGULAR:
+        raise NotMinimumPhaseError(
+            f"the rate controller has no inverse: its direct gain from the setpoint, {direct.tolist()}, is singular"
+        )
+    inverse = np.linalg.inv(direct)
+    n = len(direct)
+    B = np.vstack([np.zeros((0, n)), *(push @ inverse for push in pushes)])
+    return block_diag(*poles) - np.hstack([B] * len(poles)) if poles else np.zeros((0, 0)), B, inverse
+
+
+def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Signal, int]:
+    """Rate setpoint with which the rate controller gives `u`: C_i^-1 u, (3.32)-(3.34) of the thesis.
+
+    The inverse is solved by the Schur form of its state matrix, one first-order filter for each state.
+
+    Parameters
+    ----------
+    gains : Gains
+        Only the rate controller is used.
+    u : (N, 2) array
+        Torque (normalised) applied to the plant, excitation included: the output of the virtual controller.
+    rates : (N, 2) array, rad/s
+        Measured body rates.
+
+    Returns
+    -------
+    r_i : (N, 2) array, rad/s
+        The setpoint; its first samples contain the transient of the unknown initial integrator.
+    settling : int, samples
+        Time until that transient is below `SETTLED`.
+
+    Raises
+    ------
+    NotMinimumPhaseError
+        When the inverse is unstable or does not exist.
+    """
+    matrices, filters = rate_matrices(gains), gains.filters
+    A, B, inverse = _inverse(matrices, filters)
+    eigenvalues = np.linalg.eigvals(A)
+    # The state of an unused integrator (a zero row of Ki) is constant: an eigenvalue of exactly 1.
+    at_rest = np.isclose(eigenvalues, 1.0, rtol=0, atol=ROUNDING)
+    unstable = np.abs(eigenvalues[~at_rest]) >= 1
+    if np.any(unstable) or (at_rest.any() and np.linalg.matrix_rank(B) + at_rest.sum() > len(A)):
+        raise NotMinimumPhaseError(
+            "the rate controller cannot be inverted, it is not minimum phase: eigenvalues of the inverse "
+            f"{', '.join(f'{v:.6g}' for v in eigenvalues)}, expected inside the unit circle; "
+            f"Ki_i = {matrices['I'].round(6).tolist()} should be positive definite"
+        )
+    known = u
+    for letter, term in TERMS.items():  # remove the part of u that the measured rates alone give
+        if term.signal != ERROR:
+            known = known - regressors(letter, rates, rates, rates, filters) @ matrices[letter].T
+    n = u.shape[1]
+    triangle, basis = schur(A, output="complex")
+    drive = (known @ B.T) @ basis.conj()
+    states = np.zeros_like(drive)
+    for i in reversed(range(len(A))):  # upper triangular: the last state depends only on itself
+        coupled = drive[:, i].copy()
+        for j in range(i + 1, len(A)):
+            coupled[1:] += triangle[i, j] * states[:-1, j]
+        states[:, i] = lfilter([1], [1, -triangle[i, i]], coupled)
+    parts = (states @ basis.T).real.reshape(len(u), -1, n).sum(axis=1)
+    previous = np.vstack([np.zeros((1, n)), parts[:-1]])
+    error = (known - previous) @ inverse.T
+    moving = np.abs(eigenvalues[~at_rest])
+    slowest = float(moving.max()) if len(moving) else 0.0
+    settling = int(np.ceil(np.log(SETTLED) / np.log(slowest))) if 0 < slowest < 1 else 0
+    return error + rates, settling
