@@ -4,9 +4,9 @@
     u = Kp e + Ki I(e) - Kd D(y) + Kff r + u_bar        rate controller, e = r - y
 
 Each term is a gain matrix, the signal that it acts on and a first-order filter. All of tuning derives the law from
-`TERMS`: VRFT's regressors, the inverse (`tuning.law_inverse`), the frequency response, the state space and the predicted doublets. The
-generated C++ and its reference, `tuning.controller`, are written by hand. Tests compare the response of the compiled
-C++ with `response`, for every parameter.
+`TERMS`: VRFT's regressors, the inverse (`tuning.law_inverse`), the frequency response, the state space and the
+predicted doublets. The generated C++ and its reference, `tuning.controller`, are written by hand. Tests compare the
+response of the compiled C++ with `response`, for every parameter.
 """
 
 from __future__ import annotations
