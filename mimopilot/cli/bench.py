@@ -74,7 +74,7 @@ def experiment(
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
     amplitude: Annotated[
         float | None,
-        typer.Option(help="Of the injected torque (normalised); 0.15, or less where the motors have little room."),
+        typer.Option(help="Of the injected torque (normalised); 0.15, or less if the motors would saturate."),
     ] = None,
     bandwidth: Annotated[float, typer.Option(help="Of the injected torque, rad/s.")] = 50.0,
     seed: SeedOption = 0,

@@ -63,7 +63,7 @@ def tune(
     instrument: Annotated[
         str | None,
         typer.Option(
-            help="external (lags of the injected moment, the default), u (of the whole moment), model, repeated."
+            help="external (lags of the injected torque, the default), u (of the total torque), model, repeated."
         ),
     ] = None,
     repeat: Annotated[
@@ -73,7 +73,7 @@ def tune(
         int | None, typer.Option(help="Lags of the instrument, samples; by default from the models.")
     ] = None,
     spec: Annotated[
-        Path | None, typer.Option(help="Specification (TOML): the above, and what the log does not say.")
+        Path | None, typer.Option(help="Specification (TOML): the above, and what the log lacks.")
     ] = None,
     columns: ColumnsOption = None,
     campaign: Annotated[
@@ -216,13 +216,13 @@ def advise(
         row = ["* " + name if c is best else name, f"{c.cutoff_hz:g}", f"{c.fit:.2f}", *pairs, delta, c.verdict]
         rows.append(row)
     print("Rate loop: rad/s, damping, delay in samples; predicted RMS of an 18 degree doublet, roll / pitch")
-    columns_shown = ["model", "D [Hz]", "fit", "to the model [deg]", "off-axis [deg]", "moment", "delta", "certificate"]
+    columns_shown = ["model", "D [Hz]", "fit", "to the model [deg]", "off-axis [deg]", "torque", "delta", "certificate"]
     print_table(f"{len(rows)} of {len(ordered)}, certified ones first, by how they follow", columns_shown, rows)
     zero = "no non-minimum-phase zero" if found.zero is None else f"non-minimum-phase zero at {found.zero:.1f} rad/s"
-    print(f"{zero} between moment and rates")
+    print(f"{zero} from torque to rates")
     print(
         "recommended: --inner {:g},{:g},{} with a derivative filter of {:g} Hz: certified, follows within 10 % of the "
-        "best of those, with the least moment".format(*best.inner, best.cutoff_hz)
+        "best of those, with the least torque".format(*best.inner, best.cutoff_hz)
     )
 
 
@@ -283,7 +283,7 @@ def identify(
     columns: ColumnsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Identify the plant from control moment to body rates (PBSID, closed loop)."""
+    """Identify the plant from torque to body rates (PBSID, closed loop)."""
     from mimopilot.common.files import write_atomically
     from mimopilot.tuning.plant.frequency_response import measured_plant
     from mimopilot.tuning.plant.rates_model import identify_rates, model_toml

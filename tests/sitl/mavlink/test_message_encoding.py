@@ -18,7 +18,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     SetParameter,
     StoreParameters,
 )
-from mimopilot.sitl.mavlink.wire.link import Codec
+from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from tests.sitl.mavlink.scripted_vehicle import encode, float32
 
