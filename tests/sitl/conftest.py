@@ -8,6 +8,7 @@ import pytest
 
 import mimopilot.cli.main as front_door
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.parameters import IDENTITY
 from tests.sitl.mavlink.running import WAITS
 from tests.sitl.mavlink.scripted_vehicle import float32
@@ -36,8 +37,7 @@ def quick_mimopilot(monkeypatch, capsys, tmp_path):
 def certified(gains, tmp_path):
     """A gains file with a certificate for its matrices."""
     path = tmp_path / "my.gains.toml"
-    certificate = {"verdict": "certified", "reason": "by this test"}
-    gains.with_certificate(certificate).save(path)
+    gains.with_certificate(Certificate(Verdict.CERTIFIED, "by this test")).save(path)
     return path
 
 

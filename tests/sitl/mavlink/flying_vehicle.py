@@ -1,4 +1,4 @@
-"""A scripted vehicle in the air, with an excitation injector, telemetry, and scheduled events."""
+"""A scripted flying vehicle with an injector: it streams its flight state, and events change it."""
 
 from mimopilot.sitl.autopilot.excitation_injector import AXIS, Conditions, Injector
 from mimopilot.sitl.mavlink.ground_station.events import (
@@ -18,8 +18,8 @@ TS = 0.02
 
 
 class FlyingVehicle(ScriptedVehicle):
-    """Hovers. `integers`: its integer parameters are INT32, as on a PX4; `then`: time (s) -> event; `careless`: its
-    injector never aborts."""
+    """Hovers. `integers`: integer parameters are INT32, as on PX4; `then`: time (s) -> event; `careless`: its own
+    injector never stops by itself."""
 
     def __init__(self, integers=False, then=None, careless=False, **values):
         names = {setting.name: setting.default for setting in EXCITATION}
@@ -50,8 +50,8 @@ class FlyingVehicle(ScriptedVehicle):
             return []
         return super().answer(order)
 
-    def tell(self, now):
-        """Its telemetry, ten times a second."""
+    def stream(self, now):
+        """Messages that it streams, at 10 Hz."""
         for at in [at for at in self.then if at <= now]:
             self.then.pop(at)(self)
         while self.stepped < now:
@@ -75,5 +75,5 @@ class FlyingVehicle(ScriptedVehicle):
 
     @property
     def settings(self):
-        """Its parameters, except the one that starts the excitation."""
+        """Its parameters, except the one that starts the injector."""
         return {name: value for name, value in self.values.items() if name != AXIS}

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, make_restore_plan, off_diagonal_shares
 from mimopilot.sitl.mavlink.wire.float32 import single
+from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.parameters import MATRICES, PARAMETERS
@@ -101,7 +101,7 @@ def test_small_off_diagonals_are_dropped_and_reported(diagonal):
     ],
 )
 def test_values_out_of_range_that_a_vehicle_would_accept_are_refused(diagonal, profile, change, message):
-    with pytest.raises((SitlError, CodegenError), match=message):
+    with pytest.raises((SitlError, TuningError), match=message):
         make_plan(dataclasses.replace(diagonal, **change), profile)
 
 

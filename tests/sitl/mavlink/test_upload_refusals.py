@@ -9,6 +9,7 @@ from mimopilot.sitl.mavlink.ground_station.connection import Connection
 from mimopilot.sitl.mavlink.ground_station.events import ParameterValue
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.mavlink.wire.signing import read_key
+from mimopilot.tuning.certificate import Certificate, Verdict
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.running import wait_for
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, UdpVehicle, float32
@@ -221,7 +222,8 @@ def test_gains_for_another_vehicle_are_refused_before_writing(mimopilot, certifi
 
 def test_uncertified_gains_are_refused_before_contacting_the_vehicle(mimopilot, gains, old, new, tmp_path):
     gains.save(tmp_path / "plain.gains.toml")
-    gains.with_certificate({"verdict": "unstable", "reason": "by this test"}).save(tmp_path / "bad.gains.toml")
+    unstable = Certificate(Verdict.UNSTABLE, "by this test")
+    gains.with_certificate(unstable).save(tmp_path / "bad.gains.toml")
     with UdpVehicle(ScriptedVehicle(old)) as link:
         for name, word in (("plain", "no certificate"), ("bad", "unstable")):
             refused = mimopilot("upload", f"{name}.gains.toml", "--connect", link.url, "--yes")

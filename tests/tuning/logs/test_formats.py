@@ -4,7 +4,7 @@ from typing import get_args
 
 import pytest
 
-from mimopilot.cli.tuning import LOG
+from mimopilot.cli.options import LogArgument
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.formats import FORMATS, known_formats
 from mimopilot.tuning.logs.reader import open_log
@@ -16,7 +16,7 @@ def test_every_format_has_a_reader_and_is_named_in_the_readme_and_in_the_help(ro
     module, _, function = row.reader.partition(":")
     assert callable(getattr(import_module(module), function))
     (table,) = re.findall(r"^\| log \|.*\n(?:\|.*\n)+", (TOP / "README.md").read_text(), re.MULTILINE)
-    argument = next(part for part in get_args(LOG) if hasattr(part, "help"))
+    argument = next(part for part in get_args(LogArgument) if hasattr(part, "help"))
     assert row.name in table
     assert row.name in argument.help
 
