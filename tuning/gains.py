@@ -132,6 +132,21 @@ class Gains:
             if not POSITIVE.holds(value):
                 raise TuningError(f"moment_scale ({axis}): got {value} N m, expected {POSITIVE}")
 
+    @classmethod
+    def from_rows(cls, values: Mapping[Row, Any], **others: Any) -> Gains:
+        """A set from what it holds for each row of the parameter table, see `of`; `others`: the other attributes."""
+        parts: dict[Shape, dict[str, Any]] = {shape: {} for shape in Shape}
+        for row, value in values.items():
+            shaped = np.reshape(value, (2, 2)) if row.shape is Shape.MATRIX else value
+            parts[row.shape][row.key] = tuple(shaped) if row.shape is Shape.AXES else shaped
+        return cls(
+            **parts[Shape.MATRIX],
+            yaw=YawGains(**parts[Shape.YAW]),
+            filters=Filters(**parts[Shape.POLE], **parts[Shape.SCALAR]),
+            limits=Limits(**parts[Shape.AXES]),
+            **others,
+        )
+
     def __repr__(self) -> str:
         return (
             f"<Gains {self.provenance.method or 'of unknown origin'}, {1 / self.Ts:g} Hz, Kp_o "
@@ -185,23 +200,17 @@ class Gains:
         if unknown:
             raise TuningError(f"unknown gain element {', '.join(unknown)}; known: {', '.join(elements)}")
         elements |= changes
-        parts: dict[Shape, dict[str, Any]] = {shape: {} for shape in Shape}
+        values: dict[Row, Any] = {}
         for row in ROWS:
-            values = [elements[code] for code in row.codes]
-            parts[row.shape][row.key] = values[0] if len(values) == 1 else tuple(values)
-        filters = dict(parts[Shape.SCALAR])
-        for row in rows(Shape.POLE):
-            pole = parts[Shape.POLE][row.key]
-            if not row.valid.holds(pole):
-                raise TuningError(f"{row.code}: got {pole}, expected {row.valid}; 0: no filter")
-            moved = {row.code, "TS"} & changes.keys()
-            filters[row.key] = row.value(pole, elements["TS"]) if moved else self.of(row)
-        return replace(
-            self,
-            yaw=YawGains(**parts[Shape.YAW]),
-            filters=Filters(**filters),
-            limits=Limits(**parts[Shape.AXES]),
-            **{name: np.reshape(matrix, (2, 2)) for name, matrix in parts[Shape.MATRIX].items()},  # type: ignore[arg-type]
+            changed = [elements[code] for code in row.codes]
+            values[row] = changed[0] if len(changed) == 1 else changed
+            if row.shape is Shape.POLE:
+                if not row.valid.holds(changed[0]):
+                    raise TuningError(f"{row.code}: got {changed[0]}, expected {row.valid}; 0: no filter")
+                moved = {row.code, "TS"} & changes.keys()
+                values[row] = row.value(changed[0], elements["TS"]) if moved else self.of(row)
+        return Gains.from_rows(
+            values, moment_scale=self.moment_scale, certificate=self.certificate, provenance=self.provenance
         )
 
     def reference_models(self, axis: int) -> tuple[ReferenceModel, ReferenceModel]:

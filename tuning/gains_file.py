@@ -12,8 +12,7 @@ from mimopilot.common.errors import Error
 from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, Gains, Limits, YawGains
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, Gains
 from mimopilot.tuning.parameter_row import Row, Shape
 from mimopilot.tuning.parameters import ROWS, rows
 from mimopilot.tuning.provenance import Provenance
@@ -52,18 +51,13 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
         if not isinstance(table.get(name, {}), dict):
             raise TuningError(f"{where}: {name}: got {shown(table[name])}, expected a table")
     try:
-        parts: dict[Shape, dict[str, Any]] = {shape: {} for shape in Shape}
-        for row in ROWS:
-            parts[row.shape][row.key] = _entry(table, row)
+        values = {row: _entry(table, row) for row in ROWS}
         certificate = Certificate.from_table(table["certificate"]) if "certificate" in table else None
         if certificate is not None and schema == 1:
             certificate = replace(certificate, seal=SCHEMA_1)
         scale = _get(table, "moment_scale", "")
-        return Gains(
-            **parts[Shape.MATRIX],
-            yaw=YawGains(**parts[Shape.YAW]),
-            filters=Filters(**parts[Shape.POLE], **parts[Shape.SCALAR]),
-            limits=Limits(**parts[Shape.AXES]),
+        return Gains.from_rows(
+            values,
             moment_scale=None if scale == "unknown" else _triple(scale, "moment_scale"),
             certificate=certificate,
             provenance=Provenance.from_table(table.get("provenance", {})),

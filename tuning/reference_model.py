@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +93,7 @@ class ReferenceModel:
         return int(np.flatnonzero(transient > fraction * transient.max())[-1]) + 1 + self.delay
 
 
+@runtime_checkable
 class ContinuousModel(Protocol):
     """A reference model as specified, in continuous time."""
 
@@ -158,7 +159,7 @@ class SecondOrder:
 
 
 #: Type -> class of every reference model; a new model needs a class and a row here.
-CONTINUOUS_MODELS: dict[str, type[SecondOrder]] = {SecondOrder.type: SecondOrder}
+CONTINUOUS_MODELS: dict[str, Callable[..., ContinuousModel]] = {SecondOrder.type: SecondOrder}
 
 
 def model_from_table(table: Any, where: str) -> ContinuousModel:

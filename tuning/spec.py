@@ -10,11 +10,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validat
 from mimopilot.common.toml import checked, read_toml
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder, model_from_table
+from mimopilot.tuning.reference_model import ContinuousModel, ReferenceModel, SecondOrder, model_from_table
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Triple = tuple[Positive, Positive, Positive]
+#: Roll, pitch; checked by a validator of `TuningSpec`.
+Models = tuple[ContinuousModel, ContinuousModel]
 
 
 class _SpecTable(BaseModel):
@@ -65,7 +67,7 @@ class TuningSpec(_SpecTable):
     ----------
     method : str
         ``mimo``: full matrices. ``siso``: each axis by itself, with the optimal prefilter (3.12).
-    inner, outer : tuple of 2 SecondOrder
+    inner, outer : tuple of 2 ContinuousModel
         Reference models of the rate and the attitude loop, roll then pitch. In TOML [omega rad/s, damping, delay
         samples], one list for both axes or one for each.
     structure : str
@@ -99,9 +101,11 @@ class TuningSpec(_SpecTable):
         Margins that the verdict needs.
     """
 
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
     method: Literal["mimo", "siso"] = "mimo"
-    inner: tuple[SecondOrder, SecondOrder] = (SecondOrder(30.0, 0.7), SecondOrder(30.0, 0.7))
-    outer: tuple[SecondOrder, SecondOrder] = (SecondOrder(10.0, 0.7), SecondOrder(10.0, 0.7))
+    inner: Models = (SecondOrder(30.0, 0.7), SecondOrder(30.0, 0.7))
+    outer: Models = (SecondOrder(10.0, 0.7), SecondOrder(10.0, 0.7))
     structure: Annotated[str, Field(pattern="^PI?D?F?$")] = "PID"
     instrument: Literal["external", "u", "model", "repeated"] = "external"
     trim: bool = True
@@ -123,7 +127,7 @@ class TuningSpec(_SpecTable):
         several = isinstance(value, list | tuple) and len(value) == 2 and not isinstance(value[0], int | float)
         models = value if isinstance(value, list | tuple) and several else (value, value)
         return tuple(
-            model if isinstance(model, SecondOrder) else model_from_table(model, str(info.field_name))
+            model if isinstance(model, ContinuousModel) else model_from_table(model, str(info.field_name))
             for model in models
         )
 
@@ -145,8 +149,8 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
     return checked(TuningSpec, table, str(path or "specification"))
 
 
-def parse_model(text: str) -> SecondOrder:
-    """Parse ``OMEGA,ZETA,DELAY`` (rad/s, damping, samples) from the command line.
+def parse_model(text: str) -> tuple[float, float, int]:
+    """Parse a second-order reference model of the command line: ``OMEGA,ZETA,DELAY`` (rad/s, damping, samples).
 
     Raises
     ------
@@ -156,16 +160,15 @@ def parse_model(text: str) -> SecondOrder:
     Examples
     --------
     >>> parse_model("20,0.4,0")
-    SecondOrder(omega=20.0, zeta=0.4, delay=0)
+    (20.0, 0.4, 0)
     """
     parts = text.split(",")
     try:
         if len(parts) not in (2, 3):
             raise ValueError
-        omega, zeta, delay = float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
+        return float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
     except ValueError:
         raise TuningError(f"reference model: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0") from None
-    return SecondOrder(omega, zeta, delay)
 
 
 def parse_doublet(text: str) -> dict[str, float]:

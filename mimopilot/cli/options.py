@@ -67,14 +67,14 @@ def check_not_given(reason: str, **options: object) -> None:
     reason : str
         Where they belong, for the message.
     **options
-        By the name of their parameter; None or False: not given.
+        By the name of their parameter; None: not given.
 
     Raises
     ------
     Error
         Naming those that were given.
     """
-    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value not in (None, False)]
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
     if given:
         raise Error(f"{', '.join(given)}: {reason}")
 

@@ -84,7 +84,7 @@ def sitl(
         )
     if plant:
         check_not_given(
-            "options of the plant: with --plant, give them where it was started",
+            "belong to the plant: with --plant, give them where it was started",
             port=port or None,
             speed=speed if speed != "1" else None,
             seed=seed or None,

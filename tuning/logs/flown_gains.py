@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from mimopilot.tuning.gains import Gains, Limits, Triple, YawGains
-from mimopilot.tuning.law import Filters
-from mimopilot.tuning.parameter_row import PREFIX, cutoff_of
-from mimopilot.tuning.parameters import LIMITS, MATRICES
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameter_row import AXIS_LETTERS, PREFIX, Row, Shape
+from mimopilot.tuning.parameters import ROWS, SCALE
 from mimopilot.tuning.provenance import Provenance
-
-SCALE = "SCALE"
 
 #: Matrix -> PX4's parameter for an axis. PX4 multiplies the rate terms by MC_*RATE_K.
 _PX4 = {
@@ -24,7 +22,16 @@ _PX4 = {
     "Kff_i": "MC_{axis}RATE_FF",
 }
 _PX4_AXES = ("ROLL", "PITCH", "YAW")
-_PX4_INTEGRAL = ("MC_RR_INT_LIM", "MC_PR_INT_LIM", "MC_YR_INT_LIM")
+#: Limit -> PX4's parameter of each axis, its factor to our unit, and its value where it is not logged (NaN: not known).
+_PX4_LIMITS = {
+    "rate_max": [(f"MC_{axis}RATE_MAX", math.pi / 180, math.nan) for axis in _PX4_AXES],
+    "moment_max": [("", 1.0, 1.0)] * 3,
+    "integral_max": [(name, 1.0, math.nan) for name in ("MC_RR_INT_LIM", "MC_PR_INT_LIM", "MC_YR_INT_LIM")],
+}
+#: Cut-off of a filter -> PX4's parameter, Hz.
+_PX4_CUTOFFS = {"derivative_cutoff_hz": "IMU_DGYRO_CUTOFF"}
+#: The period is that of the log.
+_PERIOD = next(row for row in ROWS if row.key == "Ts")
 
 
 def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
@@ -45,45 +52,43 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     """
     # Vehicles store float32: use the shortest decimal that rounds to the same float32.
     values = {name: float(str(np.float32(value))) for name, value in parameters.items()}
-
-    def find(code: str, fallback: str, factor: float = 1.0) -> float:
-        ours = values.get(PREFIX + code)
-        return ours if ours is not None else factor * values.get(fallback, math.nan)
-
-    def gain(name: str, i: int, j: int) -> float:
-        code = f"{MATRICES[name]}_{'RPY'[i]}{'RPY'[j]}"
-        if i != j:
-            return values.get(PREFIX + code, 0.0)
-        axis = _PX4_AXES[i]
-        factor = 1.0 if name == "Kp_o" else values.get(f"MC_{axis}RATE_K", 1.0)
-        return find(code, _PX4[name].format(axis=axis), factor)
-
-    def triple(name: str, fallback: tuple[str, ...], factor: float) -> Triple:
-        r, p, y = (find(f"{LIMITS[name]}_{letter}", key, factor) for letter, key in zip("RPY", fallback, strict=True))
-        return r, p, y
-
-    matrices = {name: np.array([[gain(name, i, j) for j in range(2)] for i in range(2)]) for name in MATRICES}
-    yaw = YawGains(**{name: gain(name, 2, 2) for name in MATRICES})
-    rates = tuple(f"MC_{axis}RATE_MAX" for axis in _PX4_AXES)
-    limits = Limits(
-        rate_max=triple("rate_max", rates, math.pi / 180),
-        moment_max=tuple(values.get(f"{PREFIX}UMAX_{letter}", 1.0) for letter in "RPY"),  # type: ignore[arg-type]
-        integral_max=triple("integral_max", _PX4_INTEGRAL, 1.0),
-    )
-    numbers = [*np.concatenate([m.ravel() for m in matrices.values()]), *vars(yaw).values()]
-    numbers += [*limits.rate_max, *limits.moment_max, *limits.integral_max]
-    if not np.isfinite(numbers).all():
-        return None
-    pole = values.get(PREFIX + "D_POLE")
-    cutoff = values.get("IMU_DGYRO_CUTOFF", 0.0) if pole is None else float(f"{cutoff_of(pole, Ts):.6g}")
-    scale = [values.get(f"{PREFIX}{SCALE}_{letter}") for letter in "RPY"]
-    if min(*limits.rate_max, *limits.moment_max, *limits.integral_max) <= 0:
-        return None
-    return Gains(
-        **matrices,  # type: ignore[arg-type]
-        yaw=yaw,
-        filters=Filters(Ts, cutoff),
-        limits=limits,
-        moment_scale=None if None in scale else tuple(scale),  # type: ignore[arg-type]
+    found: dict[Row, Any] = {_PERIOD: Ts}
+    for row in ROWS:
+        if row is _PERIOD:
+            continue
+        numbers = []
+        for code in row.codes:
+            ours = values.get(PREFIX + code)
+            numbers.append(_stock(row, code, values) if ours is None else _of_the_file(row, ours, Ts))
+        if not all(row.shape is Shape.POLE or row.valid.holds(number) for number in numbers):
+            return None
+        found[row] = numbers[0] if len(numbers) == 1 else numbers
+    scale = [values.get(f"{PREFIX}{SCALE}_{letter}") for letter in AXIS_LETTERS]
+    return Gains.from_rows(
+        found,
+        moment_scale=None if None in scale else tuple(scale),
         provenance=Provenance("flown"),
     )
+
+
+def _of_the_file(row: Row, element: float, Ts: float) -> float:
+    """What a gains file has for an element of the controller; a cut-off to 6 digits, as precise as its pole."""
+    return float(f"{row.value(element, Ts):.6g}") if row.shape is Shape.POLE else element
+
+
+def _stock(row: Row, code: str, values: Mapping[str, float]) -> float:
+    """What PX4's own controller has for an element; not a number where the log does not tell."""
+    if row.shape is Shape.POLE:
+        return values.get(_PX4_CUTOFFS.get(row.key, ""), row.default or 0.0)
+    if row.shape is Shape.SCALAR:
+        return math.nan if row.default is None else row.default
+    *_, axes = code.rpartition("_")
+    if axes[0] != axes[-1]:
+        return 0.0
+    axis = AXIS_LETTERS.index(axes[0])
+    if row.shape is Shape.AXES:
+        name, factor, default = _PX4_LIMITS[row.key][axis]
+        return factor * values.get(name, default)
+    name = _PX4_AXES[axis]
+    factor = 1.0 if row.key == "Kp_o" else values.get(f"MC_{name}RATE_K", 1.0)
+    return factor * values.get(_PX4[row.key].format(axis=name), math.nan)

@@ -12,6 +12,7 @@ from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import FOLDER, known_airframes, load_airframe
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
+from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.provenance import Provenance
@@ -94,7 +95,7 @@ def test_converted_gains_give_the_same_torque_in_newton_metres_and_keep_their_ce
     scale = load_airframe("px4_sih").airframe.moment_scale()
     assert scale == pytest.approx((2.88, 2.88, 0.2))
     original = load_airframe("adam0").default_gains()
-    certified = original.with_certificate({"verdict": "certified", "reason": ""})
+    certified = original.with_certificate(Certificate(Verdict.CERTIFIED, ""))
     converted = certified.with_moment_scale(scale)
     for name in ("Kp_i", "Ki_i", "Kd_i"):
         moments = [np.array(g.moment_scale[:2])[:, None] * getattr(g, name) for g in (original, converted)]
