@@ -113,7 +113,7 @@ def test_converted_gains_give_the_same_torque_in_newton_metres_and_keep_their_ce
     assert deviation == pytest.approx(np.array([[1.0, 2.0], [3.0, 4.0]]) * original.moment_scale[0] / scale[0])
     back = converted.with_moment_scale(original.moment_scale)
     assert back.Kp_i == pytest.approx(original.Kp_i, rel=1e-12)
-    with pytest.raises(TuningError, match="do not say"):
+    with pytest.raises(TuningError, match="is not known"):
         dataclasses.replace(original, moment_scale=None).with_moment_scale(scale)
 
 
