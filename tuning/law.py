@@ -133,6 +133,10 @@ TERMS = {
 }
 
 
+#: The attitude controller, which makes the rate setpoint; its error is that of the angles.
+ATTITUDE = Term("Kp_o", ERROR)
+
+
 class Matrices(Protocol):
     """A gain set, or several stacked: matrices (..., 2, 2) by the names of `TERMS`, and the filters."""
 
@@ -244,7 +248,37 @@ def state_space(matrices: Mapping[str, Signal], filters: Filters) -> StateSpaceL
     return StateSpaceLaw(A, B, np.hstack([np.zeros((n_u, 0)), *outputs]), D)
 
 
-def response(gains: Any, omega: Signal) -> Response:
+def attitude_matrix(gains: Matrices) -> Signal:
+    """Matrix of the attitude controller."""
+    matrix: Signal = getattr(gains, ATTITUDE.matrix)
+    return matrix
+
+
+def cascade_response(gains: Matrices, omega: Signal) -> tuple[Response, Response]:
+    """Frequency response of both controllers: u = C_o (r_o - y_o) - C_y y_i.
+
+    Parameters
+    ----------
+    gains : Gains or GainStack
+    omega : (K,) array, rad/s
+
+    Returns
+    -------
+    C_o, C_y : (..., K, 2, 2) arrays
+    """
+    of_r, of_y = rate_response(rate_matrices(gains), gains.filters, omega)
+    return of_r @ attitude_matrix(gains), of_y
+
+
+class AllAxes(Matrices, Protocol):
+    """A gain set with the scalars of the yaw axis, by the names of `TERMS`."""
+
+    @property
+    def yaw(self) -> Any:
+        """The scalars."""
+
+
+def response(gains: AllAxes, omega: Signal) -> Response:
     """Frequency response of the whole law for small signals, without its limits.
 
     Parameters
@@ -262,7 +296,7 @@ def response(gains: Any, omega: Signal) -> Response:
     def whole(name: str) -> Signal:
         return np.asarray(block_diag(getattr(gains, name), getattr(gains.yaw, name)), dtype=np.float64)
 
-    attitude, eye, none = whole("Kp_o"), np.eye(3), np.zeros((3, 3))
+    attitude, eye, none = whole(ATTITUDE.matrix), np.eye(3), np.zeros((3, 3))
     matrices = {letter: whole(term.matrix) for letter, term in TERMS.items()}
     found = np.zeros((len(omega), 6, 12), np.complex128)
     found[:, :3] = np.hstack([attitude, -attitude, none, none])

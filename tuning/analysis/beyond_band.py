@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from mimopilot.tuning.analysis import margins
-from mimopilot.tuning.analysis.closed_loop import cascade_loop, rate_controller, singular_values
+from mimopilot.tuning.analysis.closed_loop import cascade_loop, singular_values
 from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import cascade_response
 from mimopilot.tuning.plant.frequency_response import COHERENT, PlantResponse
 
 #: Largest gain of the rate loop above the band: 6 dB below instability, if the plant falls like an integrator there.
@@ -68,7 +69,7 @@ def loop_gain_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
     largest value on, w |G| is fitted by a sequence that does not rise, which also removes noise.
     """
     grid = np.concatenate([plant.omega, np.linspace(plant.omega[-1], np.pi / gains.Ts, GRID_POINTS)[1:]])
-    falling = singular_values(rate_controller(gains, grid)[1])[0] / grid
+    falling = singular_values(cascade_response(gains, grid)[1])[0] / grid
     highest = np.maximum.accumulate(falling[..., ::-1], axis=-1)[..., ::-1][..., : len(plant.omega)]
     gain: Signal = singular_values(plant.G_i)[0] * plant.omega
     top = int(np.argmax(gain))
@@ -78,13 +79,13 @@ def loop_gain_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
 
 
 def attitude_gain_above(gains: Gains, plant: PlantResponse) -> float:
-    """Upper bound of what the attitude path C_r Kp_o G_o adds to the loop's gain above the plant's band.
+    """Upper bound of what the attitude path C_o G_o adds to the loop's gain above the plant's band.
 
     G_o falls at least like 1/w^2 there, see `loop_gain_above`.
     """
     grid = np.linspace(plant.omega[-1], np.pi / gains.Ts, GRID_POINTS)
     path = (
-        np.linalg.norm(rate_controller(gains, grid)[0] @ gains.Kp_o, ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
+        np.linalg.norm(cascade_response(gains, grid)[0], ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
     )
     return float(np.linalg.norm(plant.G_o[-1], ord=2) * path.max())
 
@@ -147,7 +148,7 @@ def _measured(plant: PlantResponse, gain: Signal, error: Signal) -> NDArray[np.b
 
 def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]:
     """sigma_max of the rate loop, (K,), and the RMS of the error's norm: two deviations of an element."""
-    controller = rate_controller(gains, plant.omega)[1]
+    controller = cascade_response(gains, plant.omega)[1]
     gain = singular_values(controller @ plant.G_i)[0]
     # Independent errors of the elements: C E has the covariance sum |C_ij|^2 dev_jk^2.
     spread = np.sqrt(np.abs(controller) ** 2 @ plant.deviation() ** 2)

@@ -39,7 +39,7 @@ class CascadeLoop:
     Attributes
     ----------
     L_i : rate loop alone, cut at u.
-    L_u : whole loop, cut at u: C_y G_i + C_r Kp_o G_o, with u = C_r r_i - C_y y_i.
+    L_u : whole loop, cut at u: C_y G_i + C_o G_o, with u = C_o (r_o - y_o) - C_y y_i.
     T_o : from attitude setpoint to attitude.
     U_o : from attitude setpoint to u.
     """
@@ -51,16 +51,10 @@ class CascadeLoop:
 
 
 def whole_loop(gains: Gains | GainStack, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
-    """L_i and L_u as in `CascadeLoop`, and the attitude path C_r Kp_o, (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
-    C_r, C_y = rate_controller(gains, plant.omega)
-    forward = C_r @ gains.Kp_o
+    """L_i and L_u as in `CascadeLoop`, and the attitude path C_o, (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
+    C_o, C_y = law.cascade_response(gains, plant.omega)
     L_i = C_y @ plant.G_i
-    return L_i, L_i + forward @ plant.G_o, forward
-
-
-def rate_controller(gains: Gains | GainStack, omega: Signal) -> tuple[Complex, Complex]:
-    """C_r and C_y of u = C_r r - C_y y at frequencies omega (rad/s), (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
-    return law.rate_response(law.rate_matrices(gains), gains.filters, omega)
+    return L_i, L_i + C_o @ plant.G_o, C_o
 
 
 def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
@@ -88,7 +82,7 @@ def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
     now = plant.C @ state
     angle = angle + gains.Ts / 2 * (now + rate)
     radius = 0.0
-    for setpoint in (np.zeros_like(now), -gains.Kp_o @ angle):
+    for setpoint in (np.zeros_like(now), -law.attitude_matrix(gains) @ angle):
         signals = {law.ERROR: setpoint - now, law.RATE: now, law.SETPOINT: setpoint}
         torque = flown.C @ memory + sum(flown.D[signal] @ values for signal, values in signals.items())
         ahead = flown.A @ memory + sum(flown.B[signal] @ values for signal, values in signals.items())

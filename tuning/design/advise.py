@@ -7,7 +7,7 @@ candidates that follow the attitude model nearly best, the one with the least to
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -220,6 +220,8 @@ def advise(
 def _slowest_zero(experiment: Experiment, cutoff_hz: float) -> float | None:
     """Slowest non-minimum-phase zero from torque to rate of the two axes, rad/s; None: there is none."""
     start, external = second_order(*FLEXIBLE, experiment.Ts), external_signal(experiment)[0]
+    flown = experiment.flown.filters if experiment.flown else Filters(experiment.Ts)
+    filters = replace(flown, Ts=experiment.Ts, derivative_cutoff_hz=cutoff_hz)
     models = [
         flexible_model(
             experiment.u[:, axis],
@@ -227,7 +229,7 @@ def _slowest_zero(experiment: Experiment, cutoff_hz: float) -> float | None:
             external,
             start,
             segments=experiment.segments,
-            filters=Filters(experiment.Ts, cutoff_hz),
+            filters=filters,
         )
         for axis in range(2)
     ]

@@ -228,6 +228,7 @@ def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
         )
     zero = np.zeros((2, 2))
     cutoff = spec.derivative_cutoff_hz
+    filters = replace(flown.filters, Ts=experiment.Ts) if flown else Filters(experiment.Ts)
     yaw = YawGains(**spec.yaw.model_dump()) if spec.yaw else flown.yaw  # type: ignore[union-attr]
     limits = Limits(**spec.limits.model_dump()) if spec.limits else flown.limits if flown else Limits()
     return Gains(
@@ -237,7 +238,7 @@ def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
         Kd_i=zero,
         Kff_i=zero,
         yaw=yaw,
-        filters=Filters(experiment.Ts, flown.derivative_cutoff_hz if cutoff is None and flown else cutoff or 0.0),
+        filters=filters if cutoff is None else replace(filters, derivative_cutoff_hz=cutoff),
         limits=limits,
         moment_scale=spec.moment_scale or (flown.moment_scale if flown else None),
     )

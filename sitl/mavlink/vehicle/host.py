@@ -28,6 +28,8 @@ from mimopilot.sitl.physics.state_estimate import MEASUREMENT_SIZE, euler_angles
 from mimopilot.tuning.parameters import PARAMETERS
 
 # All chosen:
+#: Place of the control period among the gains.
+PERIOD = [parameter.code for parameter in PARAMETERS].index("TS")
 PLANT_TIMEOUT_S = 0.9  # s without a frame before it is reported: within one second
 GROUND_PERIOD_S = 0.002  # s between reads of the ground stations' links, which are polled, not waited for
 CHILD_PERIOD_S = 0.2  # s between reads of our own plant process's messages
@@ -250,7 +252,7 @@ class Host:
         for parameter, value in zip(PARAMETERS, gains.tolist(), strict=True):
             if not parameter.minimum <= value <= parameter.maximum:
                 found["parameters"] = f"{parameter.name} is {value:g}, outside its range"
-        Ts, passed = float(gains[-1]), self._periods - self._checked
+        Ts, passed = float(gains[PERIOD]), self._periods - self._checked
         period = (self.stamp - self._first) * 1e-6 / max(passed, 1)
         if passed >= CHECK_PERIODS and abs(period - Ts) > PERIOD_TOLERANCE * Ts and not fault:
             found["rate"] = f"the plant's period is {1e3 * period:.3g} ms, the gains are for {1e3 * Ts:.3g} ms"
