@@ -183,7 +183,7 @@ class EmulatedController:
 
         Parameters
         ----------
-        gains : Gains or (36,) float32 array
+        gains : Gains or (len(PARAMETERS),) float32 array
             The new gains.
         """
         self._gains[0] = gains_array(gains)

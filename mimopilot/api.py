@@ -9,7 +9,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from mimopilot.common.blas import reproducible
 from mimopilot.sitl.physics.airframe import Airframe
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mimopilot.sitl.flight.metrics import Performance
     from mimopilot.sitl.flight.scenario import Scenario
     from mimopilot.sitl.flight.simulator import Flight
+    from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
     from mimopilot.sitl.mavlink.ground_station.upload import UploadOutcome
     from mimopilot.tuning.design.advise import Advice
     from mimopilot.tuning.logs.columns import Columns
@@ -48,6 +50,11 @@ def read_log(path: PathLike, columns: PathLike | None = None) -> Experiment:
     -------
     Experiment
         The signals in SI units; what is doubtful about the log is in its `warnings`.
+
+    Raises
+    ------
+    Error
+        When the file is no flight log, is damaged, lacks a signal, or its columns contradict one another.
     """
     from mimopilot.tuning.logs.reader import read_log as read
 
@@ -56,7 +63,23 @@ def read_log(path: PathLike, columns: PathLike | None = None) -> Experiment:
 
 @reproducible
 def inspect(path: PathLike, columns: PathLike | None = None) -> Inspection:
-    """Say what is in a log, and whether gains can be tuned from it; see `read_log`."""
+    """Say what is in a log, and whether gains can be tuned from it.
+
+    Parameters
+    ----------
+    path, columns
+        As in `read_log`.
+
+    Returns
+    -------
+    Inspection
+        Its `reason` is None when gains can be tuned.
+
+    Raises
+    ------
+    Error
+        When the file is no flight log or damaged.
+    """
     from mimopilot.tuning.logs.inspection import inspect_log
 
     return inspect_log(Path(path), _columns(columns))
@@ -82,7 +105,7 @@ def tune(
     inner, outer : tuple, optional
         Reference models of the rate and the attitude loop: (omega rad/s, damping, delay samples).
     spec : str, Path or TuningSpec, optional
-        Specification; TOML where it is a path. What is given here outranks it.
+        Specification; TOML where it is a path. What is given here overrides it.
     repeat : str, Path or Experiment, optional
         Second flight of the same experiment, for the instrument ``repeated``.
     columns : str or Path, optional
@@ -94,6 +117,11 @@ def tune(
     -------
     Gains
         With their certificate, standard deviations and warnings.
+
+    Raises
+    ------
+    Error
+        When the log cannot be read or tuned from, an option is unknown, or the gains would be unstable.
     """
     from mimopilot.tuning.design.cascade import tune as tune_cascade
 
@@ -106,7 +134,7 @@ def tune(
 def certify(
     log: Log, gains: GainSet, *, spec: PathLike | TuningSpec | None = None, columns: PathLike | None = None
 ) -> Gains:
-    """Say whether a loop will be stable, from a flight of the vehicle under any gains.
+    """Check the stability of the closed loop, from a flight of the vehicle with any gains.
 
     Parameters
     ----------
@@ -122,6 +150,11 @@ def certify(
     -------
     Gains
         The same set with its new certificate: see `Gains.verdict` and `Gains.certificate`.
+
+    Raises
+    ------
+    Error
+        When the log or the gains cannot be read, or do not belong together.
     """
     from mimopilot.tuning.design.cascade import certify_from_log
 
@@ -153,6 +186,11 @@ def advise(
     -------
     Advice
         Its `recommended` candidate holds tuned and certified gains.
+
+    Raises
+    ------
+    Error
+        When the log cannot be tuned from, or no candidate is certified.
     """
     from mimopilot.tuning.design.advise import advise as scan
 
@@ -160,10 +198,43 @@ def advise(
 
 
 def load_gains(path: PathLike) -> Gains:
-    """Read a gains file, ``*.gains.toml``; `Gains.save` writes one."""
+    """Read a gains file; `Gains.save` writes one.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``*.gains.toml``.
+
+    Returns
+    -------
+    Gains
+
+    Raises
+    ------
+    Error
+        When the file cannot be read, or a value is missing or wrong.
+    """
     from mimopilot.tuning.gains_file import load_gains as load
 
     return load(path)
+
+
+class GeneratedTree(NamedTuple):
+    """What `generate` wrote.
+
+    Attributes
+    ----------
+    files : list of Path
+        All files of the tree, also those that were up to date.
+    written : list of Path
+        Those that were written.
+    warning : str
+        What is doubtful about the stability of the gains; empty: nothing.
+    """
+
+    files: list[Path]
+    written: list[Path]
+    warning: str
 
 
 def generate(
@@ -171,10 +242,10 @@ def generate(
     out: PathLike,
     *,
     target: str = "native",
-    px4_api: str = "crtp",
     force: bool = False,
     uncertified: bool = False,
-) -> list[Path]:
+    **options: str,
+) -> GeneratedTree:
     """Emit the C++ controller with its gains, parameter table, build files and tests.
 
     Parameters
@@ -183,31 +254,51 @@ def generate(
     out : str or Path
         Folder to write to.
     target : str
-        ``native``, ``px4`` or ``cortex-m4``.
-    px4_api : str
-        PX4's module interface: ``crtp`` up to v1.17, ``descriptor`` later.
+        Name of a target, see `codegen.targets`: ``native``, ``px4``, ``cortex-m4``.
     force : bool
         Overwrite files that mimopilot did not generate.
     uncertified : bool
         Accept gains whose stability is in doubt.
+    **options : str
+        Options of the target, such as ``px4_api``: ``crtp`` up to v1.17, ``descriptor`` later.
 
     Returns
     -------
-    list of Path
-        All files of the tree, also those that were up to date.
+    GeneratedTree
+
+    Raises
+    ------
+    Error
+        When the target or an option is unknown, a gain is out of its range, the gains are not certified, or the folder
+        holds files of somebody else.
     """
     from mimopilot.codegen.render import render, write_tree
     from mimopilot.tuning.acceptance import check_verdict
 
     loaded = _gains(gains)
-    check_verdict(loaded, allow=uncertified)
-    files = render(loaded, target, px4_api=px4_api)
-    write_tree(files, Path(out), force)
-    return [Path(out) / name for name in files]
+    warning = check_verdict(loaded, allow=uncertified)
+    files = render(loaded, target, **options)
+    written = write_tree(files, Path(out), force)
+    return GeneratedTree([Path(out) / name for name in files], [Path(out) / name for name in written], warning)
 
 
 def load_airframe(name_or_path: PathLike) -> Airframe:
-    """An airframe that comes with mimopilot, by name, or that of a TOML file."""
+    """Load an airframe.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        Name of an airframe that comes with mimopilot, or a TOML file.
+
+    Returns
+    -------
+    Airframe
+
+    Raises
+    ------
+    Error
+        When the name is unknown, or the vehicle cannot fly.
+    """
     from mimopilot.sitl.physics.airframe import load_airframe as load
 
     return load(str(name_or_path)).airframe
@@ -254,6 +345,11 @@ def fly(
     -------
     Flight
         See `performance` for its figures and `plot_flight`.
+
+    Raises
+    ------
+    Error
+        When the airframe, the gains, the scenario or a fault is not possible.
     """
     from mimopilot.codegen.cortex_m4 import load_emulated
     from mimopilot.sitl.autopilot.autopilot import Autopilot
@@ -274,7 +370,23 @@ def fly(
 
 
 def performance(flight: Flight, gains: GainSet) -> Performance:
-    """Figures of a flight over its manoeuvre, against the reference models that the gains were made for."""
+    """Figures of a flight over its manoeuvre, against the reference models of the gains.
+
+    Parameters
+    ----------
+    flight : Flight
+    gains : str, Path or Gains
+
+    Returns
+    -------
+    Performance
+        J_M and J_r of (6.1)-(6.4), peaks, off-axis RMS, effort; units in the names of its attributes.
+
+    Raises
+    ------
+    Error
+        When the gains cannot be read.
+    """
     from mimopilot.sitl.flight.metrics import performance as figures
 
     return figures(flight, *_gains(gains).reference_models(flight.scenario.axis))
@@ -302,7 +414,7 @@ def experiment(
         Where its log is written (ULog).
     seconds_per_axis : float, s
     amplitude : float, optional
-        Of the injected torque (normalised); by default 0.15, or less where the motors have little room.
+        Of the injected torque (normalised); by default 0.15, or less if the motors would saturate.
     bandwidth : float, rad/s
         Of the injected torque.
     seed : int
@@ -314,6 +426,11 @@ def experiment(
     -------
     Experiment
         As read from the log.
+
+    Raises
+    ------
+    Error
+        When the airframe or the excitation is not possible, or the vehicle is lost.
     """
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, check_survived, default_amplitude
     from mimopilot.tuning.logs.reader import read_log as read
@@ -342,7 +459,7 @@ def upload(
     signing_key: PathLike | None = None,
     system: int = 0,
 ) -> UploadOutcome:
-    """Write gains to a vehicle: all of them, each read back, or the old ones again.
+    """Upload all gains and verify each; after a failure restore the old values.
 
     Parameters
     ----------
@@ -368,29 +485,47 @@ def upload(
     -------
     UploadOutcome
         ``verified`` when every value was read back.
+
+    Raises
+    ------
+    Error
+        When the vehicle is not the one that the plan is for, or anything fails: the old values are restored.
     """
+    from mimopilot.sitl.mavlink.ground_station.transaction import upload_and_verify
+
+    plan, options, loaded, _ = prepare_upload(
+        gains,
+        connect,
+        profile=profile,
+        uncertified=uncertified,
+        drop_off_diagonals=drop_off_diagonals,
+        system=system,
+        timeout=timeout,
+        signing_key=Path(signing_key) if signing_key else None,
+        force_armed=force_armed,
+        dry_run=dry_run,
+        yes=True,
+        snapshot=Path(snapshot) if snapshot else None,
+    )
+    done = upload_and_verify(plan, options, loaded, moment_scale)
+    done.check()
+    return done.outcome
+
+
+def prepare_upload(
+    gains: GainSet, connect: str, *, profile: str, uncertified: bool, drop_off_diagonals: bool, **link: Any
+) -> tuple[UploadPlan, LinkOptions, Gains, str]:
+    """Plan of an upload, the options of its link, the gains, and a warning about their stability; see `upload`."""
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
-    from mimopilot.sitl.mavlink.ground_station.transaction import upload_and_verify
     from mimopilot.tuning.acceptance import check_verdict
 
     loaded = _gains(gains)
-    check_verdict(loaded, allow=uncertified)
+    warning = check_verdict(loaded, allow=uncertified)
     source = Path("gains") if isinstance(gains, Gains) else Path(gains)
-    options = LinkOptions(
-        connect,
-        system,
-        timeout,
-        Path(signing_key) if signing_key else None,
-        force_armed,
-        dry_run,
-        yes=True,
-        snapshot=Path(snapshot) if snapshot else None,
-        stem=source.with_name(source.name.removesuffix(".toml").removesuffix(".gains")),
-    )
-    done = upload_and_verify(make_plan(loaded, profile, drop_off_diagonals), options, loaded, moment_scale)
-    done.check()
-    return done.outcome
+    stem = source.with_name(source.name.removesuffix(".toml").removesuffix(".gains"))
+    plan = make_plan(loaded, profile, drop_off_diagonals)
+    return plan, LinkOptions(connect, stem=stem, **link), loaded, warning
 
 
 def vehicle(airframe: PathLike | Airframe, gains: GainSet | None = None) -> tuple[Airframe, Gains]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from mimopilot.sitl.studies.benchmark_studies import gain_spread
 from mimopilot.sitl.studies.benchmarks import lv100, numerical_example
-from mimopilot.tuning.analysis.certificate import certify
+from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.design.cascade_estimate import estimate
 from mimopilot.tuning.estimation.vrft import vrft

@@ -1,4 +1,4 @@
-"""Fixtures shared by all rooms."""
+"""Fixtures shared by all tests."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-# As the front door does, before numpy is loaded: what is computed here is compared with what commands print.
+# As the command line does, before numpy is loaded: results are compared with printed ones.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
 
 import numpy as np
@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, settings
 from mimopilot.tuning.gains import Gains, Limits, YawGains
 from mimopilot.tuning.law import Filters
 
-#: How fast the machine is decides nothing.
+#: No deadlines: tests must not depend on the machine's speed.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any machine")
 

@@ -94,9 +94,11 @@ def test_a_flight_has_the_figures_of_the_command(gains, folder):
 
 
 def test_code_is_generated_for_a_target(gains, folder):
-    files = mp.generate(gains, str(folder / "cpp"), target="px4")
-    assert folder / "cpp" / "core" / "mimo_pid.cpp" in files
-    assert all(path.is_file() for path in files)
+    tree = mp.generate(gains, str(folder / "cpp"), target="px4", px4_api="descriptor")
+    assert folder / "cpp" / "core" / "mimo_pid.cpp" in tree.files == tree.written
+    assert all(path.is_file() for path in tree.files)
+    assert mp.generate(gains, folder / "cpp", target="px4", px4_api="descriptor").written == []
+    assert tree.warning == ""
     with pytest.raises(mp.Error, match="target: got 'zx81', expected one of cortex-m4, native, px4"):
         mp.generate(gains, folder / "cpp", target="zx81")
 

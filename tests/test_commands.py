@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 from pyulog import ULog
 
-from mimopilot.sitl.physics.airframe import FOLDER
+from mimopilot.codegen.targets import targets
+from mimopilot.sitl.physics.airframe import FOLDER, known_airframes
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.ulog_file import open_ulog
 from mimopilot.tuning.reference_model import SecondOrder
@@ -266,7 +267,7 @@ def test_the_wheel_holds_every_file_that_is_not_python(tmp_path):
     assert wanted <= held
 
 
-def test_the_demo_does_the_whole_way(mimopilot, tmp_path):
+def test_the_demo_runs_the_whole_workflow(mimopilot, tmp_path):
     result = mimopilot("demo", "--out", "out", "--seed", "1", "--json")
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
@@ -321,3 +322,18 @@ def test_damage_of_a_log_is_told_once_by_every_command_that_reads_it(mimopilot, 
         pattern = r"mimopilot: warning: x\.ulg: damaged: \d+ of \d+ bytes, in 1 place, are not valid"
         assert re.match(pattern, told[0])
     assert "damaged: " in (tmp_path / "g.gains.toml").read_text()
+
+
+def test_help_and_readme_name_every_target_and_airframe(mimopilot):
+    readme = (TOP / "README.md").read_text()
+    help_text = " ".join(mimopilot("generate", "--help").stdout.split())
+    for name, target in targets().items():
+        assert f"{name}: {target.help}" in help_text
+        assert f"--target {name}" in readme
+        for option, values in target.options.items():
+            assert f"--{option.replace('_', '-')}" in help_text
+            assert all(value in help_text for value in values)
+    flights = mimopilot("fly", "--help").stdout
+    for name in known_airframes():
+        assert name in flights
+        assert f"`{name}`" in readme

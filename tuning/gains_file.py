@@ -81,7 +81,7 @@ def _entry(table: dict[str, Any], row: Row) -> Any:
 def _get(table: Any, key: str, section: str) -> Any:
     if not isinstance(table, dict) or key not in table:
         name = f"{section}.{key}" if section else key
-        raise TuningError(f"{name}: missing; add it to the file, gains have no defaults")
+        raise TuningError(f"{name}: missing; add it to the file, it has no default")
     return table[key]
 
 

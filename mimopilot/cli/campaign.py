@@ -58,7 +58,7 @@ def campaign(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Fly a vehicle that varies, thousands of times: with which gains it survives, and how well it follows."""
+    """Fly many varied vehicles; report survival and tracking of each gain set."""
     from mimopilot.common.files import inside, write_atomically
     from mimopilot.common.parallel import cores
     from mimopilot.sitl.campaign.campaign_figures import parse_map

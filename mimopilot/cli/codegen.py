@@ -34,16 +34,12 @@ def generate(
     uncertified: UncertifiedOption = False,
 ) -> None:
     """Emit the C++ controller with its gains, parameter table, build files and tests."""
-    from mimopilot.codegen.render import render, write_tree
-    from mimopilot.tuning.acceptance import check_verdict
-    from mimopilot.tuning.gains_file import load_gains
+    import mimopilot as mp
 
-    loaded = load_gains(gains)
-    doubt = check_verdict(loaded, allow=uncertified)
-    warn(gains, [doubt] if doubt else [])
-    files = render(loaded, target, px4_api=px4_api)
-    written = write_tree(files, out, force)
-    print(f"{out}: {len(files)} files, {len(written)} written, {len(files) - len(written)} unchanged")
+    tree = mp.generate(gains, out, target=target, force=force, uncertified=uncertified, px4_api=px4_api)
+    warn(gains, [tree.warning] if tree.warning else [])
+    count, written = len(tree.files), len(tree.written)
+    print(f"{out}: {count} files, {written} written, {count - written} unchanged")
 
 
 def pil(

@@ -60,7 +60,7 @@ SystemOption = Annotated[
 
 
 def check_not_given(reason: str, **options: object) -> None:
-    """Refuse options that do not belong to what was asked for.
+    """Refuse options that do not apply to this mode.
 
     Parameters
     ----------

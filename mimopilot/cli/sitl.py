@@ -52,7 +52,7 @@ def sitl(
     ] = None,
     parameters: Annotated[
         Path | None,
-        typer.Option(help="Store here what ground stations change; at the next start it outranks the gains."),
+        typer.Option(help="Store here what ground stations change; at the next start it overrides the gains."),
     ] = None,
     speed: SpeedOption = "1",
     seed: SeedOption = 0,
@@ -149,7 +149,7 @@ def plant(
     try:
         if serial:
             board = SerialPlant(vehicle, serial)
-            print(f"plant of {airframe} speaks on {serial}", flush=True)
+            print(f"plant of {airframe}: serial port {serial}", flush=True)
             board.serve()
         with listen(LOOPBACK, port) as socket:
             print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)

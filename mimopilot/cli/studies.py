@@ -39,7 +39,7 @@ def demo(
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """The whole way, once: excitation flight, tuning, generated C++, doublets, report."""
+    """Run the whole workflow once: excitation flight, tuning, generated C++, doublets, report."""
     from mimopilot.common.console import print_json
     from mimopilot.sitl.studies.demo import print_summary, run_demo
 

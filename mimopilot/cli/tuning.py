@@ -155,7 +155,7 @@ def certify(
     columns: ColumnsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say whether a loop will be stable, from a flight of the vehicle under any gains. Exit code 1: not shown."""
+    """Check the stability of the closed loop, from a flight with any gains. Exit code 1: not certified."""
     import mimopilot as mp
     from mimopilot.tuning.certificate import ACCEPTED
 

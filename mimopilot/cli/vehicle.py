@@ -64,7 +64,7 @@ def upload(
     system: SystemOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Put gains on a vehicle: all of them, each read back, or the old ones again.
+    """Upload all gains and verify each; after a failure restore the old values.
 
     Nothing is written to an armed vehicle, or after a HEARTBEAT older than 1.5 s: a new one is requested. Once the
     vehicle has stored its values, 2.5 s after the last write and after another HEARTBEAT, all of them are read again.
@@ -72,31 +72,26 @@ def upload(
     same system number) the old values are restored, also on an armed vehicle, and the exit code is 1. If the link is
     lost, every parameter that may hold a new value is listed.
     """
-    from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
-    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+    from mimopilot.api import prepare_upload
     from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, upload_with_dialogue
-    from mimopilot.tuning.acceptance import check_verdict
-    from mimopilot.tuning.gains_file import load_gains
 
-    loaded = load_gains(gains)
-    doubt = check_verdict(loaded, allow=uncertified)
-    warn(gains, [doubt] if doubt else [])
-    plan = make_plan(loaded, profile, drop_off_diagonals)
-    scale = parse_scale(moment_scale)
-    stem = gains.name.removesuffix(".toml").removesuffix(".gains")
-    options = LinkOptions(
+    plan, options, loaded, doubt = prepare_upload(
+        gains,
         connect,
-        system,
-        timeout,
-        signing_key,
+        profile=profile,
+        uncertified=uncertified,
+        drop_off_diagonals=drop_off_diagonals,
+        system=system,
+        timeout=timeout,
+        signing_key=signing_key,
         force_armed=force_armed,
         dry_run=dry_run,
         yes=yes,
         as_json=as_json,
         snapshot=snapshot,
-        stem=gains.with_name(stem),
     )
-    upload_with_dialogue(plan, options, loaded, scale)
+    warn(gains, [doubt] if doubt else [])
+    upload_with_dialogue(plan, options, loaded, parse_scale(moment_scale))
 
 
 def restore(
@@ -111,7 +106,7 @@ def restore(
     system: SystemOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a snapshot's values back to a vehicle, with the same care as an upload.
+    """Restore a snapshot, with the checks of an upload.
 
     A snapshot that is not whole, holds a part of our gains only, or a value out of its range, is refused.
     """
@@ -123,7 +118,7 @@ def restore(
     plan = make_restore_plan(read_parameters(parameters), str(parameters))
     stem = parameters.with_name(
         re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
-    )  # a snapshot's next one is its sister
+    )  # the next snapshot gets the next number
     options = LinkOptions(
         connect,
         system,

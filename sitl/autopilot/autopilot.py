@@ -15,7 +15,7 @@ from mimopilot.codegen.cortex_m4 import EmulatedController
 from mimopilot.codegen.layout import INPUT, OUTPUT
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.sitl.physics.airframe import Airframe
-from mimopilot.sitl.physics.compiled import call_step, compiled, inlined
+from mimopilot.sitl.physics.compiled_step import call_step, compiled, inlined
 from mimopilot.sitl.physics.mixer import Allocation, allocate
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS

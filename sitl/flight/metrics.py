@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.sitl.flight.simulator import Flight
-from mimopilot.sitl.physics.compiled import compiled
+from mimopilot.sitl.physics.compiled_step import compiled
 from mimopilot.tuning.reference_model import ReferenceModel
 
 #: Figure of a flight -> its label: those of `Performance`, then of `sitl.flight.fault_recovery.Recovery`.

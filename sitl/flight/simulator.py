@@ -13,7 +13,7 @@ from mimopilot.sitl.autopilot.failure_detector import MAX_TILT, MAX_TILT_SECONDS
 from mimopilot.sitl.faults.inject_plant import FaultInjection
 from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.physics.airframe import Airframe
-from mimopilot.sitl.physics.compiled import compiled
+from mimopilot.sitl.physics.compiled_step import compiled
 from mimopilot.sitl.physics.rigid_body import COMMAND_HISTORY, PlantParameters, advance
 from mimopilot.sitl.physics.simulated_plant import SimulatedPlant
 from mimopilot.sitl.physics.state_estimate import Sensors, euler_angles, measure
@@ -96,7 +96,7 @@ class _Measuring(NamedTuple):
     noise: NDArray[np.float64]
 
 
-class _Link(NamedTuple):
+class _TickLink(NamedTuple):
     """Runs (N,) and delays (N,) of each period, the motor commands so far, and the number of the first period."""
 
     runs: NDArray[np.int64]
@@ -187,7 +187,7 @@ class Simulator(SimulatedPlant):
             _Body(self.plant, self.state, self.steps, self.step),
             _Measuring(self.sensors, self.measurement, noise),
             (autopilot.loop, autopilot.hover, autopilot.altitude),
-            _Link(runs, delays, self.history, self.count),
+            _TickLink(runs, delays, self.history, self.count),
             self._before[0],
             record,
             truth,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.sitl.physics.compiled import compiled, inlined
+from mimopilot.sitl.physics.compiled_step import compiled, inlined
 from mimopilot.sitl.physics.rigid_body import QUATERNION, ROTORS, PlantParameters
 
 FRICTION = 0.7  # Coulomb coefficient of a foot; chosen: rubber on dry concrete

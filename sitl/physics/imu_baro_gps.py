@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.sitl.physics.compiled import compiled
+from mimopilot.sitl.physics.compiled_step import compiled
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 
 GYRO_DENSITY = 1.75e-4  # rad/s/sqrt(Hz): 0.01 deg/s/sqrt(Hz)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.physics.compiled import compiled, inlined
+from mimopilot.sitl.physics.compiled_step import compiled, inlined
 
 ROUNDING = 1e-9  # thrust fraction; a command out of range by less is clipped and not reported as saturation
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.physics.compiled import compiled, inlined
+from mimopilot.sitl.physics.compiled_step import compiled, inlined
 
 GRAVITY = 9.80665  # m/s^2, standard gravity
 RUNGE_KUTTA_STEP = 1e-3  # s; chosen: a step of 0.1 ms moves half a second of flight by less than 1e-6 (m, m/s, rad/s)

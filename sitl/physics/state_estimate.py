@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from scipy.signal import butter
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.physics.compiled import inlined
+from mimopilot.sitl.physics.compiled_step import inlined
 
 MEASUREMENT_SIZE = 9  # numbers in a measurement
 ESTIMATE_NOISES = 6  # normal numbers for one measurement: 3 angles, 3 rates

@@ -29,7 +29,7 @@ from mimopilot.sitl.studies.attitude_study import (
 )
 from mimopilot.sitl.studies.autotune import autotune
 from mimopilot.sitl.studies.optimum import OptimumTask, best_gains, flown_effort
-from mimopilot.tuning.analysis.certificate import certify
+from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.analysis.doublet_prediction import doublet_effort, doublet_model
 from mimopilot.tuning.analysis.stability_figures import GRID_STEP, sensitivity_peak
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS

@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mimopilot.codegen.layout import OUTPUT, to_array
+from mimopilot.codegen.layout import OUTPUT, offset, to_array
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, WARNINGS, find_compiler
 from mimopilot.codegen.vectors import random_inputs
+from mimopilot.tuning.parameter_row import Shape
+from mimopilot.tuning.parameters import ROWS
 
 BIN = Path(sys.executable).parent
 HERE = Path(__file__).parent
@@ -163,6 +165,13 @@ def test_no_function_of_the_core_has_an_unbounded_or_large_stack_frame(tree):
         assert result.returncode == 0, result.stderr
 
 
+def place(key, shape=None):
+    """Where a row of the parameter table lies among the gains."""
+    row = next(row for row in ROWS if row.key == key and shape in (None, row.shape))
+    first = offset(row) // 4
+    return slice(first, first + len(row.codes))
+
+
 def test_a_million_steps_with_invalid_inputs_and_gain_changes_stay_finite_and_limited(gains):
     rng = np.random.default_rng(7)
     wild = np.array([np.nan, np.inf, -np.inf, 1e38, -1e38, 3e38, 1e-40, -1e-45, 0.0, -0.0, 12.5, 100.0], np.float32)
@@ -176,20 +185,26 @@ def test_a_million_steps_with_invalid_inputs_and_gain_changes_stay_finite_and_li
             inputs[name][hit] = rng.choice(wild, int(hit.sum()))
         inputs["saturation"] = rng.integers(-(2**31), 2**31, inputs["saturation"].shape)
         outputs = controller.run(inputs)
-        limits = {"moment": current[28:31], "rates_setpoint": current[25:28]}
+        limits = {"moment": current[place("moment_max")], "rates_setpoint": current[place("rate_max")]}
         for name, limit in limits.items():
             assert np.isfinite(outputs[name]).all()
             assert (np.abs(outputs[name]) <= limit).all()
-        assert (np.abs(controller.state["integral"]) <= current[31:34]).all()
+        assert (np.abs(controller.state["integral"]) <= current[place("integral_max")]).all()
         assert np.isfinite(controller.state["derivative"]).all()
         faulty += int((outputs["fault"] != 0).sum())
         bumped += int((np.abs(outputs["moment"]) == limits["moment"]).any(axis=1).sum())
         changed = to_array(gains)
-        changed[:25] *= rng.choice([1e-30, 1.0, 30.0, 1e5]).astype(np.float32) * rng.choice([-1, 1], 25)
-        changed[25:34] = rng.uniform(1e-3, 50, 9)
-        changed[34] = rng.uniform(0, 0.999)
+        for row in ROWS:
+            count = len(row.codes)
+            if row.shape in (Shape.MATRIX, Shape.YAW):
+                size = rng.choice([1e-30, 1.0, 30.0, 1e5]).astype(np.float32)
+                changed[place(row.key, row.shape)] *= size * rng.choice([-1, 1], count)
+            elif row.shape is Shape.AXES:
+                changed[place(row.key)] = rng.uniform(1e-3, 50, count)
+            elif row.shape is Shape.POLE:
+                changed[place(row.key)] = rng.uniform(0, 0.999)
         if rng.random() < 0.3:
-            changed[rng.integers(36)] = rng.choice(wild[:6])
+            changed[rng.integers(len(changed))] = rng.choice(wild[:6])
         if controller.set_gains(changed):
             current, accepted = changed, accepted + 1
         else:

@@ -1,3 +1,4 @@
+import dataclasses
 import math
 
 import numpy as np
@@ -6,7 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.reference_model import second_order
+from mimopilot.tuning.gains import gains_to_toml
+from mimopilot.tuning.gains_file import gains_from_toml
+from mimopilot.tuning.provenance import Provenance
+from mimopilot.tuning.reference_model import CONTINUOUS_MODELS, ReferenceModel, second_order
+from mimopilot.tuning.spec import load_spec
 
 TS = 1 / 250
 
@@ -71,3 +76,37 @@ def test_the_transient_is_below_one_percent_after_settling():
 def test_an_impossible_model_is_refused(omega, zeta, delay):
     with pytest.raises(TuningError, match="reference model"):
         second_order(omega, zeta, delay, TS)
+
+
+@dataclasses.dataclass(frozen=True)
+class FirstOrder:
+    """omega/(s + omega): all that another kind of model needs, beside its row in `CONTINUOUS_MODELS`."""
+
+    type = "first_order"
+
+    omega: float
+
+    @property
+    def bandwidth(self):
+        return self.omega
+
+    def discretise(self, Ts):
+        pole = math.exp(-self.omega * Ts)
+        return ReferenceModel((1 - pole,), (1.0, -pole), 0, Ts, label=f"{self.omega:g} rad/s, first order")
+
+    def as_table(self):
+        return {"type": self.type, "omega": self.omega}
+
+
+def test_another_kind_of_model_is_one_class_and_one_row(monkeypatch, gains):
+    monkeypatch.setitem(CONTINUOUS_MODELS, FirstOrder.type, FirstOrder)
+    first = {"type": "first_order", "omega": 25.0}
+    spec = load_spec(inner=[first, [30.0, 0.7]], outer={**first, "omega": 8})
+    assert spec.inner[0] == FirstOrder(25.0)
+    slow, fast = spec.models("outer", 0.004)[0], spec.models("inner", 0.004)[0]
+    assert slow.response(np.ones(2000))[-1] == pytest.approx(1.0, rel=1e-9)
+    assert fast.response(np.ones(10))[9] == pytest.approx(1 - math.exp(-25 * 0.036), rel=1e-9)
+    tagged = dataclasses.replace(gains, provenance=Provenance(inner_model=spec.inner, outer_model=spec.outer))
+    read = gains_from_toml(gains_to_toml(tagged), "file")
+    assert read.provenance.inner_model == spec.inner
+    assert read.reference_models(0)[1].den == slow.den

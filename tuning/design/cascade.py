@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.tuning.analysis.certificate import certify
+from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.analysis.doublet_prediction import doublet_model
 from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.cascade_estimate import CascadeEstimate, estimate
@@ -28,8 +28,8 @@ PERIOD_TOLERANCE = 0.02
 #: Largest relative difference between the units of torque of a log and of a gain set: rounding in files.
 UNIT_TOLERANCE = 0.01
 MOTORS_UNKNOWN = (
-    "the log does not tell how the allocator drives the motors (PX4: actuator_motors, with THR_MDL_FAC set): where the "
-    "doublet saturates motors the refined gains are not optimal"
+    "the log does not contain how the allocator drives the motors (PX4: actuator_motors, with THR_MDL_FAC set): if the "
+    "doublet saturates motors, the refined gains are not optimal"
 )
 
 

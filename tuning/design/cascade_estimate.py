@@ -224,7 +224,7 @@ def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
     missing = [name for name, value in required.items() if value is None]
     if flown is None and missing:
         raise TuningError(
-            f"{experiment.source}: the log does not tell {' and '.join(missing)}; put it into a --spec file"
+            f"{experiment.source}: the log does not contain {' and '.join(missing)}; put it into a --spec file"
         )
     zero = np.zeros((2, 2))
     cutoff = spec.derivative_cutoff_hz
@@ -250,7 +250,7 @@ def _prior(experiment: Experiment, spec: TuningSpec, axes: slice) -> dict[str, N
         return None
     flown = experiment.flown
     if flown is None:
-        raise TuningError(f"{experiment.source}: pull: the log does not tell which gains flew; set pull to 0")
+        raise TuningError(f"{experiment.source}: pull: the log does not contain which gains flew; set pull to 0")
     return {term: getattr(flown, TERMS[term].matrix)[axes, axes] for term in spec.structure}
 
 

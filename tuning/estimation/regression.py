@@ -64,7 +64,7 @@ class Regression:
 
 
 @dataclass(frozen=True, eq=False)
-class _Row:
+class _RegressionRow:
     """Maps from the correlations to one row of B, for regressors scaled to unit RMS."""
 
     gain: Signal
@@ -92,7 +92,7 @@ class Solution:
     condition: float
     problem: Regression
     scale: Signal
-    rows: tuple[_Row, ...]
+    rows: tuple[_RegressionRow, ...]
 
     @cached_property
     def r_squared(self) -> Signal:
@@ -181,7 +181,7 @@ def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: f
     if rank < S.shape[1]:
         raise TuningError("not excited: the injected signal does not excite every axis; inject a torque on each axis")
     B = np.empty((Q.shape[1], S.shape[1]))
-    rows: list[_Row] = []
+    rows: list[_RegressionRow] = []
     for i in range(len(B)):
         if weight == "optimal":
             b = first[:, i] / scale
@@ -197,7 +197,7 @@ def solve(problem: Regression, weight: str, prior: Signal | None = None, pull: f
         gain = np.linalg.inv(curvature + load)
         B[i] = gain @ (projected.T @ Q[:, i] + target)
         misfit = Q[:, i] - S @ B[i]
-        rows.append(_Row(gain, projected, cho_solve(factor, misfit) if factor is not None else misfit))
+        rows.append(_RegressionRow(gain, projected, cho_solve(factor, misfit) if factor is not None else misfit))
     return Solution(B / scale, float(singular[0] / singular[-1]), problem, scale, tuple(rows))
 
 
@@ -229,7 +229,7 @@ def _residual_covariance(problem: Regression, residual: list[Signal]) -> Signal:
     return loaded
 
 
-def _score_covariance(problem: Regression, noise: LocalResponse, row: _Row, b: Signal, i: int) -> Signal:
+def _score_covariance(problem: Regression, noise: LocalResponse, row: _RegressionRow, b: Signal, i: int) -> Signal:
     """Covariance of the noise in S' W^-1 (q - S b), (n_x, n_x).
 
     Noise enters as (1/N) sum of z(k) eps(k) + g(k) x_n(k). Here eps and x_n are the noise in the residual and in the

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-#: Bytes at the beginning of a file from which its format is told: enough for the header line of a CSV file.
+#: Bytes at the beginning of a file from which its format is detected: enough for the header line of a CSV file.
 HEAD_BYTES = 4096
 
 

@@ -69,7 +69,7 @@ class Recording:
     changes : sequence of (time s, name, value)
         Parameters set later, in order of time.
     faults : sequence of str
-        Why gains cannot be tuned from the log, as far as the reader can tell.
+        Why gains cannot be tuned from the log, known to the reader.
     warnings : sequence of str
         What is wrong with a log that can still be used, such as damage.
     notes : sequence of str

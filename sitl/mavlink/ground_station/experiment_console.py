@@ -12,7 +12,8 @@ import typer
 from mimopilot.common.console import print_json, print_table
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.experiment import (
+from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
+from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import (
     INTEGERS,
     NAMES,
     ExperimentResult,
@@ -20,7 +21,6 @@ from mimopilot.sitl.mavlink.ground_station.experiment import (
     excite,
     start_monitor,
 )
-from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES
 from mimopilot.tuning.excitation import hold_from_bandwidth

@@ -27,7 +27,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     SetParameter,
     StoreParameters,
 )
-from mimopilot.sitl.mavlink.ground_station.vehicle_contact import FRESH_S, TRIES, TRY_S, VehicleContact
+from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import FRESH_S, TRIES, TRY_S, VehicleLinkState
 from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest
 
 #: Largest number of pending requests; chosen.
@@ -64,13 +64,13 @@ class _PendingRequest:
     kept: float | None = None
 
 
-class ParameterClient(VehicleContact):
+class ParameterClient(VehicleLinkState):
     """Reads and writes the parameters of one vehicle.
 
     Parameters
     ----------
     now, tries, system, force_armed
-        See `sitl.mavlink.ground_station.vehicle_contact.VehicleContact`.
+        See `sitl.mavlink.ground_station.vehicle_link_state.VehicleLinkState`.
     integers : collection of str
         Names that may be INT32 on the vehicle; all others must be REAL32.
     """

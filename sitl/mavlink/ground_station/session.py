@@ -15,8 +15,8 @@ from mimopilot.sitl.mavlink.ground_station.connection import Connection
 from mimopilot.sitl.mavlink.ground_station.events import Exchange, Heartbeat, T, run_exchange
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import NoParametersError, read_values
-from mimopilot.sitl.mavlink.ground_station.vehicle_contact import TRY_S
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import STOCK_PARAMETERS, check_kind, describe_missing_module
+from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
 from mimopilot.sitl.mavlink.wire.signing import read_key
 from mimopilot.tuning.parameter_row import PREFIX
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Exchange
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Answer, ParameterClient
-from mimopilot.sitl.mavlink.ground_station.vehicle_contact import FRESH_S
+from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import FRESH_S
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 
 #: PX4 and ArduPilot do not save a smaller change of a value (the epsilon of single precision, rounded up).

@@ -18,7 +18,7 @@ from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 PATIENCE_S = 180.0
 #: Waits of an upload, s, shortened where a test does not measure them: (module, name) -> seconds.
 WAITS = {
-    ("mimopilot.sitl.mavlink.ground_station.vehicle_contact", "LISTEN_S"): 0.15,
+    ("mimopilot.sitl.mavlink.ground_station.vehicle_link_state", "LISTEN_S"): 0.15,
     ("mimopilot.sitl.mavlink.ground_station.parameter_protocol", "AUTOSAVE_S"): 0.15,
 }
 _PATCHES = "".join(f"import {module}; {module}.{name} = {value}; " for (module, name), value in WAITS.items())

@@ -1,7 +1,7 @@
 """Logs of PX4 in its own simulator: tuning from them, and the same gains in our simulation.
 
-The files hold the experiment of one flight each: 16 s of injected moment an axis, at 250 Hz, a vehicle with and one
-without coupling between roll and pitch. Nobody here wrote the plant that flew.
+The files hold the experiment of one flight each: 16 s of injected torque per axis, at 250 Hz, a vehicle with and one
+without coupling between roll and pitch. The plant is PX4's own.
 """
 
 from dataclasses import replace

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mimopilot.tuning.analysis.beyond_band import find_structural_mode, loop_gain_above
-from mimopilot.tuning.analysis.certificate import certify
+from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from tests.tuning.analysis.loops import (

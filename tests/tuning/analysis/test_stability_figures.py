@@ -7,7 +7,7 @@ import control
 import numpy as np
 import pytest
 
-from mimopilot.tuning.analysis.certificate import certify
+from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.analysis.stability_figures import sensitivity_peak
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates

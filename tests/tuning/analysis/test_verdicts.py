@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mimopilot.sitl.physics.airframe import Frame
-from mimopilot.tuning.analysis.certificate import UNSTABLE_RADIUS, certify
+from mimopilot.tuning.analysis.certify import UNSTABLE_RADIUS, certify
 from mimopilot.tuning.analysis.closed_loop import cascade_loop, model_spectral_radius
 from mimopilot.tuning.analysis.stability_figures import GRID_STEP, sensitivity_peak
 from mimopilot.tuning.certificate import ACCEPTED, Thresholds, Verdict

@@ -17,7 +17,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.plant.frequency_response import plant_response
 from mimopilot.tuning.spec import TuningSpec
-from tests.tuning.analysis.test_certificate import experiment
+from tests.tuning.analysis.test_certify import experiment
 from tests.tuning.truth import thesis
 
 TS = 0.004

@@ -15,7 +15,7 @@ from mimopilot.tuning.design.cascade_estimate import estimate
 from mimopilot.tuning.design.quality_checks import check_estimates, check_saturation
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.reference_model import second_order
-from tests.tuning.analysis.test_certificate import experiment
+from tests.tuning.analysis.test_certify import experiment
 from tests.tuning.truth import thesis
 
 TS = 0.004

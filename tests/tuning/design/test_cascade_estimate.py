@@ -17,7 +17,7 @@ from mimopilot.tuning.estimation.instrumental_variables import align, instrument
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import second_order
-from tests.tuning.analysis.test_certificate import experiment
+from tests.tuning.analysis.test_certify import experiment
 from tests.tuning.literal import literal_cascade
 from tests.tuning.truth import thesis
 

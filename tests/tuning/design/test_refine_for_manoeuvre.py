@@ -23,7 +23,7 @@ from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import Manoeuvre, parse_doublet
 from mimopilot.tuning.statespace import StateSpace
 from tests.conftest import assert_one_clear_line
-from tests.tuning.analysis.test_certificate import experiment
+from tests.tuning.analysis.test_certify import experiment
 from tests.tuning.truth import thesis
 
 TS = 0.004

@@ -8,14 +8,14 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
 from mimopilot.tuning.excitation import prbs
 from mimopilot.tuning.reference_model import second_order
-from tests.tuning.analysis.test_certificate import experiment
+from tests.tuning.analysis.test_certify import experiment
 
 TS = 0.004
 START = second_order(15, 0.7, 0, TS)
 
 
 def closed_loop_data(zero, noise, seed=1, n=8000):
-    """u, y and the injected moment of a rate plant 150 (1 - s/zero)/((s + 1.2)(0.05 s + 1)) under P = 0.02."""
+    """u, y and the injected torque of a rate plant 150 (1 - s/zero)/((s + 1.2)(0.05 s + 1)) under P = 0.02."""
     numerator = [150.0] if zero is None else [-150.0 / zero, 150.0]
     b, a, _ = cont2discrete((numerator, np.polymul([1.0, 1.2], [0.05, 1.0])), TS)
     rng = np.random.default_rng(seed)

@@ -21,7 +21,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
 )
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
-from mimopilot.sitl.mavlink.ground_station.vehicle_contact import LISTEN_S
+from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import LISTEN_S
 from mimopilot.sitl.mavlink.wire.float32 import single
 from tests.sitl.mavlink.scripted_vehicle import FAILING, ScriptedVehicle, SimulatedLink
 

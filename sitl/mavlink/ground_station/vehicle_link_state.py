@@ -35,7 +35,7 @@ LISTEN_S = 1.2
 BEAT_S = 1.0
 
 
-class VehicleContact:
+class VehicleLinkState:
     """State of the contact with one vehicle, from its first HEARTBEAT on.
 
     Parameters

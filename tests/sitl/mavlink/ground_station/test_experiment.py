@@ -9,9 +9,9 @@ import pytest
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SetParameter, run_exchange
-from mimopilot.sitl.mavlink.ground_station.experiment import INTEGERS, excite, start_monitor
 from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions, settings
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
+from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import INTEGERS, excite, start_monitor
 from mimopilot.tuning.logs.reader import read_log
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle

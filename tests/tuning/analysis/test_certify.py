@@ -8,7 +8,7 @@ import pytest
 from mimopilot.common.errors import InputFileError
 from mimopilot.sitl.physics.airframe import Frame, load_airframe
 from mimopilot.tuning.analysis.beyond_band import find_structural_mode
-from mimopilot.tuning.analysis.certificate import certify
+from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.certificate import Thresholds, Verdict
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError

@@ -42,7 +42,7 @@ def register(app: typer.Typer) -> None:
     """Add these commands to the command line."""
     app.command(epilog="Example: mimopilot experiment adam0 --seed 1 --out flight.ulg")(experiment)
     app.command(epilog="Example: mimopilot fly adam0 --gains my.gains.toml --axis roll --json")(fly)
-    app.command(epilog="Example: mimopilot convert px4.gains.toml px4_sih --out bench.gains.toml")(convert)
+    app.command(epilog="Example: mimopilot convert px4.gains.toml px4_sih --out sih.gains.toml")(convert)
 
 
 def convert(

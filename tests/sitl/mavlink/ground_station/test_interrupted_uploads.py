@@ -6,8 +6,8 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SOLE_PEER, SetParameter, run_exchange
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
+from tests.sitl.mavlink.ground_station.test_parameter_protocol import NAMES, NEW, OLD, upload
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, SimulatedLink
-from tests.sitl.mavlink.test_parameter_protocol import NAMES, NEW, OLD, upload
 
 
 @pytest.mark.parametrize("after", range(len(NAMES) + 1))
