@@ -60,12 +60,19 @@ class Target:
 @lru_cache(maxsize=1)
 def targets() -> dict[str, Target]:
     """All targets, by name."""
-    found = {}
+    found: dict[str, Target] = {}
     for path in sorted(TEMPLATES.glob(f"*/{DESCRIPTION}")):
         table = read_toml(path, "target")
-        folders, options = tuple(table.pop("folders")), table.pop("options", {})
-        choices = {name: tuple(values) for name, values in options.items()}
-        found[table["name"]] = Target(**table, folders=folders, folder=path.parent.name, options=choices)
+        try:
+            folders, options = tuple(table.pop("folders")), table.pop("options", {})
+            choices = {name: tuple(values) for name, values in options.items()}
+            target = Target(**table, folders=folders, folder=path.parent.name, options=choices)
+        except (KeyError, TypeError) as error:
+            raise CodegenError(f"{path}: not a target: {error}; expected the entries of `Target`") from error
+        if target.name in found:
+            other = found[target.name].folder
+            raise CodegenError(f"{path}: {target.name} is the target of {other}; choose another name")
+        found[target.name] = target
     return found
 
 

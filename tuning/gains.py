@@ -36,7 +36,7 @@ THESIS_OUTER = (SecondOrder(10.0, 0.7),) * 2
 #: Of the gains file.
 SCHEMA = 2
 #: Comments of keys.
-NOTES = {"Ts": "s", "derivative_cutoff_hz": "0: no filter"}
+NOTES = {Shape.SCALAR: "s", Shape.POLE: "0: no filter"}
 #: Seal of a certificate that was read from a gains file of schema 1.
 SCHEMA_1 = "schema 1"
 #: Largest relative difference of the ratios of roll and pitch at which a certificate stays valid: rounding of the unit.
@@ -230,9 +230,17 @@ class Gains:
         return replace(self, certificate=replace(certificate, seal=self._seal(certificate)))
 
     def _seal(self, certificate: Certificate) -> str:
-        """Hash of a certificate and of every number that the loop's stability depends on."""
+        """Hash of a certificate and of every number that the loop's stability depends on.
+
+        A parameter at its default is left out: a set keeps its certificate when the table gains a row.
+        """
         content = {name: value for name, value in certificate.as_table().items() if name != "seal"}
-        numbers = {**self.elements(), **{row.key: self.of(row) for row in rows(Shape.POLE)}}
+        numbers: dict[str, float] = {}
+        for row in ROWS:
+            values = self._values(row)
+            if row.default is None or any(value != row.default for value in values):
+                numbers |= dict(zip(row.codes, (row.element(value, self.Ts) for value in values), strict=True))
+                numbers |= {row.key: values[0]} if row.shape is Shape.POLE else {}
         return sha256(json.dumps([content, numbers, self.moment_scale], sort_keys=True, default=str))
 
     def verdict(self) -> tuple[Verdict, str]:
@@ -310,7 +318,7 @@ def gains_to_toml(gains: Gains) -> str:
 
     def line(row: Row) -> str:
         value = gains.of(row)
-        note = f"  # {NOTES[row.key]}" if row.key in NOTES else ""
+        note = f"  # {NOTES[row.shape]}" if row.shape in NOTES else ""
         plain = np.asarray(value, dtype=np.float64).tolist()
         return f"{row.key} = {toml_value(plain)}{note}"
 

@@ -179,6 +179,8 @@ def model_from_table(table: Any, where: str) -> ContinuousModel:
             f"{where}: got {shown(table)}, expected [omega, damping, delay], or a table with type "
             f"{' or '.join(CONTINUOUS_MODELS)} and its numbers"
         )
+    if not float(table.get("delay", 0)).is_integer():
+        raise TuningError(f"{where}: delay: got {table['delay']}, expected whole samples")
     try:
         return kind(**{name: value for name, value in table.items() if name != "type"})
     except TypeError:

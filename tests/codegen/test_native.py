@@ -14,7 +14,8 @@ from mimopilot.codegen.native import NativeController, NativeLibrary, build_nati
 from mimopilot.codegen.vectors import random_inputs, reference_outputs
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.gains import Limits
-from mimopilot.tuning.parameters import MATRICES
+from mimopilot.tuning.parameter_row import Shape
+from mimopilot.tuning.parameters import MATRICES, ROWS
 
 TS = 0.004
 HOLD = 25
@@ -37,11 +38,15 @@ def zero_inputs(rows=1, **values):
 
 
 def random_gains(base, rng):
-    changes = {
-        code: float(np.float32(value + rng.normal() * (abs(value) + 0.05) * 0.5))
-        for code, value in base.elements().items()
-        if code[:2] in ("AP", "RP", "RI", "RD", "RF")
-    }
+    """Other gains and filters, of every row of the table that is no limit and no period."""
+    elements, changes = base.elements(), {}
+    for row in ROWS:
+        for code in row.codes:
+            if row.shape in (Shape.MATRIX, Shape.YAW):
+                value = elements[code]
+                changes[code] = float(np.float32(value + rng.normal() * (abs(value) + 0.05) * 0.5))
+            elif row.shape is Shape.POLE:
+                changes[code] = float(rng.uniform(0.0, 0.95))
     if rng.random() < 0.3:
         changes |= {"RI_RR": 0.0, "RI_RP": 0.0}
     if rng.random() < 0.2:

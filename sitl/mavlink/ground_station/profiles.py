@@ -19,7 +19,7 @@ from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameter_row import AXES, AXIS_LETTERS, PREFIX, Parameter
-from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, MATRICES, PARAMETERS, Setting
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, MATRICES, PARAMETERS, ROWS, Setting
 
 #: Largest off-diagonal gain, as a share of its row's diagonal, that a stock profile drops without the option; chosen.
 DROPPED_SHARE = 0.1
@@ -224,13 +224,15 @@ def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
     Raises
     ------
     SitlError
-        If one is out of the range of our table, or only some of our gains are present.
+        If one is out of the range of our table, or only some of our gains are present that have no default.
     """
     for name, value in values.items():
         expected = violated_range(name, value)
         if expected:
             raise SitlError(f"{source}: {name}: got {value:.6g}, expected {expected}")
-    writable = [p.name for p in PARAMETERS if p.writable]
+    # A snapshot may be older than a row of the table that has a default.
+    required = {PREFIX + code for row in ROWS if row.default is None for code in row.codes}
+    writable = [p.name for p in PARAMETERS if p.writable and p.name in required]
     lacking = [name for name in writable if name not in values]
     if 0 < len(lacking) < len(writable):
         raise SitlError(

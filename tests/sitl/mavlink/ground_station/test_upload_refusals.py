@@ -10,9 +10,13 @@ from mimopilot.sitl.mavlink.ground_station.events import ParameterValue
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.mavlink.wire.signing import read_key
 from mimopilot.tuning.certificate import Certificate, Verdict
+from mimopilot.tuning.parameters import PARAMETERS
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.running import wait_for
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, UdpVehicle, float32
+
+WRITTEN = sum(parameter.writable for parameter in PARAMETERS)
+
 
 KEY = bytes(range(32))
 
@@ -176,10 +180,10 @@ def test_an_incomplete_or_out_of_range_snapshot_is_refused_before_contacting_the
         lines = text.splitlines(keepends=True)
         unsealed = "".join(lines[1:])
         for content, parts in [
-            ("".join(lines[:-5]), ("holds 30 parameters, but its first line says 35",)),
+            ("".join(lines[:-5]), (f"holds {WRITTEN - 5} parameters, but its first line says {WRITTEN}",)),
             (text[:-4], ("it was cut short",)),
             (text.replace("0.13125", "0.13126"), ("damaged or edited",)),
-            ("".join(lines[1:-5]), ("holds 30 of our 35 gains", "lacks")),
+            ("".join(lines[1:-5]), (f"holds {WRITTEN - 5} of our {WRITTEN} gains", "lacks")),
             (unsealed.replace("\t0.13125001\t", "\t99\t"), ("MIMO_RP_RR: got 99, expected",)),
         ]:
             (tmp_path / "bad.params").write_text(content)
