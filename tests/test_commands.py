@@ -307,7 +307,7 @@ def test_the_demo_runs_the_whole_workflow(mimopilot, tmp_path):
     assert again.returncode == 0
 
 
-def test_damage_of_a_log_is_told_once_by_every_command_that_reads_it(mimopilot, log, tmp_path):
+def test_damage_of_a_log_is_reported_once_by_every_command_that_reads_it(mimopilot, log, tmp_path):
     data = bytearray(log.read_bytes())
     data[open_ulog(log).topics[0].offsets[1000] + 2] ^= 0xFF  # the kind of a message
     (tmp_path / "x.ulg").write_bytes(data)

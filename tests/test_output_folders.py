@@ -1,4 +1,4 @@
-"""Commands that write into a folder: nothing leaves it, and what cannot be written is told before the work."""
+"""Commands that write into a folder: nothing leaves it; what cannot be written is reported first."""
 
 import pytest
 
@@ -31,7 +31,7 @@ def test_no_command_follows_a_link_out_of_its_folder(mimopilot, tmp_path, comman
 @pytest.mark.parametrize(
     ("out", "words"), [("dangling", "is a link that leads to no folder"), ("/dev/null", "is a file")]
 )
-def test_what_is_no_folder_is_told_as_that(mimopilot, tmp_path, out, words):
+def test_an_output_that_is_no_folder_is_reported(mimopilot, tmp_path, out, words):
     (tmp_path / "dangling").symlink_to("nothing")
     assert_one_clear_line(mimopilot("reproduce", "lv100", "--out", out), f"{out}: {words}; give --out a folder")
     assert not (tmp_path / "nothing").exists()

@@ -1,7 +1,7 @@
 """The table of the controller's parameters.
 
 A row of `ROWS` is a member of the C++ ``struct Gains``. The struct, its order and its layout in memory come from the
-table, and so do the keys of the gains file and the names and ranges of parameters: in headers, PX4's module.yaml,
+table. So do the keys of the gains file, and the names and ranges of parameters: in headers, PX4's module.yaml,
 parameter files, the simulated vehicle and the uploader.
 """
 

@@ -1,4 +1,4 @@
-"""Reference models: the transfer function asked of each closed loop."""
+"""Reference models: the transfer function required of each closed loop."""
 
 from __future__ import annotations
 

@@ -44,9 +44,9 @@ METHODS = (
     f"{DEFAULT}: the gains during the experiment. {AUTOTUNE}: one axis at a time by the rule of PX4's autotune, "
     f"from the same log. {SISO} and {MIMO}: VRFT with the thesis' reference models. {REFINED}: {MIMO} refined on a "
     f"model from the same log, for this doublet, with a predicted effort {EFFORT_RATIO - 1:.0%} above {SISO}'s. "
-    f"{BEST}: all gains by direct optimisation in the simulation, with the effort of {REFINED} there (median of the "
-    "first seeds) and the certificate's limits on the true plant, the limit on Ms less the error of Ms from a log; no "
-    f"method knows the true plant. {BOUND}: the same with any effort. Effort: RMS of both torques together."
+    f"{BEST}: all gains by direct optimisation on the true plant, which no method knows. Its effort is that of "
+    f"{REFINED} there (median of the first seeds). Its margins are the certificate's, Ms less the error of Ms from a log. "
+    f"{BOUND}: the same with any effort. Effort: RMS of both torques together."
 )
 SPREAD_COLUMNS = ("gain", *ELEMENTS)
 COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].removesuffix(", RMS of u") for text in COSTS.values()))

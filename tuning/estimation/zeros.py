@@ -1,11 +1,13 @@
 """Non-minimum-phase zeros of a plant, by a flexible reference model.
 
 A reference model must keep the plant's zeros outside the unit circle, so it cannot be chosen before they are known.
-Its numerator is therefore free, M(z, eta) = eta' F(z) with M(1) = 1, and found together with the controller:
-|| M(eta) (u + C(rho) y) - C(rho) y ||^2 is linear least squares in eta for a given rho, and in rho for a given eta. The
-zeros of M outside the unit circle are those of the plant. (L. Campestrini, D. Eckhard, M. Gevers, A. S. Bazanella,
-"Virtual Reference Feedback Tuning for non-minimum phase plants", Automatica 47 (2011).) Here all signals enter by their
-correlations with an external one, so noise causes no bias.
+Its numerator is therefore free, M(z, eta) = eta' F(z) with M(1) = 1. It is found together with the controller:
+|| M(eta) (u + C(rho) y) - C(rho) y ||^2 is linear least squares in eta for a given rho, and in rho for a given eta.
+The zeros of M outside the unit circle are those of the plant. Here all signals enter by their correlations with an
+external one, so noise causes no bias.
+
+Source: L. Campestrini, D. Eckhard, M. Gevers, A. S. Bazanella, "Virtual Reference Feedback Tuning for non-minimum
+phase plants", Automatica 47 (2011).
 """
 
 from __future__ import annotations

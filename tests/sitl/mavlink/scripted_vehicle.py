@@ -37,7 +37,7 @@ STREAM_S = 0.1
 #: Faults after which no upload may be reported as verified, on any link.
 FAILING = (
     *("echoes", "echoes one", "ignores", "clamps", "rounds", "out of range", "read only", "denies"),
-    *("deaf to one", "arms", "dies", "forgets", "swaps", "integer"),
+    *("ignores one", "arms", "disconnects", "loses one", "writes another", "integer"),
 )
 
 
@@ -51,20 +51,20 @@ class ScriptedVehicle:
     def __init__(self, values, fault="", faulty="", after=0, storage=0):
         self.values = {name: float32(value) for name, value in values.items()}
         self.fault, self.faulty, self.after, self.storage = fault, faulty, after, storage
-        self.armed = self.dead = False
+        self.armed = self.offline = False
         self.autopilot, self.type = 12, 2  # a quadrotor with PX4
         self.first = self.values.get(faulty, 0.0)
         self.writes = self.reads = self.stored = 0
 
     def heartbeat(self):
-        return [] if self.dead else [Heartbeat(SYSTEM, COMPONENT, self.autopilot, self.armed, 0, self.type)]
+        return [] if self.offline else [Heartbeat(SYSTEM, COMPONENT, self.autopilot, self.armed, 0, self.type)]
 
     def value(self, name):
         kind = 6 if self.fault == "integer" and name == self.faulty else 9
         return ParameterValue(SYSTEM, COMPONENT, name, self.values[name], kind)
 
     def answer(self, order):
-        if self.dead:
+        if self.offline:
             return []
         if isinstance(order, StoreParameters):
             self.stored += 1
@@ -83,8 +83,8 @@ class ScriptedVehicle:
     def write(self, name, value):
         self.writes += 1
         if self.writes > self.after:
-            if self.fault == "dies":
-                self.dead = True
+            if self.fault == "disconnects":
+                self.offline = True
                 return []
             if self.fault == "arms" and not self.armed:
                 self.armed = True
@@ -100,7 +100,7 @@ class ScriptedVehicle:
         reasons = {"out of range": 2, "denies": 3, "read only": 5}
         if self.fault in reasons and hit:
             return [ParameterRefusal(SYSTEM, COMPONENT, name, reasons[self.fault]), self.value(name)]
-        if self.fault == "deaf to one" and hit:
+        if self.fault == "ignores one" and hit:
             return []
         if self.fault == "clamps" and hit:
             value = min(value, float32(1.05 * self.first))
@@ -109,11 +109,11 @@ class ScriptedVehicle:
         if self.fault == "epsilon" and abs(value - self.values[name]) < 1.1920929e-07:
             return [self.value(name)]
         self.values[name] = value
-        if self.fault == "forgets" and hit:
+        if self.fault == "loses one" and hit:
             answer = [self.value(name)]
             self.values[name] = float32(value / 2)
             return answer
-        if self.fault == "swaps" and hit:
+        if self.fault == "writes another" and hit:
             other = next(n for n in self.values if n != name)
             self.values[other] = value
         return [self.value(name)]

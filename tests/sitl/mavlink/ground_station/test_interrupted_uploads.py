@@ -12,7 +12,7 @@ from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, SimulatedLink
 
 @pytest.mark.parametrize("after", range(len(NAMES) + 1))
 def test_a_link_loss_after_any_write_reports_every_changed_parameter(after):
-    vehicle = ScriptedVehicle(OLD, "dies", after=after)
+    vehicle = ScriptedVehicle(OLD, "disconnects", after=after)
     outcome = upload(SimulatedLink(vehicle))
     if after == len(NAMES):
         assert outcome.state == "verified"

@@ -206,7 +206,7 @@ def test_a_second_vehicle_that_appears_during_the_upload_is_never_written(at):
 
 
 def test_an_answer_from_another_address_is_not_accepted():
-    vehicle = ScriptedVehicle(OLD, "deaf to one", faulty=FAULTY)
+    vehicle = ScriptedVehicle(OLD, "ignores one", faulty=FAULTY)
     link = SimulatedLink(vehicle)
     client = ParameterClient(link.now())
     run_exchange(client.await_heartbeat(), link)

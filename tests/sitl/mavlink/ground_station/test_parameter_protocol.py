@@ -78,13 +78,13 @@ def test_a_faulty_vehicle_is_never_reported_as_verified():
         states.setdefault(fault, set()).add(outcome.state)
         if outcome.state == "verified":
             # Its arming was not received in time, or the wrong write was repeated later.
-            assert fault in ("arms", "swaps")
+            assert fault in ("arms", "writes another")
             assert vehicle.values == NEW
         for name, value in vehicle.values.items():
             assert value in outcome.held[name], (seed, fault, name)
         if outcome.state in ("rolled back", "untouched"):
             assert vehicle.values == OLD, (seed, fault)
-    assert states["dies"] == {"mixed"}
+    assert states["disconnects"] == {"mixed"}
     for fault in ("echoes", "echoes one", "ignores", "clamps", "rounds", "out of range", "read only", "denies"):
         assert states[fault] <= {"rolled back", "untouched"}, fault
 
@@ -107,14 +107,14 @@ def test_each_fault_on_a_good_link_is_named_and_rolled_back(fault):
         "out of range": f"{NAMES[7]}: refused: value out of its range",
         "read only": "refused: read only",
         "denies": "refused: permission denied",
-        "deaf to one": f"{NAMES[7]}: no answer in 12 s",
+        "ignores one": f"{NAMES[7]}: no answer in 12 s",
         "arms": "the vehicle was armed before the last reading",
-        "dies": "no message from the vehicle for 12 s",
-        "forgets": f"{NAMES[7]}: reads back as",
-        "swaps": f"{NAMES[0]}: reads back as",
+        "disconnects": "no message from the vehicle for 12 s",
+        "loses one": f"{NAMES[7]}: reads back as",
+        "writes another": f"{NAMES[0]}: reads back as",
     }
     assert reasons[fault] in outcome.reason
-    expected = {"dies": "mixed", "forgets": "mixed", "swaps": "mixed"}.get(fault, "rolled back")
+    expected = {"disconnects": "mixed", "loses one": "mixed", "writes another": "mixed"}.get(fault, "rolled back")
     assert outcome.state == expected
     for name, value in vehicle.values.items():
         assert value in outcome.held[name]
@@ -139,7 +139,7 @@ def test_the_answers_of_other_vehicles_and_components_are_ignored(sender):
     link = SimulatedLink(vehicle, noise=[other_sender(*sender)])
     assert upload(link, system=1).state == "verified"
     assert vehicle.values == NEW
-    deaf = ScriptedVehicle(OLD, "deaf to one", faulty=NAMES[3])
+    deaf = ScriptedVehicle(OLD, "ignores one", faulty=NAMES[3])
     link = SimulatedLink(deaf, noise=[lambda m: ParameterValue(*sender, NAMES[3], NEW[NAMES[3]])])
     assert upload(link, system=1).state == "rolled back"
 
@@ -198,7 +198,7 @@ def test_a_missing_parameter_stops_the_upload_before_writing():
 
 def test_an_absent_vehicle_is_waited_for_until_the_timeout():
     vehicle = ScriptedVehicle(OLD)
-    vehicle.dead = True
+    vehicle.offline = True
     link = SimulatedLink(vehicle)
     with pytest.raises(SitlError, match="no HEARTBEAT of an autopilot in 3 s"):
         upload(link, tries=6)
