@@ -50,7 +50,10 @@ class Target:
         CodegenError
             If a value is unknown. Options of other targets are ignored.
         """
+        known = {name for target in targets().values() for name in target.options}
         for name, value in options.items():
+            if name not in known:
+                raise CodegenError(f"option {name!r}: no target has it; known: {', '.join(sorted(known))}")
             values = self.options.get(name, (value,))
             if value not in values:
                 raise CodegenError(f"{name.replace('_', '-')}: got {value!r}, expected one of {', '.join(values)}")

@@ -30,13 +30,23 @@ def generate(
     px4_api: Annotated[
         str, typer.Option(help="PX4's module interface: crtp, up to v1.17, or descriptor, later.")
     ] = "crtp",
+    option: Annotated[
+        list[str] | None, typer.Option("--option", help="Further option of a target, NAME=VALUE; see its target.toml.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that mimopilot did not generate.")] = False,
     uncertified: UncertifiedOption = False,
 ) -> None:
     """Emit the C++ controller with its gains, parameter table, build files and tests."""
     import mimopilot as mp
+    from mimopilot.codegen.errors import CodegenError
 
-    tree = mp.generate(gains, out, target=target, force=force, uncertified=uncertified, px4_api=px4_api)
+    options = {"px4_api": px4_api}
+    for text in option or ():
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise CodegenError(f"--option {text}: expected NAME=VALUE")
+        options[name.replace("-", "_")] = value
+    tree = mp.generate(gains, out, target=target, force=force, uncertified=uncertified, **options)
     warn(gains, [tree.warning] if tree.warning else [])
     count, written = len(tree.files), len(tree.written)
     print(f"{out}: {count} files, {written} written, {count - written} unchanged")

@@ -45,8 +45,8 @@ METHODS = (
     f"from the same log. {SISO} and {MIMO}: VRFT with the thesis' reference models. {REFINED}: {MIMO} refined on a "
     f"model from the same log, for this doublet, with a predicted effort {EFFORT_RATIO - 1:.0%} above {SISO}'s. "
     f"{BEST}: all gains by direct optimisation on the true plant, which no method knows. Its effort is that of "
-    f"{REFINED} there (median of the first seeds). Its margins are the certificate's, Ms less the error of Ms from a log. "
-    f"{BOUND}: the same with any effort. Effort: RMS of both torques together."
+    f"{REFINED} there (median of the first seeds). Its margins are the certificate's, Ms less the error of Ms from a "
+    f"log. {BOUND}: the same with any effort. Effort: RMS of both torques together."
 )
 SPREAD_COLUMNS = ("gain", *ELEMENTS)
 COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].removesuffix(", RMS of u") for text in COSTS.values()))

@@ -19,6 +19,7 @@ from mimopilot.codegen.toolchain import find_compiler
 from mimopilot.common.files import sha256
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS
+from tests.conftest import assert_one_clear_line
 
 
 def read_tree(folder):
@@ -271,3 +272,32 @@ def test_a_name_that_is_invalid_on_a_vehicle_is_refused(gains, monkeypatch, name
 def test_an_unknown_target_is_refused(gains):
     with pytest.raises(CodegenError, match="expected one of cortex-m4, native, px4"):
         render(gains, "unknown")
+
+
+def test_an_option_of_a_target_reaches_its_templates_and_an_unknown_one_is_refused(gains, tmp_path, mimopilot):
+    gains.save(tmp_path / "g.toml")
+    start = ("generate", "g.toml", "--target", "px4", "--uncertified", "--out")
+    assert mimopilot(*start, "a", "--px4-api", "descriptor").returncode == 0
+    assert mimopilot(*start, "b", "--option", "px4-api=descriptor").returncode == 0
+    module = "px4/src/modules/mc_mimo_pid/mc_mimo_pid.cpp"
+    assert (tmp_path / "a" / module).read_bytes() == (tmp_path / "b" / module).read_bytes()
+    for text, message in (("colour=red", "no target has it; known: px4_api"), ("px4_api", "expected NAME=VALUE")):
+        assert_one_clear_line(mimopilot(*start, "c", "--option", text), message)
+    assert not (tmp_path / "c").exists()
+
+
+def test_a_target_with_an_unknown_entry_or_the_name_of_another_is_refused(tmp_path, monkeypatch):
+    cases = ('name = "x"\nhelp = ""\ntypo = 1\n', "not a target: 'folders'"), (None, "choose another name")
+    for text, message in cases:
+        (tmp_path / "a").mkdir(exist_ok=True)
+        (tmp_path / "b").mkdir(exist_ok=True)
+        whole = 'name = "x"\nhelp = ""\nfolders = ["core"]\n'
+        (tmp_path / "a" / DESCRIPTION).write_text(text or whole)
+        (tmp_path / "b" / DESCRIPTION).write_text(whole)
+        monkeypatch.setattr("mimopilot.codegen.targets.TEMPLATES", tmp_path)
+        targets.cache_clear()
+        with pytest.raises(CodegenError, match=message):
+            targets()
+    monkeypatch.undo()
+    targets.cache_clear()
+    assert "px4" in targets()
