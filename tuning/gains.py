@@ -22,7 +22,7 @@ from mimopilot.common.toml import toml_entries, toml_value
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
-from mimopilot.tuning.parameter_row import AXES, POSITIVE, Row, Shape
+from mimopilot.tuning.parameter_row import ANY, AXES, POSITIVE, Row, Shape, Valid
 from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, rows
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
@@ -33,10 +33,8 @@ Triple = tuple[float, float, float]
 #: Reference models of the thesis' flights (chapter 6): rate loop, attitude loop.
 THESIS_INNER = (SecondOrder(20.0, 0.4),) * 2
 THESIS_OUTER = (SecondOrder(10.0, 0.7),) * 2
-#: Of the gains file.
+#: Schema of the gains file.
 SCHEMA = 2
-#: Comments of keys.
-NOTES = {Shape.SCALAR: "s", Shape.POLE: "0: no filter"}
 #: Seal of a certificate that was read from a gains file of schema 1.
 SCHEMA_1 = "schema 1"
 #: Largest relative difference of the ratios of roll and pitch at which a certificate stays valid: rounding of the unit.
@@ -127,7 +125,7 @@ class Gains:
             valid = replace(row.valid, highest=np.inf) if row.shape is Shape.POLE else row.valid  # a cut-off, Hz
             for where, value in self._named(row):
                 if not valid.holds(value):
-                    raise TuningError(f"{where}: got {value}{_unit(row)}, expected {_said(row, valid)}")
+                    raise TuningError(f"{where}: got {value}{_unit(row)}, expected {_expectation(valid)}")
         for axis, value in zip(AXES, self.moment_scale or (), strict=False):
             if not POSITIVE.holds(value):
                 raise TuningError(f"moment_scale ({axis}): got {value} N m, expected {POSITIVE}")
@@ -308,9 +306,8 @@ def _unit(row: Row) -> str:
     return f" {row.unit}" if row.unit and row.shape in (Shape.SCALAR, Shape.AXES) and row.unit != "norm" else ""
 
 
-def _said(row: Row, valid: object) -> str:
-    text = str(valid)
-    return f"{text}; tune again or correct the file" if text.startswith("a finite") else text
+def _expectation(valid: Valid) -> str:
+    return str(valid) if valid != ANY else f"{valid}; tune again or correct the file"
 
 
 def gains_to_toml(gains: Gains) -> str:
@@ -318,7 +315,8 @@ def gains_to_toml(gains: Gains) -> str:
 
     def line(row: Row) -> str:
         value = gains.of(row)
-        note = f"  # {NOTES[row.shape]}" if row.shape in NOTES else ""
+        notes = {Shape.SCALAR: row.unit, Shape.POLE: "0: no filter"}
+        note = f"  # {notes[row.shape]}" if row.shape in notes else ""
         plain = np.asarray(value, dtype=np.float64).tolist()
         return f"{row.key} = {toml_value(plain)}{note}"
 
