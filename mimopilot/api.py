@@ -12,10 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from mimopilot.common.blas import reproducible
-from mimopilot.sitl.physics.airframe import Airframe
-from mimopilot.tuning.experiment import Experiment
-from mimopilot.tuning.gains import Gains, Triple
-from mimopilot.tuning.reference_model import ContinuousModel
 
 if TYPE_CHECKING:
     from mimopilot.sitl.flight.metrics import Performance
@@ -24,15 +20,19 @@ if TYPE_CHECKING:
     from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
     from mimopilot.sitl.mavlink.ground_station.upload import UploadOutcome
+    from mimopilot.sitl.physics.airframe import Airframe
     from mimopilot.tuning.design.advise import Advice
+    from mimopilot.tuning.experiment import Experiment
+    from mimopilot.tuning.gains import Gains, Triple
     from mimopilot.tuning.logs.columns import Columns
     from mimopilot.tuning.logs.inspection import Inspection
+    from mimopilot.tuning.reference_model import ContinuousModel
     from mimopilot.tuning.spec import TuningSpec
 
-PathLike = str | Path
-Log = PathLike | Experiment
-GainSet = PathLike | Gains
-Model = tuple[float, float] | tuple[float, float, int] | ContinuousModel
+    PathLike = str | Path
+    Log = PathLike | Experiment
+    GainSet = PathLike | Gains
+    Model = tuple[float, float] | tuple[float, float, int] | ContinuousModel
 
 
 @reproducible
@@ -522,7 +522,7 @@ def prepare_upload(
 
     loaded = _gains(gains)
     warning = check_verdict(loaded, allow=uncertified)
-    source = Path("gains") if isinstance(gains, Gains) else Path(gains)
+    source = Path(gains) if isinstance(gains, str | Path) else Path("gains")
     stem = source.with_name(source.name.removesuffix(".toml").removesuffix(".gains"))
     plan = make_plan(loaded, profile, drop_off_diagonals)
     return plan, LinkOptions(connect, stem=stem, **link), loaded, warning
@@ -533,7 +533,7 @@ def vehicle(airframe: PathLike | Airframe, gains: GainSet | None = None) -> tupl
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.physics.airframe import load_airframe as load
 
-    if isinstance(airframe, Airframe):
+    if not isinstance(airframe, str | Path):
         if gains is None:
             raise SitlError(f"gains: an airframe that is no file ({airframe.name}) has none of its own; give them")
         return airframe, _gains(gains)
@@ -544,11 +544,11 @@ def vehicle(airframe: PathLike | Airframe, gains: GainSet | None = None) -> tupl
 def _experiment(log: Log, columns: PathLike | None) -> Experiment:
     from mimopilot.tuning.logs.reader import read_log as read
 
-    return log if isinstance(log, Experiment) else read(Path(log), _columns(columns))
+    return read(Path(log), _columns(columns)) if isinstance(log, str | Path) else log
 
 
 def _gains(gains: GainSet) -> Gains:
-    return gains if isinstance(gains, Gains) else load_gains(gains)
+    return load_gains(gains) if isinstance(gains, str | Path) else gains
 
 
 def _columns(path: PathLike | None) -> Columns | None:

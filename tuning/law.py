@@ -17,8 +17,6 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
-from scipy.signal import lfilter
 
 from mimopilot.tuning.parameter_row import pole_of
 
@@ -85,6 +83,8 @@ class Filter:
         moved = moved / self.divisor
         if self.pole == 1:
             return np.asarray(self.gain * np.cumsum(moved, axis=0), dtype=np.float64)
+        from scipy.signal import lfilter  # takes a second to import, which most commands do not need
+
         return np.asarray(lfilter([self.gain], [1, -self.pole], moved, axis=0), dtype=np.float64)
 
     def times(self, matrix: Signal, z: Response) -> Response:
@@ -230,7 +230,7 @@ def state_space(matrices: Mapping[str, Signal], filters: Filters) -> StateSpaceL
     """
     n_u, n = np.shape(next(iter(matrices.values())))
     D = {signal: np.zeros((n_u, n)) for signal in (ERROR, RATE, SETPOINT)}
-    poles: list[Signal] = []
+    poles: list[float] = []
     inputs: list[tuple[str, Signal]] = []
     outputs: list[Signal] = []
     for letter, term in TERMS.items():
@@ -239,12 +239,12 @@ def state_space(matrices: Mapping[str, Signal], filters: Filters) -> StateSpaceL
         shape, matrix = term.filter(filters), term.sign * np.asarray(matrices[letter], float)
         D[term.signal] = D[term.signal] + (matrix if shape is None else shape.direct * matrix)
         if shape is not None:
-            poles.append(shape.pole * np.eye(n))
+            poles.append(shape.pole)
             inputs.append((term.signal, shape.memory * np.eye(n)))
             outputs.append(matrix)
     none = np.zeros((n, n))
     B = {signal: np.vstack([np.zeros((0, n)), *(b if s == signal else none for s, b in inputs)]) for signal in D}
-    A = block_diag(*poles) if poles else np.zeros((0, 0))
+    A = np.diag(np.repeat(poles, n))
     return StateSpaceLaw(A, B, np.hstack([np.zeros((n_u, 0)), *outputs]), D)
 
 
@@ -294,7 +294,9 @@ def response(gains: AllAxes, omega: Signal) -> Response:
     """
 
     def whole(name: str) -> Signal:
-        return np.asarray(block_diag(getattr(gains, name), getattr(gains.yaw, name)), dtype=np.float64)
+        matrix = np.zeros((3, 3))
+        matrix[:2, :2], matrix[2, 2] = getattr(gains, name), getattr(gains.yaw, name)
+        return matrix
 
     attitude, eye, none = whole(ATTITUDE.matrix), np.eye(3), np.zeros((3, 3))
     matrices = {letter: whole(term.matrix) for letter, term in TERMS.items()}

@@ -9,7 +9,6 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete, lfilter
 
 from mimopilot.common.toml import shown
 from mimopilot.tuning.errors import TuningError
@@ -55,6 +54,8 @@ class ReferenceModel:
         signal : (N,) or (N, n) array
             Input; columns are independent.
         """
+        from scipy.signal import lfilter  # takes a second to import, which most commands do not need
+
         filtered: NDArray[np.float64] = lfilter(self.taps, self.den, signal, axis=0)
         return filtered
 
@@ -85,6 +86,8 @@ class ReferenceModel:
 
     def settling_samples(self, fraction: float = 0.01) -> int:
         """Samples until a transient of the model is below `fraction` of its peak, delay included."""
+        from scipy.signal import lfilter
+
         slowest = float(np.max(np.abs(np.roots(self.den))))
         if slowest >= 1:
             raise TuningError(f"reference model {self.label}: pole at {slowest:.4g}, expected inside the unit circle")
@@ -213,6 +216,8 @@ def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceM
             f"expected {MIN_OMEGA:g} <= omega < {np.pi / Ts:.4g} rad/s, 0 < damping <= {MAX_DAMPING}, "
             f"delay 0 to {MAX_DELAY} samples"
         )
+    from scipy.signal import cont2discrete
+
     num, den, _ = cont2discrete(([omega**2], [1, 2 * zeta * omega, omega**2]), Ts, method="zoh")
     return ReferenceModel(
         tuple(float(b) for b in num[0][1:]),
