@@ -137,7 +137,7 @@ def experiment(
     from mimopilot.api import vehicle
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, default_amplitude
 
-    reason = "belongs to --connect; a simulated flight excites both axes"
+    reason = "belong to --connect; a simulated flight excites both axes"
     check_not_given(reason, axis=axis, mode=mode, tilt_deg=tilt_deg)
     if out is None:
         raise SitlError("--out: name the log to write, FILE.ulg")
