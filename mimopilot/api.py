@@ -351,7 +351,6 @@ def fly(
     Error
         When the airframe, the gains, the scenario or a fault is not possible.
     """
-    from mimopilot.codegen.cortex_m4 import load_emulated
     from mimopilot.sitl.autopilot.autopilot import Autopilot
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.flight.scenario import Scenario, scenario_of
@@ -365,7 +364,11 @@ def fly(
         if isinstance(scenario, Scenario)
         else scenario_of(str(scenario), axis, amplitude_deg, period_s, tail_s, list(faults), controller.Ts)
     )
-    processor = load_emulated(controller) if on == "cortex-m4" else None
+    processor = None
+    if on == "cortex-m4":
+        from mimopilot.codegen.cortex_m4 import load_emulated
+
+        processor = load_emulated(controller)
     return fly_scenario(body, Autopilot(body, controller, processor), task, seed, noise)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mimopilot as mp
+from mimopilot.tuning.reference_model import SecondOrder
 from tests.sitl.mavlink.running import running_sitl
 
 SECONDS = 12.0
@@ -65,7 +66,7 @@ def test_tuning_gives_the_same_bytes_as_the_command_whatever_the_caller_loaded_b
 def test_a_specification_can_be_overridden(log):
     given = mp.tune(log, inner=(25, 0.5), outer=(9, 0.8), method="siso", structure="PI")
     assert (given.provenance.method, given.provenance.details["structure"]) == ("siso", "PI")
-    assert given.provenance.inner_model[0].as_list() == [25, 0.5, 0]
+    assert given.provenance.inner_model[0] == SecondOrder(25, 0.5, 0)
     assert not np.any(given.Kd_i)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,19 +29,40 @@ SETTLED = 0.01
 ROUNDING = 1e-12
 
 
-def inverse_eigenvalues(matrices: Mapping[str, Signal], filters: Filters) -> Any:
-    """Poles of the inverse rate controller; with an integral alone the eigenvalues of I - Ts Ki (Kp + Ts Ki + Kff)^-1.
+@dataclass(frozen=True, eq=False)
+class InverseLaw:
+    """The inverse from u to e, in the coordinates of the terms' parts of u.
+
+    Attributes
+    ----------
+    A, B : (m, m) and (m, n) arrays
+        Of its states.
+    direct : (n, n) array
+        Its direct gain.
+    eigenvalues : (m,) array
+        Its poles; with an integral alone those of I - Ts Ki (Kp + Ts Ki + Kff)^-1.
+    """
+
+    A: Signal
+    B: Signal
+    direct: Signal
+    eigenvalues: Any
+
+
+def inverse_law(matrices: Mapping[str, Signal], filters: Filters) -> InverseLaw:
+    """The inverse rate controller.
+
+    Parameters
+    ----------
+    matrices : mapping
+        Letter -> (n, n) matrix.
+    filters : Filters
 
     Raises
     ------
     NotMinimumPhaseError
         When the controller has no inverse.
     """
-    return np.linalg.eigvals(_inverse(matrices, filters)[0])
-
-
-def _inverse(matrices: Mapping[str, Signal], filters: Filters) -> tuple[Signal, Signal, Signal]:
-    """A and B of the inverse from u to e, in the coordinates of the terms' parts of u, and its direct gain."""
     direct: Any = 0.0
     poles, pushes = [], []
     for letter, term in TERMS.items():
@@ -57,7 +79,8 @@ def _inverse(matrices: Mapping[str, Signal], filters: Filters) -> tuple[Signal, 
     inverse = np.linalg.inv(direct)
     n = len(direct)
     B = np.vstack([np.zeros((0, n)), *(push @ inverse for push in pushes)])
-    return block_diag(*poles) - np.hstack([B] * len(poles)) if poles else np.zeros((0, 0)), B, inverse
+    A = block_diag(*poles) - np.hstack([B] * len(poles)) if poles else np.zeros((0, 0))
+    return InverseLaw(A, B, inverse, np.linalg.eigvals(A))
 
 
 def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Signal, int]:
@@ -87,8 +110,8 @@ def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Si
         When the inverse is unstable or does not exist.
     """
     matrices, filters = rate_matrices(gains), gains.filters
-    A, B, inverse = _inverse(matrices, filters)
-    eigenvalues = np.linalg.eigvals(A)
+    inverted = inverse_law(matrices, filters)
+    A, B, inverse, eigenvalues = inverted.A, inverted.B, inverted.direct, inverted.eigenvalues
     # The state of an unused integrator (a zero row of Ki) is constant: an eigenvalue of exactly 1.
     at_rest = np.isclose(eigenvalues, 1.0, rtol=0, atol=ROUNDING)
     unstable = np.abs(eigenvalues[~at_rest]) >= 1

@@ -156,10 +156,6 @@ class SecondOrder:
         """The model as plain TOML values."""
         return {"type": self.type, **asdict(self)}
 
-    def as_list(self) -> list[float | int]:
-        """OMEGA, ZETA, DELAY, the form of specifications and of the command line."""
-        return [self.omega, self.zeta, self.delay]
-
 
 #: Type -> class of every reference model; a new model needs a class and a row here.
 CONTINUOUS_MODELS: dict[str, Callable[..., ContinuousModel]] = {SecondOrder.type: SecondOrder}

@@ -20,6 +20,7 @@ from mimopilot.cli.options import (
     WorkersOption,
 )
 from mimopilot.common.console import json_text, print_json, print_table
+from mimopilot.common.errors import check_not_given
 
 
 def register(app: typer.Typer) -> None:
@@ -107,12 +108,12 @@ def _task(scenario: str, axis: str | None, sizes: dict[str, float | None], fault
     """Entries of the plan from the options that say what is flown."""
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.faults.kinds import parse_fault
-    from mimopilot.sitl.flight.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, TAIL_S, check_not_in_file, read_scenario
+    from mimopilot.sitl.flight.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, TAIL_S, read_scenario
 
     named = [str(parse_fault(text)) for text in faults or ()]
     given: dict[str, Any] = {name: value for name, value in sizes.items() if value is not None}
     if scenario.endswith(".toml"):
-        check_not_in_file(scenario, axis=axis, **sizes)
+        check_not_given(f"defined in {scenario}; change it there", axis=axis, **sizes)
         task, own = read_scenario(Path(scenario))
         given = {name: getattr(task, name) for name in sizes}
         scenario, axis, named = task.manoeuvre, task.axis, [*map(str, own), *named]

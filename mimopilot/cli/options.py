@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share, and the checks between them."""
+"""Options and arguments that several commands share."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-
-from mimopilot.common.errors import Error
 
 AirframeArgument = Annotated[
     str,
@@ -57,26 +55,6 @@ KeyOption = Annotated[Path | None, typer.Option(help="Sign with this key: 32 byt
 SystemOption = Annotated[
     int, typer.Option(min=0, max=255, help="The vehicle's system number; 0: the only one there is.")
 ]
-
-
-def check_not_given(reason: str, **options: object) -> None:
-    """Refuse options that do not apply to this mode.
-
-    Parameters
-    ----------
-    reason : str
-        Where they belong, for the message.
-    **options
-        By the name of their parameter; None: not given.
-
-    Raises
-    ------
-    Error
-        Naming those that were given.
-    """
-    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
-    if given:
-        raise Error(f"{', '.join(given)}: {reason}")
 
 
 def warn(where: Path | str, warnings: Iterable[str]) -> None:

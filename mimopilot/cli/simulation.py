@@ -23,9 +23,9 @@ from mimopilot.cli.options import (
     TailOption,
     TimeoutOption,
     YesOption,
-    check_not_given,
 )
 from mimopilot.common.console import print_json, print_table, progress_console
+from mimopilot.common.errors import check_not_given
 
 if TYPE_CHECKING:
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan

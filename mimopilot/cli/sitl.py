@@ -17,8 +17,8 @@ from mimopilot.cli.options import (
     PeriodOption,
     SeedOption,
     SpeedOption,
-    check_not_given,
 )
+from mimopilot.common.errors import check_not_given
 
 
 def register(app: typer.Typer) -> None:

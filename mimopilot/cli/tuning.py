@@ -14,10 +14,10 @@ from mimopilot.cli.options import (
     JsonOption,
     LogArgument,
     OuterOption,
-    check_not_given,
     warn,
 )
 from mimopilot.common.console import print_json, print_table, progress_console
+from mimopilot.common.errors import check_not_given
 
 if TYPE_CHECKING:
     from mimopilot.tuning.design.advise import Candidate

@@ -19,3 +19,23 @@ class Error(Exception):
 
 class InputFileError(Error, ValueError):
     """A file cannot be read, or its content is not as expected."""
+
+
+def check_not_given(reason: str, **options: object) -> None:
+    """Refuse options that do not apply to this mode.
+
+    Parameters
+    ----------
+    reason : str
+        Where they belong, for the message.
+    **options
+        By the name of their parameter; None: not given.
+
+    Raises
+    ------
+    Error
+        Naming those that were given.
+    """
+    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
+    if given:
+        raise Error(f"{', '.join(given)}: {reason}")

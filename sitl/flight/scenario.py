@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
+from mimopilot.common.errors import check_not_given
 from mimopilot.common.toml import checked, read_toml
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.errors import SitlError
@@ -235,19 +236,6 @@ def excitation_flight(
     return Scenario("experiment", Ts, np.zeros_like(excitation), excitation, 0, (0, len(excitation)))
 
 
-def check_not_in_file(file: str, **options: object) -> None:
-    """Refuse options that a scenario file defines; None: not given.
-
-    Raises
-    ------
-    SitlError
-        Naming those that were given.
-    """
-    given = [f"--{name.replace('_', '-')}" for name, value in options.items() if value is not None]
-    if given:
-        raise SitlError(f"{', '.join(given)}: defined in {file}; change it there")
-
-
 def scenario_of(
     name: str,
     axis: str | None,
@@ -272,11 +260,12 @@ def scenario_of(
 
     Raises
     ------
-    SitlError
+    Error
         When something of a file is given here, too, or a value is out of its range.
     """
     if name.endswith(".toml"):
-        check_not_in_file(name, axis=axis, amplitude_deg=amplitude_deg, period_s=period_s, tail_s=tail_s)
+        reason = f"defined in {name}; change it there"
+        check_not_given(reason, axis=axis, amplitude_deg=amplitude_deg, period_s=period_s, tail_s=tail_s)
         task = load_scenario(Path(name), Ts)
     else:
         amplitude = AMPLITUDE_DEG if amplitude_deg is None else amplitude_deg

@@ -9,7 +9,7 @@ from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.law import Filters, rate_matrices, regressors
-from mimopilot.tuning.law_inverse import inverse_eigenvalues, rebuild_rate_setpoint
+from mimopilot.tuning.law_inverse import inverse_law, rebuild_rate_setpoint
 
 N = 400
 
@@ -72,7 +72,7 @@ def test_a_controller_that_is_not_minimum_phase_is_refused_with_its_eigenvalues(
 def test_the_poles_of_the_inverse_are_those_of_the_closed_form(gains):
     diagonal = dataclasses.replace(gains, Ki_i=np.diag([0.25, 0.2]), Kp_i=np.diag([0.15, 0.13]), Kff_i=np.zeros((2, 2)))
     expected = [0.15 / (0.15 + 0.004 * 0.25), 0.13 / (0.13 + 0.004 * 0.2)]
-    got = inverse_eigenvalues(rate_matrices(diagonal), diagonal.filters)
+    got = inverse_law(rate_matrices(diagonal), diagonal.filters).eigenvalues
     assert sorted(got.real) == pytest.approx(sorted(expected), rel=1e-12)
 
 

@@ -11,6 +11,7 @@ from mimopilot.tuning.gains_file import gains_from_toml
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameter_row import Row, Shape
 from mimopilot.tuning.parameters import ROWS, rows
+from mimopilot.tuning.reference_model import SecondOrder
 
 SCHEMA_1 = """
 schema = 1
@@ -57,7 +58,7 @@ structure = "PID"
 def test_a_file_of_schema_1_is_read_and_its_certificate_is_void_with_the_reason():
     gains = gains_from_toml(SCHEMA_1, "old.gains.toml")
     assert gains.Kp_i.tolist() == [[0.15, 0.02], [0.01, 0.13]]
-    assert [model.as_list() for model in gains.provenance.inner_model] == [[30.0, 0.7, 0], [25.0, 0.6, 1]]
+    assert gains.provenance.inner_model == (SecondOrder(30.0, 0.7, 0), SecondOrder(25.0, 0.6, 1))
     verdict, reason = gains.verdict()
     assert verdict == Verdict.VOID
     assert "schema 1" in reason
