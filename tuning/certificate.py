@@ -81,6 +81,8 @@ class Certificate:
         `Thresholds` of the verdict.
     log_sha256 : str
         Hash of the log that it was made from.
+    further : tuple of mapping
+        Certificates of the same gains from other logs, as tables; this one has the thinnest margin.
     seal : str
         Hash of the certificate and the gains, see `tuning.gains.Gains.with_certificate`; empty: not bound to gains.
     """
@@ -91,11 +93,13 @@ class Certificate:
     band: tuple[float, float] = (0.0, 0.0)
     thresholds: Mapping[str, float] = field(default_factory=DEFAULT_THRESHOLDS.model_dump)
     log_sha256: str = ""
+    further: tuple[Mapping[str, Any], ...] = ()
     seal: str = ""
 
     def as_table(self) -> dict[str, Any]:
         """The certificate as plain TOML and JSON values."""
-        return {**asdict(self), "verdict": str(self.verdict), "band": list(self.band)}
+        table = {**asdict(self), "verdict": str(self.verdict), "band": list(self.band), "further": list(self.further)}
+        return table if self.further else {name: value for name, value in table.items() if name != "further"}
 
     @classmethod
     def from_table(cls, table: Mapping[str, Any]) -> Certificate:
@@ -116,7 +120,7 @@ class Certificate:
         except ValueError:
             given, valid = shown(table.get("verdict")), ", ".join(repr(str(one)) for one in Verdict)
             raise TuningError(f"certificate.verdict: got {given}, expected one of {valid}") from None
-        for name, kind in (("figures", dict), ("thresholds", dict), ("band", list), ("reason", str)):
+        for name, kind in (("figures", dict), ("thresholds", dict), ("band", list), ("reason", str), ("further", list)):
             if not isinstance(values.setdefault(name, kind()), kind):
                 raise TuningError(f"certificate.{name}: got {shown(values[name])}, expected a {kind.__name__}")
-        return cls(verdict, **{**values, "band": tuple(values["band"])})
+        return cls(verdict, **{**values, "band": tuple(values["band"]), "further": tuple(values["further"])})

@@ -17,6 +17,8 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Triple = tuple[Positive, Positive, Positive]
 #: Roll, pitch; checked by a validator of `TuningSpec`.
 Models = tuple[ContinuousModel, ContinuousModel]
+#: Models of a loop if only those of the other one are given.
+DEFAULT_MODELS: dict[str, Models] = {"inner": (SecondOrder(30.0, 0.7),) * 2, "outer": (SecondOrder(10.0, 0.7),) * 2}
 
 
 class _SpecTable(BaseModel):
@@ -43,21 +45,20 @@ class LimitsSpec(_SpecTable):
     integral_max: Triple
 
 
-class Manoeuvre(_SpecTable):
-    """A doublet that all gains are refined for, see `tuning.design.refine_for_manoeuvre`.
+class DesignLimits(_SpecTable):
+    """Limits of the design on the measured response.
 
     Attributes
     ----------
-    amplitude_deg : float, deg
-    period_s : float, s
-        Whole length.
-    effort : tuple of 2 float or None
-        Largest RMS of both torques together in the roll and in the pitch doublet; None: that of VRFT's gains.
+    Ms : float
+        Largest singular value of the sensitivity, cut at the torques and at the angles, the response's error included.
+        1.6 leaves 36 degrees and 8.5 dB on each axis (S. Skogestad, I. Postlethwaite, Multivariable Feedback Control).
+    noise : float
+        RMS of the torque at hover that noise causes, over that of the flown gains, for each axis.
     """
 
-    amplitude_deg: Annotated[float, Field(gt=0, le=60)]
-    period_s: Annotated[float, Field(gt=0, le=60)]
-    effort: tuple[Positive, Positive] | None = None
+    Ms: Annotated[float, Field(gt=1.05, le=2.5)] = 1.6
+    noise: Annotated[float, Field(gt=0, le=10)] = 1.5
 
 
 class TuningSpec(_SpecTable):
@@ -67,9 +68,11 @@ class TuningSpec(_SpecTable):
     ----------
     method : str
         ``mimo``: full matrices. ``siso``: each axis by itself, with the optimal prefilter (3.12).
-    inner, outer : tuple of 2 ContinuousModel
+    inner, outer : tuple of 2 ContinuousModel or None
         Reference models of the rate and the attitude loop, roll then pitch. In TOML [omega rad/s, damping, delay
-        samples], one list for both axes or one for each.
+        samples], one list for both axes or one for each. Both None: the gains are designed on the measured response,
+        see `tuning.design.response_design`. Else VRFT finds them for these models, as in the thesis; one that is not
+        given is 30 rad/s, 0.7 or 10 rad/s, 0.7.
     structure : str
         Terms of the rate controller: letters of ``PIDF`` in that order, P among them. The attitude controller is P.
     instrument : str
@@ -87,10 +90,6 @@ class TuningSpec(_SpecTable):
         Pull of the rate gains towards the flown ones, for short logs: 1 moves a single gain halfway, 0 not at all.
     refine : bool
         Refine VRFT's attitude gains on the measured frequency response, see `tuning.design.refine_attitude`.
-    doublet_s : float or None, s
-        Length of the doublet whose spectrum weighs the errors of that refinement; None: 1/omega, for all setpoints.
-    manoeuvre : Manoeuvre or None
-        Refine the gains of both loops for this doublet; None: the rate loop follows its model.
     derivative_cutoff_hz : float or None, Hz
         Cut-off of the derivative filter; None: as flown.
     moment_scale : tuple of 3 float or None, N m
@@ -99,13 +98,15 @@ class TuningSpec(_SpecTable):
         None: as flown.
     certificate : Thresholds
         Margins that the verdict needs.
+    design : DesignLimits
+        Limits of the design on the measured response.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
     method: Literal["mimo", "siso"] = "mimo"
-    inner: Models = (SecondOrder(30.0, 0.7), SecondOrder(30.0, 0.7))
-    outer: Models = (SecondOrder(10.0, 0.7), SecondOrder(10.0, 0.7))
+    inner: Models | None = None
+    outer: Models | None = None
     structure: Annotated[str, Field(pattern="^PI?D?F?$")] = "PID"
     instrument: Literal["external", "u", "model", "repeated"] = "external"
     trim: bool = True
@@ -113,17 +114,18 @@ class TuningSpec(_SpecTable):
     weight: Literal["identity", "optimal"] = "optimal"
     pull: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.0
     refine: bool = True
-    doublet_s: Annotated[float, Field(gt=0, le=60)] | None = None
-    manoeuvre: Manoeuvre | None = None
     derivative_cutoff_hz: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
     moment_scale: Triple | None = None
     yaw: YawSpec | None = None
     limits: LimitsSpec | None = None
     certificate: Thresholds = DEFAULT_THRESHOLDS
+    design: DesignLimits = DesignLimits()
 
     @field_validator("inner", "outer", mode="before")
     @classmethod
     def _one_model_for_both_axes(cls, value: object, info: ValidationInfo) -> object:
+        if value is None:
+            return None
         several = isinstance(value, list | tuple) and len(value) == 2 and not isinstance(value[0], int | float)
         models = value if isinstance(value, list | tuple) and several else (value, value)
         return tuple(
@@ -132,8 +134,18 @@ class TuningSpec(_SpecTable):
         )
 
     def models(self, loop: Literal["inner", "outer"], Ts: float) -> list[ReferenceModel]:
-        """Reference models of a loop, roll then pitch."""
-        return [model.discretise(Ts) for model in getattr(self, loop)]
+        """Reference models of a loop, roll then pitch; `DEFAULT_MODELS` if none are given."""
+        return [model.discretise(Ts) for model in self.continuous(loop)]
+
+    def continuous(self, loop: Literal["inner", "outer"]) -> Models:
+        """The same, as specified."""
+        given: Models | None = getattr(self, loop)
+        return given or DEFAULT_MODELS[loop]
+
+    @property
+    def for_models(self) -> bool:
+        """Whether the gains are asked for reference models, as in the thesis."""
+        return self.inner is not None or self.outer is not None
 
 
 def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
@@ -169,18 +181,3 @@ def parse_model(text: str) -> tuple[float, float, int]:
         return float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
     except ValueError:
         raise TuningError(f"reference model: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0") from None
-
-
-def parse_doublet(text: str) -> dict[str, float]:
-    """Parse ``DEGREES,SECONDS`` from the command line: entries of a `Manoeuvre`.
-
-    Raises
-    ------
-    TuningError
-        When it is not two numbers.
-    """
-    try:
-        amplitude, period = (float(part) for part in text.split(","))
-    except ValueError:
-        raise TuningError(f"doublet: got {text!r}, expected DEGREES,SECONDS such as 22.5,0.42") from None
-    return {"amplitude_deg": amplitude, "period_s": period}

@@ -20,7 +20,7 @@ MAX_SENSITIVITY_BELOW_BAND = 0.5
 #: Above the frequency where the loop first falls below the limit, noise may exceed it up to this ratio of frequencies.
 CROSSOVER_NOISE_RATIO = 1.25
 #: A gain whose error is below this share of it counts as measured, whatever the coherence.
-MEASURED_ERROR = 0.5
+MEASURED_ERROR = 0.4
 #: Frequencies from the band's end to Nyquist on which the controller's response is searched for its maximum.
 GRID_POINTS = 200
 #: Smallest distance of the loop from -1 that a peak of the sensitivity is computed from: it bounds the peak.
@@ -71,11 +71,16 @@ def loop_gain_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
     grid = np.concatenate([plant.omega, np.linspace(plant.omega[-1], np.pi / gains.Ts, GRID_POINTS)[1:]])
     falling = singular_values(cascade_response(gains, grid)[1])[0] / grid
     highest = np.maximum.accumulate(falling[..., ::-1], axis=-1)[..., ::-1][..., : len(plant.omega)]
+    bound: Signal = falling_gain(plant) * highest
+    return bound
+
+
+def falling_gain(plant: PlantResponse) -> Signal:
+    """Bound of w sigma_max(G_i) above each frequency, (K,): it does not rise from its largest value on."""
     gain: Signal = singular_values(plant.G_i)[0] * plant.omega
     top = int(np.argmax(gain))
     gain[top:] = isotonic_regression(gain[top:], increasing=False).x
-    bound: Signal = gain * highest
-    return bound
+    return gain
 
 
 def attitude_gain_above(gains: Gains, plant: PlantResponse) -> float:
@@ -109,19 +114,28 @@ def find_structural_mode(gains: Gains, plant: PlantResponse) -> tuple[float, flo
     tuple of 2 float or None
         Frequency (rad/s) at which it exceeds the limit most surely, and the gain plus its error there; None: nowhere.
     """
+    counts, gain, error = _exceeded(gains, plant)
+    if not counts.any():
+        return None
+    surest = int(np.argmax(np.where(counts, gain - error, -np.inf)))
+    return float(plant.omega[surest]), float((gain + error)[surest])
+
+
+def exceeded_frequencies(gains: Gains, plant: PlantResponse) -> NDArray[np.bool_]:
+    """Measured frequencies above the crossover at which the rate loop's gain may exceed the limit, (K,)."""
+    return _exceeded(gains, plant)[0]
+
+
+def _exceeded(gains: Gains, plant: PlantResponse) -> tuple[NDArray[np.bool_], Signal, Signal]:
+    """See `exceeded_frequencies`; and the gain and its error, (K,)."""
     gain, error = _rate_loop_gain(gains, plant)
     known = np.flatnonzero(plant.known())
     small = known[gain[known] + error[known] <= MAX_GAIN_ABOVE_BAND]
     small = small[small > known[np.argmax(gain[known])]] if len(small) else small
     if not len(small):
-        return None
-    upper = gain + error
+        return np.zeros(len(gain), bool), gain, error
     above_crossover = plant.omega > CROSSOVER_NOISE_RATIO * plant.omega[small[0]]
-    counts = _measured(plant, gain, error) & above_crossover & (upper > MAX_GAIN_ABOVE_BAND)
-    if not counts.any():
-        return None
-    surest = int(np.argmax(np.where(counts, gain - error, -np.inf)))
-    return float(plant.omega[surest]), float(upper[surest])
+    return _measured(plant, gain, error) & above_crossover & (gain + error > MAX_GAIN_ABOVE_BAND), gain, error
 
 
 def sensitivity_peak_above(gains: Gains, plant: PlantResponse, end: float) -> float:

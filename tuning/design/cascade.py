@@ -1,147 +1,109 @@
-"""Tuning the cascade from one experiment: VRFT estimate, quality checks, refinement and certificate."""
+"""Tuning the attitude cascade from flights: the one way from logs to certified gains."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.certify import certify
-from mimopilot.tuning.analysis.doublet_prediction import doublet_model
 from mimopilot.tuning.certificate import Verdict
-from mimopilot.tuning.design.cascade_estimate import CascadeEstimate, estimate
-from mimopilot.tuning.design.quality_checks import check_band, check_estimates, check_saturation
-from mimopilot.tuning.design.refine_attitude import refine_attitude
-from mimopilot.tuning.design.refine_for_manoeuvre import refine_for_manoeuvre
+from mimopilot.tuning.design.quality_checks import check_saturation
+from mimopilot.tuning.design.tune_by_design import tune_by_design
+from mimopilot.tuning.design.tune_for_models import tune_for_models
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import TERMS
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
-from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.spec import TuningSpec
 
 #: Largest relative difference between the periods of a log and of a gain set: loggers' clocks differ by less.
 PERIOD_TOLERANCE = 0.02
 #: Largest relative difference between the units of torque of a log and of a gain set: rounding in files.
 UNIT_TOLERANCE = 0.01
-MOTORS_UNKNOWN = (
-    "the log does not contain how the allocator drives the motors (PX4: actuator_motors, with THR_MDL_FAC set): if the "
-    "doublet saturates motors, the refined gains are not optimal"
-)
 
 
 def tune(
-    experiment: Experiment,
+    experiments: Experiment | Sequence[Experiment],
     spec: TuningSpec | None = None,
     measured: PlantEstimates | None = None,
     repeat: Experiment | None = None,
 ) -> Gains:
     """Gains of the whole cascade, certified.
 
+    Without reference models they are designed on the measured response; with them, VRFT finds those whose loops come
+    closest to the models, as in the thesis.
+
     Parameters
     ----------
-    experiment : Experiment
-        One flight with excitation.
+    experiments : Experiment or sequence of Experiment
+        One flight with excitation, or several of one vehicle.
     spec : TuningSpec, optional
-        Method and reference models.
+        Method, reference models and limits.
     measured : PlantEstimates, optional
-        Response and models of the experiment, if they were computed before.
+        Response and models of a single experiment, if they were computed before.
     repeat : Experiment, optional
         See `tuning.design.cascade_estimate.estimate`.
 
     Returns
     -------
     Gains
-        With their certificate; method, reference models, log and standard deviations are in the provenance.
+        With their certificate; method, reference models, logs and standard deviations are in the provenance.
 
     Raises
     ------
     TuningError
-        As `estimate`, or when the gains would be unusable or unstable.
+        When a log has no external signal, is too short or not excited, or when the gains would be unusable or unstable.
     """
     spec = spec or TuningSpec()
-    measured = measured or PlantEstimates(experiment)
-    excited_stretches(experiment, external_signal(experiment)[0], spec.method)
-    found = estimate(experiment, spec, repeat, measured.body)
-    plant = measured.response
-    warnings = [
-        *experiment.warnings,
-        *found.warnings,
-        *check_saturation(experiment),
-        *check_estimates(experiment.source, found.stretches, found.inner, experiment.Ts),
-        *check_band(experiment.source, plant, [model.bandwidth for model in spec.inner]),
-    ]
-    gains, deviations = found.gains, found.inner_deviations()
-    outer_models = spec.models("outer", experiment.Ts)
-    if spec.refine:
-        try:
-            full = spec.method == "mimo"
-            gains, deviations["Kp_o"] = refine_attitude(
-                gains, plant, outer_models, full, spec.doublet_s, found.draw_inner
-            )
-        except TuningError as error:
-            warnings.append(f"the attitude gains are not refined: {error}")
-    if spec.manoeuvre:
-        if experiment.motors is None:
-            warnings.append(MOTORS_UNKNOWN)
-        try:
-            gains = refine_for_manoeuvre(
-                gains,
-                doublet_model(measured, spec.manoeuvre),
-                plant,
-                outer_models,
-                terms=[*(TERMS[term].matrix for term in spec.structure), "Kp_o"],
-                full=spec.method == "mimo",
-                limit=spec.manoeuvre.effort,
-            )
-            deviations = {}
-        except TuningError as error:
-            warnings.append(f"the gains are not refined for the manoeuvre: {error}")
-    if deviations and "Kp_o" not in deviations:
-        deviations["Kp_o"] = found.outer_deviation()
-    provenance = _provenance(experiment, spec, found, deviations, warnings)
-    tuned = _certified(replace(gains, provenance=provenance), measured, spec)
+    flights = [experiments] if isinstance(experiments, Experiment) else list(experiments)
+    estimates = [measured] if measured is not None else [PlantEstimates(one) for one in flights]
+    doubts = [_doubts(one, spec) for one in flights]
+    if not spec.for_models:
+        _check_one_vehicle(flights)
+        return _with_origin(tune_by_design(estimates, spec), flights, doubts)
+    if len(flights) > 1:
+        raise TuningError(f"{len(flights)} logs: reference models are for one; leave out --inner and --outer")
+    tuned = _certified(_with_origin(tune_for_models(estimates[0], spec, repeat), flights, doubts), estimates[0], spec)
     verdict, reason = tuned.verdict()
     if verdict == Verdict.UNSTABLE:
         raise TuningError(
-            f"{experiment.source}: the gains from this log for these models are unstable, nothing is written: "
+            f"{flights[0].source}: the gains from this log for these models are unstable, nothing is written: "
             f"{reason}; record a longer or stronger excitation, or ask for a slower rate loop"
         )
     return tuned
 
 
-def _provenance(
-    experiment: Experiment,
-    spec: TuningSpec,
-    found: CascadeEstimate,
-    deviations: dict[str, NDArray[np.float64]],
-    warnings: list[str],
-) -> Provenance:
-    """Origin of the gains: log, method, options, fit and standard deviations."""
-    return Provenance(
-        method=spec.method,
-        log=experiment.source,
-        log_sha256=experiment.sha256,
-        inner_model=spec.inner,
-        outer_model=spec.outer,
-        standard_deviation={matrix: value.tolist() for matrix, value in deviations.items()},
-        fit=tuple(float(value) for loop in found.inner for value in loop.solution.r_squared),
-        warnings=tuple(warnings),
-        details={
-            "structure": spec.structure,
-            "instrument": found.instruments.name,
-            "weight": spec.weight,
-            "trim": spec.trim,
-            "pull": spec.pull,
-            "refined": spec.refine,
-            **({"manoeuvre": spec.manoeuvre.model_dump(exclude_none=True)} if spec.manoeuvre else {}),
-            "window": [found.inner[0].window, found.outer[0].window],
-            "samples": [found.inner[0].samples, found.outer[0].samples],
-        },
+def _doubts(experiment: Experiment, spec: TuningSpec) -> list[str]:
+    """Warnings about a log; refuses one that is not excited or is saturated."""
+    excited_stretches(experiment, external_signal(experiment)[0], spec.method)
+    return [*experiment.warnings, *check_saturation(experiment)]
+
+
+def _with_origin(gains: Gains, flights: Sequence[Experiment], doubts: Sequence[Sequence[str]]) -> Gains:
+    """The set with the logs that it comes from, and the warnings about them."""
+    warnings = [warning for some in doubts for warning in some]
+    names, hashes = (", ".join(getattr(one, name) for one in flights) for name in ("source", "sha256"))
+    provenance = replace(
+        gains.provenance,
+        log=names,
+        log_sha256=hashes,
+        warnings=tuple(dict.fromkeys([*warnings, *gains.provenance.warnings])),
     )
+    return replace(gains, provenance=provenance)
+
+
+def _check_one_vehicle(flights: Sequence[Experiment]) -> None:
+    """Refuse logs that cannot be of one vehicle: another period or unit of torque."""
+    first = flights[0]
+    for other in flights[1:]:
+        if abs(other.Ts / first.Ts - 1) > PERIOD_TOLERANCE:
+            raise TuningError(f"{other.source}: sampled every {other.Ts:g} s, {first.source} every {first.Ts:g} s")
+        ours, theirs = (one.flown.moment_scale if one.flown else None for one in (first, other))
+        if ours and theirs and not np.allclose(ours[:2], theirs[:2], rtol=UNIT_TOLERANCE, atol=0):
+            raise TuningError(f"{other.source}: u = 1 is another torque than in {first.source}; not the same allocator")
 
 
 def _certified(gains: Gains, measured: PlantEstimates, spec: TuningSpec) -> Gains:

@@ -106,7 +106,7 @@ def estimate(
         experiment, repeat = align(experiment, repeat)
     chosen = instruments(experiment, spec.instrument, repeat)
     stretches = excited_stretches(experiment, chosen.external, spec.method)
-    base = _base(experiment, spec)
+    base = starting_set(experiment, spec)
     models = spec.models("inner", experiment.Ts)
     inner = [
         _loop(
@@ -214,8 +214,14 @@ def _rate_setpoint(
     return r_i, [], settling, ()
 
 
-def _base(experiment: Experiment, spec: TuningSpec) -> Gains:
-    """Gains with everything that is not tuned: yaw, limits, filter and unit, as specified or as flown."""
+def starting_set(experiment: Experiment, spec: TuningSpec) -> Gains:
+    """Gains with everything that is not tuned: yaw, limits, filter and unit, as specified or as flown.
+
+    Raises
+    ------
+    TuningError
+        When neither the log nor the specification says what the yaw gains or the derivative's filter are.
+    """
     flown = experiment.flown
     required = {
         "which yaw gains flew ([yaw]: Kp_o, Kp_i, Ki_i, Kd_i)": spec.yaw,

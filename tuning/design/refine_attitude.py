@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from mimopilot.tuning.analysis.closed_loop import cascade_loop, doublet_spectrum
+from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import DRAWS, MIN_FREQUENCIES, PlantResponse
@@ -26,14 +26,13 @@ def refine_attitude(
     plant: PlantResponse,
     models: Sequence[ReferenceModel],
     full: bool,
-    doublet_s: float | None = None,
     draw_inner: Callable[[Gains, np.random.Generator], Gains] = lambda gains, generator: gains,
 ) -> tuple[Gains, Signal]:
     """Kp_o that brings the measured closed loop closest to the outer reference model.
 
     A P controller cannot reach the model exactly. VRFT weighs the remaining error by the experiment's spectrum; here
     the same data weigh it by that of setpoints. The weight is |T_o - M_o|^2 / omega, between an impulse's
-    (J_MR, (3.1)) and a step's, or the spectrum of a doublet. Gauss-Newton from the VRFT gains, four numbers at most;
+    (J_MR, (3.1)) and a step's. Gauss-Newton from the VRFT gains, four numbers at most;
     no model is fitted.
 
     Parameters
@@ -46,8 +45,6 @@ def refine_attitude(
         Of the attitude loop.
     full : bool
         False: the diagonal only (SISO).
-    doublet_s : float, s, optional
-        Length of the doublet whose spectrum weighs the error.
     draw_inner : callable, optional
         Replaces the rate gains by others drawn from their error.
 
@@ -72,9 +69,8 @@ def refine_attitude(
     plant = plant.at(use).extended()
     target = np.stack([model.frequency_response(plant.omega) for model in models], axis=1)[:, :, None] * np.eye(2)
     where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
-    spectrum = plant.omega**-0.5 if doublet_s is None else np.abs(doublet_spectrum(plant.omega, doublet_s))
     # An integral over frequency: the measured frequencies are not equally spaced.
-    spectrum = spectrum * np.sqrt(np.gradient(plant.omega))
+    spectrum = np.sqrt(np.gradient(plant.omega) / plant.omega)
     weight = where * spectrum[:, None, None]
 
     def placed(values: Signal, around: Gains = gains) -> Gains:

@@ -48,8 +48,8 @@ SDLOG2 = (
     "convert it to CSV with PX4's sdlog2_dump.py and name its columns with --columns"
 )
 NOTE = (
-    "flown gains are not read: ArduPilot filters the error for D and for yaw, which this controller does not; give "
-    "yaw, limits and derivative_cutoff_hz in a --spec file"
+    "the flown gains are ArduPilot's: it also filters the rate setpoint (FLTT) and the error of yaw (FLTE), which this "
+    "controller does not, and its D acts on the error"
 )
 
 
@@ -230,9 +230,14 @@ def _excitation(log: _DataflashLog) -> Series | None:
     values = np.zeros((len(axis), 2))
     for code, column in MIXER_AXES.items():
         values[axis == code, column] = waveform.values[axis == code, 0]
-    time = np.concatenate([waveform.time, waveform.time[ends] + Ts])
+    # Zero between the runs, and before and after them: a response needs the time in which the last run fades.
+    zeros = waveform.time[ends] + Ts
+    torque = log.series(*LAYOUTS["u"][0])
+    if torque is not None:
+        zeros = np.concatenate([zeros, [min(torque.time[0], waveform.time[0] - Ts), max(torque.time[-1], zeros[-1])]])
+    time = np.concatenate([waveform.time, zeros])
     order = np.argsort(time, kind="stable")
-    values = np.concatenate([values, np.zeros((len(ends), 2))])[order]
+    values = np.concatenate([values, np.zeros((len(zeros), 2))])[order]
     return Series(time[order], values, "SIDD") if values.any() else None
 
 

@@ -14,14 +14,16 @@ STILL_WINDOW = 1.0  # s
 TUMBLE = np.radians(75.0)  # rad of tilt: no multirotor holds altitude beyond it
 BEFORE_TUMBLE = 1.0  # s before a tumble that are not used: control is lost within 0.7 s of a motor failure
 MAX_TUMBLES = 3  # as many tumbles mean degrees taken for radians, or aerobatics
+#: s after the excitation in which the response fades: a chirp that ends with the record looks like its transient.
+FADE = 2.0
 SHORT = 0.1  # s on the ground during the excitation that need no warning
 
 
 def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str, ...]]:
     """The parts of a log that can be used for tuning.
 
-    An injected excitation marks the experiment, from its first to its last nonzero sample; without one it is the
-    whole log. Of the experiment the part in flight is used: as the vehicle logged it, else from the first to the
+    An injected excitation marks the experiment, from its first to its last nonzero sample and until the response has
+    faded; without one it is the whole log. Of the experiment the part in flight is used: as the vehicle logged it, else from the first to the
     last movement. Nothing is used from `BEFORE_TUMBLE` before a tumble on.
 
     Parameters
@@ -162,7 +164,10 @@ def _marked(excitation: Series | None) -> Interval | None:
     if excitation is None:
         return None
     active = np.flatnonzero(excitation.values.any(axis=1))
-    return (float(excitation.time[active[0]]), float(excitation.time[active[-1]])) if len(active) else None
+    if not len(active):
+        return None
+    end = min(excitation.time[active[-1]] + FADE, excitation.time[-1])
+    return float(excitation.time[active[0]]), float(end)
 
 
 def _moving(rates: Series, parts: tuple[Interval, ...]) -> Interval | None:

@@ -1,35 +1,91 @@
-"""The gains that flew, from the vehicle's parameters: this controller's (``MIMO_``), else PX4's (``MC_``)."""
+"""The gains that flew, from the vehicle's parameters.
+
+This controller's (``MIMO_``), else those of PX4 (``MC_``) or ArduPilot (``ATC_``).
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains import Gains, Limits
 from mimopilot.tuning.parameter_row import AXIS_LETTERS, PREFIX, Row, Shape
 from mimopilot.tuning.parameters import ROWS, SCALE
 from mimopilot.tuning.provenance import Provenance
 
-#: Matrix -> PX4's parameter for an axis. PX4 multiplies the rate terms by MC_*RATE_K.
-_PX4 = {
-    "Kp_o": "MC_{axis}_P",
-    "Kp_i": "MC_{axis}RATE_P",
-    "Ki_i": "MC_{axis}RATE_I",
-    "Kd_i": "MC_{axis}RATE_D",
-    "Kff_i": "MC_{axis}RATE_FF",
-}
+
+
+@dataclass(frozen=True)
+class _Stock:
+    """Parameters of an autopilot's own controller.
+
+    Attributes
+    ----------
+    axes : tuple of 3 str
+        Its names of roll, pitch and yaw.
+    gains : mapping
+        Matrix -> parameter of an axis.
+    factor : str
+        Parameter of an axis that multiplies the rate terms; empty: none.
+    limits : mapping
+        Limit -> for each axis its parameter, the factor to our unit, and the value where it is not logged (NaN: not
+        known).
+    cutoffs : mapping
+        Cut-off of a filter -> parameter, Hz.
+    unlimited : mapping
+        Limit -> value where the parameter is 0, which means that there is no limit.
+    """
+
+    axes: tuple[str, str, str]
+    gains: Mapping[str, str]
+    factor: str
+    limits: Mapping[str, list[tuple[str, float, float]]]
+    cutoffs: Mapping[str, str]
+    unlimited: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+
+_DEGREE = math.pi / 180
 _PX4_AXES = ("ROLL", "PITCH", "YAW")
-#: Limit -> PX4's parameter of each axis, its factor to our unit, and its value where it is not logged (NaN: not known).
-_PX4_LIMITS = {
-    "rate_max": [(f"MC_{axis}RATE_MAX", math.pi / 180, math.nan) for axis in _PX4_AXES],
-    "moment_max": [("", 1.0, 1.0)] * 3,
-    "integral_max": [(name, 1.0, math.nan) for name in ("MC_RR_INT_LIM", "MC_PR_INT_LIM", "MC_YR_INT_LIM")],
-}
-#: Cut-off of a filter -> PX4's parameter, Hz.
-_PX4_CUTOFFS = {"derivative_cutoff_hz": "IMU_DGYRO_CUTOFF"}
+_PX4 = _Stock(
+    axes=_PX4_AXES,
+    gains={
+        "Kp_o": "MC_{axis}_P",
+        "Kp_i": "MC_{axis}RATE_P",
+        "Ki_i": "MC_{axis}RATE_I",
+        "Kd_i": "MC_{axis}RATE_D",
+        "Kff_i": "MC_{axis}RATE_FF",
+    },
+    factor="MC_{axis}RATE_K",
+    limits={
+        "rate_max": [(f"MC_{axis}RATE_MAX", _DEGREE, math.nan) for axis in _PX4_AXES],
+        "moment_max": [("", 1.0, 1.0)] * 3,
+        "integral_max": [(name, 1.0, math.nan) for name in ("MC_RR_INT_LIM", "MC_PR_INT_LIM", "MC_YR_INT_LIM")],
+    },
+    cutoffs={"derivative_cutoff_hz": "IMU_DGYRO_CUTOFF"},
+)
+_ARDUPILOT_AXES = ("RLL", "PIT", "YAW")
+_ARDUPILOT = _Stock(
+    axes=_ARDUPILOT_AXES,
+    gains={
+        "Kp_o": "ATC_ANG_{axis}_P",
+        "Kp_i": "ATC_RAT_{axis}_P",
+        "Ki_i": "ATC_RAT_{axis}_I",
+        "Kd_i": "ATC_RAT_{axis}_D",
+        "Kff_i": "ATC_RAT_{axis}_FF",
+    },
+    factor="",
+    limits={
+        "rate_max": [(f"ATC_RATE_{letter}_MAX", _DEGREE, 0.0) for letter in AXIS_LETTERS],
+        "moment_max": [("", 1.0, 1.0)] * 3,
+        "integral_max": [(f"ATC_RAT_{axis}_IMAX", 1.0, math.nan) for axis in _ARDUPILOT_AXES],
+    },
+    cutoffs={"derivative_cutoff_hz": "ATC_RAT_RLL_FLTD"},
+    unlimited={"rate_max": Limits().rate_max},
+)
 #: The period is that of the log.
 _PERIOD = next(row for row in ROWS if row.key == "Ts")
 
@@ -48,7 +104,7 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     -------
     Gains or None
         None when the parameters do not describe a complete controller. Elements without a ``MIMO_`` parameter in
-        the log (yaw, limits) are PX4's.
+        the log (yaw, limits) are the autopilot's own.
     """
     # Vehicles store float32: use the shortest decimal that rounds to the same float32.
     values = {name: float(str(np.float32(value))) for name, value in parameters.items()}
@@ -77,9 +133,10 @@ def _of_the_file(row: Row, element: float, Ts: float) -> float:
 
 
 def _stock(row: Row, code: str, values: Mapping[str, float]) -> float:
-    """What PX4's own controller has for an element; not a number where the log does not tell."""
+    """What the autopilot's own controller has for an element; not a number where the log does not tell."""
+    stock = _ARDUPILOT if "ATC_RAT_RLL_P" in values else _PX4
     if row.shape is Shape.POLE:
-        return values.get(_PX4_CUTOFFS.get(row.key, ""), row.default or 0.0)
+        return values.get(stock.cutoffs.get(row.key, ""), row.default or 0.0)
     if row.shape is Shape.SCALAR:
         return math.nan if row.default is None else row.default
     *_, axes = code.rpartition("_")
@@ -87,8 +144,8 @@ def _stock(row: Row, code: str, values: Mapping[str, float]) -> float:
         return 0.0
     axis = AXIS_LETTERS.index(axes[0])
     if row.shape is Shape.AXES:
-        name, factor, default = _PX4_LIMITS[row.key][axis]
-        return factor * values.get(name, default)
-    name = _PX4_AXES[axis]
-    factor = 1.0 if row.key == "Kp_o" else values.get(f"MC_{name}RATE_K", 1.0)
-    return factor * values.get(_PX4[row.key].format(axis=name), math.nan)
+        name, factor, default = stock.limits[row.key][axis]
+        return factor * values.get(name, default) or stock.unlimited.get(row.key, (0.0, 0.0, 0.0))[axis]
+    name = stock.axes[axis]
+    factor = 1.0 if row.key == "Kp_o" else values.get(stock.factor.format(axis=name), 1.0)
+    return factor * values.get(stock.gains[row.key].format(axis=name), math.nan)

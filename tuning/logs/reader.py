@@ -143,4 +143,4 @@ def _motors(recording: Recording, parts: tuple[Interval, ...], warnings: list[st
     motors = fit_motors(u, given)
     injected = recording.signals.get("u_bar")
     warnings += saturation_warnings(u, given, motors, float(np.abs(injected.values).max()) if injected else 0.0)
-    return motors if recording.linear_thrust else None
+    return motors

@@ -76,8 +76,6 @@ class Recording:
         Remarks for `mimopilot inspect`.
     commands : Series or None
         Motor commands, 0 to 1, one column per motor. None: not logged.
-    linear_thrust : bool
-        Whether the commands are proportional to thrust.
     published : mapping
         Name -> original time stamps (N,), s, of a signal whose stamps in `signals` are those of the control cycle.
     span : tuple (begin, end) or None, s
@@ -100,7 +98,6 @@ class Recording:
     warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
     commands: Series | None = None
-    linear_thrust: bool = True
     published: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     span: Interval | None = None
     columns: Columns | None = None

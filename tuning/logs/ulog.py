@@ -32,8 +32,6 @@ EXCITATION_TOPIC, EXCITATION_NAME = "debug_vect", "MIMO_EXC"
 THRUSTS = (("vehicle_thrust_setpoint", "xyz[2]", -1.0), ("actuator_controls_0", "control[3]", 1.0))
 MIN_THRUST = 0.1  # normalised; above it the vehicle counts as flying when no land detector was logged
 MOTORS_TOPIC, MOTORS = "actuator_motors", tuple(f"control[{i}]" for i in range(12))
-#: PX4's thrust model factor. 0: PX4 does not compensate the thrust curve, commands are proportional to rotor speed.
-THRUST_CURVE = "THR_MDL_FAC"
 #: (topic, field, value when armed).
 ARMED = (("actuator_armed", "armed", 1), ("vehicle_status", "arming_state", 2))
 
@@ -79,7 +77,6 @@ def record_ulog(path: Path) -> Recording:
     airborne, evidence = _airborne(log)
     now = file.parameters | {name: value for _, name, value in file.changes}
     vehicle = px4_vehicle(log.fields("vehicle_status"), now)
-    curves = [file.parameters.get(THRUST_CURVE), *(value for _, name, value in file.changes if name == THRUST_CURVE)]
     wanted = {
         signal: " or ".join(f"{topic} ({', '.join(fields)})" for topic, fields in layouts)
         for signal, layouts in LAYOUTS.items()
@@ -98,7 +95,6 @@ def record_ulog(path: Path) -> Recording:
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((file.damage,) if file.damage else ()), *vehicle.warnings),
         commands=_commands(log),
-        linear_thrust=0 not in curves,
         published=published,
         span=_span(file),
     )

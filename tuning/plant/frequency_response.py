@@ -193,7 +193,8 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
         When the flight is too short, or w does not excite both axes.
     """
     signals = np.hstack([experiment.u, experiment.y_i, experiment.y_o])
-    upper = min(upper, 0.95 * np.pi / experiment.Ts, _reach(experiment, instrument))
+    # The last window ends where the excitation does.
+    upper = min(upper, 0.95 * np.pi / experiment.Ts, _reach(experiment, instrument) / (1 + GROWTH))
     found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper, GROWTH)
     T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
     if np.any(np.linalg.matrix_rank(T_u) < 2):
@@ -208,8 +209,8 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
         omega=found.omega,
         G_i=T_i @ inverse,
         G_o=T_o @ inverse,
-        root=_root(found.noise),
-        reach=_root(found.error).transpose(0, 2, 1) @ inverse,
+        root=hermitian_root(found.noise),
+        reach=hermitian_root(found.error).transpose(0, 2, 1) @ inverse,
         coherence=found.explained[:, 2:4],
         Ts=experiment.Ts,
     )
@@ -294,7 +295,7 @@ def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
     return replace(plant, G_o=G_o, root=root)
 
 
-def _root(matrices: Complex) -> Complex:
+def hermitian_root(matrices: Complex) -> Complex:
     """R with R R^H = each of the positive semidefinite `matrices`."""
     values, vectors = np.linalg.eigh(matrices)
     root: Complex = vectors * np.sqrt(np.maximum(values, 0))[:, None, :]

@@ -19,6 +19,9 @@ from mimopilot.tuning.errors import TuningError
 ORDER = 2  # of the local polynomials
 FREEDOM = 8  # least degrees of freedom of the noise estimate in a window
 CENTRES = 1000  # largest number of frequencies
+#: Share of a signal's power that a wide window may leave unexplained, whatever narrow ones leave: a narrow window hardly
+#: tells a chirp near an end of the record from the record's transient.
+NEGLIGIBLE = 3e-3
 #: A window is too wide if its noise exceeds that of narrow windows by this many standard deviations of the ratio.
 HIDDEN = 4.0
 
@@ -154,7 +157,8 @@ def _is_too_wide(wide: _Fit, parts: Sequence[_Fit]) -> bool:
     freedom = sum(part.freedom for part in parts)
     narrow = sum(part.freedom * np.real(np.diag(part.noise)) for part in parts) / freedom
     ratio = np.real(np.diag(wide.noise)) / np.maximum(narrow, 1e-300)
-    return bool(np.max(ratio) > 1 + HIDDEN * np.sqrt(1 / wide.freedom + 1 / freedom))
+    matters = 1 - wide.explained > NEGLIGIBLE
+    return bool(np.max(ratio[matters], initial=0.0) > 1 + HIDDEN * np.sqrt(1 / wide.freedom + 1 / freedom))
 
 
 class _Spectrum:

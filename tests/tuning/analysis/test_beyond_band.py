@@ -118,8 +118,8 @@ def test_a_gain_counts_if_one_axis_is_coherent_or_its_error_is_small():
     for coherence in ((0.8, 0.0), (0.0, 0.8)):
         found = find_structural_mode(plain(), with_peak(150.0, 0.6, 0.4, coherence))
         assert found == pytest.approx((150.0, 1.4))
-    # 2 * 0.14 is less than half of 0.6, but more than the 30 % below which a response is known.
-    assert find_structural_mode(plain(), with_peak(150.0, 0.6, 0.14)) == pytest.approx((150.0, 0.88))
+    # 2 * 0.11 is less than 0.4 of 0.6, but more than the 30 % below which a response is known.
+    assert find_structural_mode(plain(), with_peak(150.0, 0.6, 0.11)) == pytest.approx((150.0, 0.82))
     assert find_structural_mode(plain(), with_peak(150.0, 0.6, 0.16)) is None
 
 

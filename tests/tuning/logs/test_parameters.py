@@ -51,16 +51,6 @@ def test_changes_afterwards_to_the_same_value_or_outside_the_loop_give_no_warnin
     assert log.warnings == ()
 
 
-def test_a_thrust_curve_set_later_decides_whether_commands_are_thrust(tmp_path, flight):
-    motors = {"timestamp": microseconds(flight.t), "timestamp_sample": microseconds(flight.t)}
-    motors["control"] = np.full((len(flight.t), 4), 0.5, np.float32)
-    topics = px4_topics(flight, actuator_motors=motors)
-    path = write_ulog(tmp_path / "x.ulg", topics, {"THR_MDL_FAC": 0.3})
-    assert open_log(path).linear_thrust
-    path = write_ulog(tmp_path / "x.ulg", topics, {"THR_MDL_FAC": 0.3}, [(11.0, "THR_MDL_FAC", 0.0)])
-    assert not open_log(path).linear_thrust
-
-
 def test_repeated_parm_messages_are_changes(tmp_path, flight):
     names = [b"ATC_RAT_YAW_P", b"LOG_BITMASK", b"ATC_RAT_YAW_P", b"STAT_RUNTIME", b"STAT_RUNTIME"]
     times, values = microseconds([9, 9, 15, 9, 16]), [0.2, 1, 0.4, 5, 35]

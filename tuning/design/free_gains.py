@@ -1,0 +1,85 @@
+"""The gains that a design may change, as a vector of numbers of about the size 1."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import ATTITUDE, TERMS
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody
+
+#: Typical bandwidths of the attitude and of the rate loop, rad/s, and ratios Ki over Kp (1/s) and Kd over Kp (s) of
+#: multirotors of 0.3 to 5 kg: the units of the search.
+ATTITUDE_BANDWIDTH, RATE_BANDWIDTH, INTEGRAL, DERIVATIVE = 5.0, 20.0, 2.0, 0.02
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FreeGains:
+    """Elements of the gain matrices that may change.
+
+    Attributes
+    ----------
+    base : Gains
+        Everything else. Matrices that are neither free nor in the structure are zero.
+    units : mapping
+        Name of a free matrix -> size of 1 in the vector, in the order of the vector.
+    where : (2, 2) bool array
+        Elements that may change: all, or the diagonal (SISO).
+    """
+
+    base: Gains
+    units: Mapping[str, float]
+    where: NDArray[np.bool_]
+
+    @property
+    def size(self) -> Signal:
+        """Size of 1 of every element of the vector, (n,)."""
+        return np.repeat(list(self.units.values()), int(self.where.sum()))
+
+    def places(self) -> Iterator[tuple[str, int, int]]:
+        """Matrix, row and column of every element."""
+        for name in self.units:
+            for row, column in np.argwhere(self.where):
+                yield name, int(row), int(column)
+
+    def vector(self, gains: Gains) -> Signal:
+        """The free elements of a set."""
+        return np.concatenate([getattr(gains, name)[self.where] / unit for name, unit in self.units.items()])
+
+    def gains(self, vector: Signal) -> Gains:
+        """The set with these free elements."""
+        parts = dict.fromkeys(self.units, np.zeros((2, 2)))
+        for name, values in zip(self.units, np.split(vector * self.size, len(self.units)), strict=True):
+            matrix = np.zeros((2, 2))
+            matrix[self.where] = values
+            parts[name] = matrix
+        return replace(self.base, certificate=None, **parts)  # type: ignore[arg-type]
+
+
+def free_gains(base: Gains, body: RigidBody, structure: str, full: bool) -> FreeGains:
+    """The attitude gain and the terms of a structure.
+
+    Parameters
+    ----------
+    base : Gains
+        Filters, limits and yaw.
+    body : RigidBody
+        Its control effectiveness gives the units.
+    structure : str
+        Letters of `tuning.law.TERMS`.
+    full : bool
+        False: the diagonals only.
+    """
+    proportional = RATE_BANDWIDTH / float(np.abs(body.B).max())
+    ratio = {"P": 1.0, "I": INTEGRAL, "D": DERIVATIVE, "F": 1.0}
+    units = {ATTITUDE.matrix: ATTITUDE_BANDWIDTH}
+    units |= {TERMS[letter].matrix: proportional * ratio[letter] for letter in structure}
+    zero = {term.matrix: np.zeros((2, 2)) for letter, term in TERMS.items() if letter not in structure}
+    where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
+    return FreeGains(replace(base, certificate=None, **zero), units, where)  # type: ignore[arg-type]

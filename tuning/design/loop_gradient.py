@@ -1,0 +1,215 @@
+"""The closed loop around a plant and its exact derivatives with respect to the gains.
+
+u = C_ref r_o - C_o y_o - C_y y_i. Each gain adds products of a column and a row to the controller: dL = alpha beta',
+dC_ref = alpha gamma', so all derivatives are products of a column and a row, too:
+
+    S = (I + L)^-1,  L = C_y G_i + C_o G_o        dS = -(S alpha) (beta' S)
+    U = S C_ref,     T = G_o U                    dU = (S alpha) (gamma' - beta' U)
+    u_n = S (C_y N_i + C_o N_o)                   du_n = (S alpha) (xi' - beta' u_n)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mimopilot.tuning.design.free_gains import FreeGains
+from mimopilot.tuning.law import ATTITUDE, TERMS, rate_response
+from mimopilot.tuning.plant.wide_response import WideResponse
+
+Complex = NDArray[np.complex128]
+Signal = NDArray[np.float64]
+
+#: Matrix -> letter of its term.
+LETTERS = {term.matrix: letter for letter, term in TERMS.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class ProductGradient:
+    """Derivatives of a matrix with respect to n gains, each a column times a row: left (K, n, i), right (K, n, j)."""
+
+    left: Complex
+    right: Complex
+
+    def times(self, matrix: Complex) -> ProductGradient:
+        """Derivative of the matrix (K, j, m) multiplied from the right by a constant one."""
+        return ProductGradient(self.left, self.right @ matrix)
+
+    def after(self, matrix: Complex) -> ProductGradient:
+        """Derivative of the matrix multiplied from the left by a constant one (K, m, i)."""
+        return ProductGradient(self.left @ matrix.transpose(0, 2, 1), self.right)
+
+    def whole(self) -> Complex:
+        """All derivatives, (n, K, i, j)."""
+        product: Complex = (self.left[:, :, :, None] * self.right[:, :, None, :]).transpose(1, 0, 2, 3)
+        return product
+
+
+@dataclass(frozen=True, eq=False)
+class LoopGradient:
+    """The closed loop of a gain vector and its derivatives with respect to the vector's elements.
+
+    Attributes
+    ----------
+    plant : WideResponse
+    free : FreeGains
+    vector : (n,) array
+    """
+
+    plant: WideResponse
+    free: FreeGains
+    vector: Signal
+
+    @cached_property
+    def matrices(self) -> Mapping[str, Signal]:
+        """Name -> free matrix."""
+        gains = self.free.gains(self.vector)
+        return {name: getattr(gains, name) for name in self.free.units}
+
+    @cached_property
+    def _shapes(self) -> Mapping[str, tuple[Complex, Complex]]:
+        """Rate controller's matrix -> responses (K, 1, 1) from the rate setpoint and from the measured rate to u."""
+        one = np.ones((1, 1))
+        return {
+            name: rate_response({LETTERS[name]: one}, self.free.base.filters, self.plant.omega)
+            for name in self.free.units
+            if name in LETTERS
+        }
+
+    @cached_property
+    def C_r(self) -> Complex:  # noqa: N802
+        """From the rate setpoint to u, (K, 2, 2)."""
+        return np.asarray(sum(of_r * self.matrices[name] for name, (of_r, _) in self._shapes.items()), complex)
+
+    @cached_property
+    def C_y(self) -> Complex:  # noqa: N802
+        """From the measured rates to -u, (K, 2, 2)."""
+        return np.asarray(sum(of_y * self.matrices[name] for name, (_, of_y) in self._shapes.items()), complex)
+
+    @cached_property
+    def C_o(self) -> Complex:  # noqa: N802
+        """From the measured angles to -u, (K, 2, 2)."""
+        return self.C_r @ self.matrices[ATTITUDE.matrix]
+
+    @cached_property
+    def L_i(self) -> Complex:  # noqa: N802
+        """The rate loop cut at u, (K, 2, 2)."""
+        return self.C_y @ self.plant.G_i
+
+    @cached_property
+    def L_u(self) -> Complex:  # noqa: N802
+        """The whole loop cut at u, (K, 2, 2)."""
+        return self.L_i + self.C_o @ self.plant.G_o
+
+    @cached_property
+    def S(self) -> Complex:  # noqa: N802
+        """Sensitivity at u, (K, 2, 2)."""
+        return np.linalg.inv(np.eye(2) + self.L_u).astype(np.complex128)
+
+    @cached_property
+    def U(self) -> Complex:  # noqa: N802
+        """From the attitude setpoint to u, (K, 2, 2)."""
+        return self.S @ self.C_o
+
+    @cached_property
+    def T(self) -> Complex:  # noqa: N802
+        """From the attitude setpoint to the attitude, (K, 2, 2)."""
+        return self.plant.G_o @ self.U
+
+    @cached_property
+    def D(self) -> Complex:  # noqa: N802
+        """From a torque disturbance to the attitude, (K, 2, 2)."""
+        return self.plant.G_o @ self.S
+
+    @cached_property
+    def noise(self) -> Complex:
+        """Square root of the spectrum of u that noise causes, (K, 2, 4)."""
+        N = self.plant.noise
+        return self.S @ (self.C_y @ N[:, :2] + self.C_o @ N[:, 2:])
+
+    @cached_property
+    def noise_rms(self) -> Signal:
+        """RMS of u at hover (normalised) that noise causes, (2,)."""
+        rms: Signal = np.sqrt(self.plant.noise_weight @ np.sum(np.abs(self.noise) ** 2, axis=2))
+        return rms
+
+    def loop_error(self, whole: bool) -> Signal:
+        """RMS of the norm of the error of L_u, or of L_i, (K,): two standard deviations of an element."""
+        error = self.C_y @ self.plant.error_i
+        if whole:
+            error = error + self.C_o @ self.plant.error_o
+        size: Signal = np.linalg.norm(error, axis=(1, 2)) * np.linalg.norm(self.plant.reach, axis=(1, 2))
+        return size
+
+    @cached_property
+    def _rows(self) -> Mapping[str, Complex]:
+        """alpha, beta, gamma, xi of the module's equations and beta of the rate loop alone, (K, n, ...) each."""
+        count, eye, N = len(self.plant.omega), np.eye(2), self.plant.noise
+        Kp_o = self.matrices[ATTITUDE.matrix]
+        angle, noise_o = Kp_o @ self.plant.G_o, Kp_o @ N[:, 2:]
+        parts: dict[str, list[Complex]] = {name: [] for name in ("alpha", "beta", "gamma", "xi", "beta_i")}
+
+        def add(**rows: NDArray[np.generic]) -> None:
+            for name, row in rows.items():
+                parts[name].append(np.broadcast_to(row, (count, row.shape[-1])))
+
+        for name, row, column in self.free.places():
+            if name == ATTITUDE.matrix:
+                add(
+                    alpha=self.C_r[:, :, row],
+                    beta=self.plant.G_o[:, column],
+                    gamma=eye[column],
+                    xi=N[:, 2 + column],
+                    beta_i=np.zeros(2),
+                )
+                continue
+            of_r, of_y = (shape[:, 0] for shape in self._shapes[name])
+            add(
+                alpha=eye[row],
+                beta=of_y * self.plant.G_i[:, column] + of_r * angle[:, column],
+                gamma=of_r * Kp_o[column],
+                xi=of_y * N[:, column] + of_r * noise_o[:, column],
+                beta_i=of_y * self.plant.G_i[:, column],
+            )
+        size = self.free.size[None, :, None]
+        found = {name: np.stack(rows, axis=1).astype(np.complex128) for name, rows in parts.items()}
+        found["alpha"] = found["alpha"] * size
+        return found
+
+    @cached_property
+    def _left(self) -> Complex:
+        return self._rows["alpha"] @ self.S.transpose(0, 2, 1)
+
+    @property
+    def dL_u(self) -> ProductGradient:  # noqa: N802
+        """Derivative of `L_u`."""
+        return ProductGradient(self._rows["alpha"], self._rows["beta"])
+
+    @property
+    def dL_i(self) -> ProductGradient:  # noqa: N802
+        """Derivative of `L_i`."""
+        return ProductGradient(self._rows["alpha"], self._rows["beta_i"])
+
+    @cached_property
+    def dU(self) -> ProductGradient:  # noqa: N802
+        """Derivative of `U`."""
+        return ProductGradient(self._left, self._rows["gamma"] - self._rows["beta"] @ self.U)
+
+    @cached_property
+    def dT(self) -> ProductGradient:  # noqa: N802
+        """Derivative of `T`."""
+        return self.dU.after(self.plant.G_o)
+
+    @cached_property
+    def dD(self) -> ProductGradient:  # noqa: N802
+        """Derivative of `D`."""
+        return ProductGradient(self._left, -self._rows["beta"] @ self.S).after(self.plant.G_o)
+
+    @cached_property
+    def dnoise(self) -> ProductGradient:
+        """Derivative of `noise`."""
+        return ProductGradient(self._left, self._rows["xi"] - self._rows["beta"] @ self.noise)

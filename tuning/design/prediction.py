@@ -1,0 +1,106 @@
+"""What a gain set will do on the vehicle of a log: the figures that sets are compared by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mimopilot.tuning.analysis.closed_loop import singular_values
+from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, PERIODS, Manoeuvres
+from mimopilot.tuning.design.free_gains import free_gains
+from mimopilot.tuning.design.loop_gradient import LoopGradient
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import TERMS
+from mimopilot.tuning.plant.wide_response import WideResponse
+
+#: Time after a doublet that its RMS counts, s.
+TAIL = 1.0
+#: Off-axis RMS of a 10 degree doublet below which sets count as equally decoupled, deg: no pilot sees it.
+DECOUPLED = 0.1
+
+#: Share of a limit within which a design keeps it.
+ROUNDING = 0.01
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Figures of a gain set, predicted from the measured response. Pairs are for roll and pitch.
+
+    Attributes
+    ----------
+    follow_deg, offaxis_deg : tuple of 2 float, deg
+        RMS over the doublets of 10 degrees and 1 s after: error to the attitude model; angle of the other axis.
+    disturbance_deg : tuple of 2 float, deg
+        RMS of the angles over 1 s after a step of torque that accelerates by 1.5 rad/s^2.
+    noise : tuple of 2 float
+        RMS of the torque (normalised) at hover that the log's noise causes.
+    Ms : float
+        Largest singular value of the sensitivity, cut at the torques.
+    """
+
+    follow_deg: Pair
+    offaxis_deg: Pair
+    disturbance_deg: Pair
+    noise: Pair
+    Ms: float
+
+
+def predict(gains: Gains, plant: WideResponse, task: Manoeuvres) -> Prediction:
+    """Figures of a gain set around a plant.
+
+    Parameters
+    ----------
+    gains : Gains
+    plant : WideResponse
+    task : Manoeuvres
+        On the plant's frequencies.
+    """
+    free = free_gains(gains, plant.body, "".join(TERMS), full=True)
+    loop = LoopGradient(plant, free, free.vector(gains))
+    follow = [_rms(np.abs(loop.T[:, i, i] - task.target) ** 2, task) for i in range(2)]
+    offaxis = [_rms(np.abs(loop.T[:, 1 - i, i]) ** 2, task) for i in range(2)]
+    disturbance = np.degrees(np.sqrt(np.einsum("ki,kji->i", task.step, np.abs(loop.D) ** 2) / TAIL))
+    inside = slice(0, plant.band.stop)
+    return Prediction(
+        follow_deg=(follow[0], follow[1]),
+        offaxis_deg=(offaxis[0], offaxis[1]),
+        disturbance_deg=(float(disturbance[0]), float(disturbance[1])),
+        noise=(float(loop.noise_rms[0]), float(loop.noise_rms[1])),
+        Ms=float(1 / singular_values(np.eye(2) + loop.L_u[inside])[1].min()),
+    )
+
+
+def _rms(power: np.ndarray, task: Manoeuvres) -> float:  # type: ignore[type-arg]
+    """RMS over all doublets, deg, of a response whose squared size is `power`."""
+    energy = task.doublets @ power
+    return float(np.degrees(AMPLITUDE) * np.sqrt(np.mean(energy / (np.array(PERIODS) + TAIL))))
+
+
+def reasons_to_keep(new: Sequence[Prediction], flown: Sequence[Prediction], Ms: float, noise: float) -> list[str]:
+    """Why a set is not better than the flown one on the same logs; empty: it is better.
+
+    Parameters
+    ----------
+    new, flown : sequence of Prediction
+        One for each log.
+    Ms, noise : float
+        Limits of the peak of the sensitivity, and of the torque's noise over the flown one's.
+    """
+    reasons = []
+    for ours, theirs in zip(new, flown, strict=True):
+        follow, before = np.hypot(*ours.follow_deg), np.hypot(*theirs.follow_deg)
+        if follow >= before:
+            reasons.append(f"it follows its attitude model no better ({follow:.2f} degrees, flown {before:.2f})")
+        offaxis, before = np.hypot(*ours.offaxis_deg), np.hypot(*theirs.offaxis_deg)
+        if offaxis > max(before, DECOUPLED):
+            reasons.append(f"it moves the other axis more ({offaxis:.2f} degrees, flown {before:.2f})")
+        if ours.Ms > max(Ms, theirs.Ms) * (1 + ROUNDING):
+            reasons.append(f"its margin is thinner (Ms {ours.Ms:.2f}, flown {theirs.Ms:.2f})")
+        ratio = max(a / b for a, b in zip(ours.noise, theirs.noise, strict=True))
+        if ratio > noise * (1 + ROUNDING):
+            reasons.append(f"it drives the motors with {ratio:.2f} times the noise of the flown gains")
+    return list(dict.fromkeys(reasons))

@@ -1,0 +1,310 @@
+"""The design on the measured response: gains of fixed structure with stability and margins inside.
+
+The cost is how well the attitude follows a second-order model over a family of doublets, how little the other axis
+moves, and how little a step of torque does. The constraints are the certificate's, robust to the error of the
+response, and the noise of the torque. The bandwidth of the model is found: a slower one gives away stiffness, a faster
+one cannot be followed within the constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mimopilot.tuning.analysis.beyond_band import MAX_SENSITIVITY_BELOW_BAND, exceeded_frequencies
+from mimopilot.tuning.analysis.manoeuvres import doublet_torque, manoeuvres
+from mimopilot.tuning.design.constraints import (
+    SHARE,
+    Constraint,
+    Cut,
+    Definite,
+    Distance,
+    MotorLimit,
+    NoiseLimit,
+    gain_above_band,
+    structural_modes,
+)
+from mimopilot.tuning.design.descent import INFEASIBLE, DesignTask, PlantTask, descend
+from mimopilot.tuning.design.free_gains import FreeGains, free_gains
+from mimopilot.tuning.design.prediction import predict
+from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import ATTITUDE, TERMS
+from mimopilot.tuning.motors import Motors
+from mimopilot.tuning.plant.noise_spectrum import flown_torque_noise
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
+from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
+from mimopilot.tuning.reference_model import SecondOrder
+from mimopilot.tuning.spec import DesignLimits
+
+#: Bandwidths of the attitude model, rad/s: ten a factor of 3.16 (ISO 3, R20), from a heavy lifter to a small racer. No
+#: position controller or pilot uses a faster attitude.
+BANDWIDTHS = (2.8, 3.2, 3.6, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.2, 12.5, 14.0, 16.0, 18.0, 20.0, 22.4, 25.0)
+#: Where the search begins, rad/s, and its first step along the table.
+FIRST_BANDWIDTH, FIRST_STRIDE = 10.0, 2
+#: Damping of the attitude model: 5 % overshoot, the usual choice.
+DAMPING = 0.7
+#: A descent during the search ends with a step that lowers the merit by less than this share, the last one sooner than
+#: that.
+ROUGHLY, EXACTLY = 2e-2, 1e-4
+#: Least integral action over the proportional one at the start, 1/s: an offset decays within about ten seconds.
+MIN_INTEGRAL_RATIO = 0.1
+#: Range of the manoeuvres' size, rad (5 to 30 degrees): what moved in the flight, within a normal flight's attitudes.
+AMPLITUDES = (np.radians(5.0), np.radians(30.0))
+#: Share of the samples with a smaller angle than the flown amplitude.
+NEARLY_ALL = 0.999
+#: Motors of a log that does not hold their commands: a quadrotor, X, that hovers at half thrust.
+USUAL_MOTORS = Motors(np.array([[-0.5, 0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, -0.5]]), np.full(4, 0.5))
+#: Share of a motor's range that the doublets may use.
+RANGE = 0.95
+#: Plants drawn from the error of the response for the standard deviations.
+DRAWS = 12
+#: Factor on the limit of Ms after gains without a certificate.
+TIGHTER = 0.95
+#: Factors on the rate gains of a starting point.
+SCALES = (1.0, 0.7, 0.5, 0.35, 0.25)
+#: A constraint whose margin is below this is active.
+ACTIVE = 0.02
+#: Share of the cost that a bound must cost to be worth a warning.
+COSTS = 0.05
+#: The bandwidth is the largest with a cost below the first, or below the least times the second: 7 % of RMS error.
+GOOD, NEARLY_BEST = 0.005, 1.05
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Gains designed on the response of one or more flights.
+
+    Attributes
+    ----------
+    gains : Gains
+        Without a certificate.
+    model : SecondOrder
+        The attitude model that they follow.
+    cost : float
+        Mean relative energy of the errors.
+    violation : float
+        Sum of the relative violations of the constraints, 0 if all hold.
+    active : list of str
+        What limits the design, the tightest first.
+    deviations : mapping
+        Matrix -> (2, 2) standard deviations in its unit: the spread to expect if the flight were repeated.
+    vehicle_damps : bool
+        Whether a negative derivative gain would follow better.
+    """
+
+    gains: Gains
+    model: SecondOrder
+    cost: float
+    violation: float
+    active: list[str]
+    deviations: dict[str, Signal]
+    vehicle_damps: bool
+
+    @property
+    def feasible(self) -> bool:
+        """Whether all constraints hold."""
+        return self.violation < INFEASIBLE
+
+
+@dataclass(frozen=True, eq=False)
+class ResponseDesign:
+    """Designs on the logs of one vehicle.
+
+    Attributes
+    ----------
+    plants : sequence of WideResponse
+        One for each log.
+    experiments : sequence of Experiment
+    limits : DesignLimits
+    noise : sequence of (2,) array
+        RMS of the torque at hover under the flown gains, for each log.
+    limited : sequence of (K,) bool array
+        Frequencies of each measured response at which the rate loop's gain is limited, whatever the fitted body says.
+    """
+
+    plants: Sequence[WideResponse]
+    experiments: Sequence[Experiment]
+    limits: DesignLimits
+    noise: Sequence[Signal]
+    limited: Sequence[NDArray[np.bool_]]
+
+    @classmethod
+    def of(cls, measured: Sequence[PlantEstimates], limits: DesignLimits) -> ResponseDesign:
+        """Designs on the responses measured in one or more flights.
+
+        Raises
+        ------
+        TuningError
+            When a response is known at too few frequencies.
+        """
+        plants = [wide_response(one) for one in measured]
+        experiments = [one.experiment for one in measured]
+        noise = [flown_noise(one, plant) for one, plant in zip(experiments, plants, strict=True)]
+        return cls(plants, experiments, limits, noise, [np.zeros(len(one.response.omega), bool) for one in plants])
+
+    def tighter(self, gains: Gains) -> ResponseDesign:
+        """The design after gains that lacked a certificate.
+
+        The rate loop is limited where its gain may have exceeded the certificate's limit; if it did so nowhere, the
+        limit of Ms is lower.
+        """
+        exceeded = [exceeded_frequencies(gains, plant.response) for plant in self.plants]
+        if any(which.any() for which in exceeded):
+            return replace(self, limited=[a | b for a, b in zip(self.limited, exceeded, strict=True)])
+        return replace(self, limits=self.limits.model_copy(update={"Ms": TIGHTER * self.limits.Ms}))
+
+    def design(self, starts: Sequence[Gains], structure: str, full: bool, bandwidth: float | None = None) -> Design:
+        """The best gains for the best bandwidth.
+
+        Parameters
+        ----------
+        starts : sequence of Gains
+            Where the search begins; the first gives filters, limits and yaw.
+        structure : str
+            Letters of `tuning.law.TERMS`.
+        full : bool
+            False: the diagonals only (SISO).
+        bandwidth : float, rad/s, optional
+            Of the attitude model; by default it is found.
+        """
+        free = free_gains(starts[0], self.plants[0].body, structure, full)
+        task = self._task(free, starts, FIRST_BANDWIDTH if bandwidth is None else bandwidth)
+        ends = [descend(task, _scaled(task, start), ROUGHLY) for start in starts]
+        vector = min(ends, key=task.merit)
+        if bandwidth is None:
+            bandwidth, task, vector = self._best_bandwidth(task, vector)
+        vector = descend(task, vector, EXACTLY)
+        return Design(
+            gains=free.gains(vector),
+            model=SecondOrder(bandwidth, DAMPING),
+            cost=task.cost(vector),
+            violation=task.violation(vector),
+            active=task.active(vector, ACTIVE),
+            deviations=_deviations(task, vector),
+            vehicle_damps=_vehicle_damps(task, vector),
+        )
+
+    def _best_bandwidth(self, task: DesignTask, vector: Signal) -> tuple[float, DesignTask, Signal]:
+        """The largest bandwidth of nearly the least merit: along the table from the first one."""
+        first = BANDWIDTHS.index(FIRST_BANDWIDTH)
+        found = {first: (task.merit(vector), task, vector)}
+
+        def merit(place: int) -> float:
+            if not 0 <= place < len(BANDWIDTHS):
+                return np.inf
+            if place not in found:
+                nearest = min(found, key=lambda known: abs(known - place))
+                moved = _with_bandwidth(task, BANDWIDTHS[place])
+                end = descend(moved, found[nearest][2], ROUGHLY)
+                found[place] = moved.merit(end), moved, end
+            return found[place][0]
+
+        best, stride = first, FIRST_STRIDE
+        while stride:
+            better = min((best, best + stride, best - stride), key=merit)
+            best, stride = better, stride if better != best else stride // 2
+        enough = max(GOOD, NEARLY_BEST * merit(best))
+        while merit(best + 1) <= enough:
+            best += 1
+        return BANDWIDTHS[best], *found[best][1:]
+
+    def _task(self, free: FreeGains, starts: Sequence[Gains], bandwidth: float) -> DesignTask:
+        """Cost and constraints around every plant."""
+        model = SecondOrder(bandwidth, DAMPING).discretise(free.base.Ts)
+        return DesignTask(
+            free,
+            [
+                PlantTask(plant, manoeuvres(plant, model), self._constraints(free, starts, place))
+                for place, plant in enumerate(self.plants)
+            ],
+        )
+
+    def _constraints(self, free: FreeGains, starts: Sequence[Gains], place: int) -> list[Constraint]:
+        """The constraints around one of the plants."""
+        plant, experiment, noise = self.plants[place], self.experiments[place], self.noise[place]
+        B, floor = plant.body.B, 1 / self.limits.Ms
+        proportional = max(float(plant.body.least(start.Kp_i)) for start in starts)
+        found: list[Constraint] = [
+            *(Distance(cut, slice(0, plant.band.stop), floor) for cut in Cut),
+            Distance(Cut.TORQUE, slice(plant.band.start, plant.band.start + 1), 1 / (SHARE * MAX_SENSITIVITY_BELOW_BAND)),
+            NoiseLimit(self.limits.noise * noise),
+            gain_above_band(plant),
+            structural_modes(plant, self.limited[place]),
+            Definite(ATTITUDE.matrix, np.eye(2), 0.0),
+        ]
+        if TERMS["I"].matrix in free.units:
+            found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
+        if TERMS["D"].matrix in free.units:
+            found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(2))]
+        motors = experiment.motors or USUAL_MOTORS
+        room = RANGE * np.column_stack([motors.hover, 1 - motors.hover])
+        found.append(MotorLimit(doublet_torque(plant, flown_amplitude(experiment)), motors.mixer, room))
+        return found
+
+
+def flown_noise(experiment: Experiment, plant: WideResponse) -> Signal:
+    """RMS of the torque at hover (normalised) under the flown gains, (2,); as recorded where they are not known."""
+    if experiment.flown is None:
+        return flown_torque_noise(experiment, plant.response, plant.omega)
+    model = SecondOrder(FIRST_BANDWIDTH, DAMPING).discretise(plant.Ts)
+    flown = replace(experiment.flown, filters=replace(experiment.flown.filters, Ts=plant.Ts))
+    return np.array(predict(flown, plant, manoeuvres(plant, model)).noise)
+
+
+def flown_amplitude(experiment: Experiment) -> float:
+    """Size of the flown manoeuvres, rad: of the angles and of their setpoints, within `AMPLITUDES`."""
+    sizes = []
+    for signal in (experiment.y_o, experiment.r_o):
+        if signal is not None:
+            used = np.vstack([signal[start:stop] for start, stop in experiment.segments])
+            sizes.append(float(np.quantile(np.abs(used - np.median(used, axis=0)), NEARLY_ALL, axis=0).max()))
+    return float(np.clip(max(sizes), *AMPLITUDES))
+
+
+def _scaled(task: DesignTask, start: Gains) -> Signal:
+    """A starting point with its rate gains scaled to the least merit: the search begins near its constraints."""
+    rate = [TERMS[letter].matrix for letter in TERMS]
+    scaled = [
+        task.free.vector(replace(start, **{name: factor * getattr(start, name) for name in rate}))  # type: ignore[arg-type]
+        for factor in SCALES
+    ]
+    return min(scaled, key=task.merit)
+
+
+def _with_bandwidth(task: DesignTask, bandwidth: float) -> DesignTask:
+    """The task for another attitude model."""
+    model = SecondOrder(bandwidth, DAMPING).discretise(task.free.base.Ts)
+    plants = [replace(one, manoeuvres=replace(one.manoeuvres, model=model)) for one in task.plants]
+    return replace(task, plants=plants)
+
+
+def _vehicle_damps(task: DesignTask, vector: Signal) -> bool:
+    """Whether the bound on the derivative gain is active and costs following."""
+    name = Definite(TERMS["D"].matrix, np.eye(2), 0.0).name
+    if name not in task.active(vector, ACTIVE):
+        return False
+    plants = [
+        replace(one, constraints=[limit for limit in one.constraints if limit.name != name]) for one in task.plants
+    ]
+    free = replace(task, plants=plants)
+    return free.merit(descend(free, vector, ROUGHLY)) < (1 - COSTS) * task.merit(vector)
+
+
+def _deviations(task: DesignTask, vector: Signal) -> dict[str, Signal]:
+    """Standard deviation of each free matrix: the step that plants drawn from the error of the response ask for."""
+    generator = np.random.default_rng(0)
+    around = task.step(vector, 1.0)
+    steps = [
+        task.step(vector, 1.0, [one.plant.draw(generator) for one in task.plants]) - around for _ in range(DRAWS)
+    ]
+    found = {name: np.zeros((2, 2)) for name in task.free.units}
+    spread = np.sqrt(np.mean(np.square(steps), axis=0)) * task.free.size
+    for (name, row, column), value in zip(task.free.places(), spread, strict=True):
+        found[name][row, column] = value
+    return found

@@ -1,0 +1,174 @@
+"""Gains designed on the measured response of one or more flights, compared with those that flew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+from mimopilot.tuning.analysis.certify import certify
+from mimopilot.tuning.analysis.manoeuvres import manoeuvres
+from mimopilot.tuning.certificate import Certificate, Verdict
+from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
+from mimopilot.tuning.design.prediction import Prediction, predict, reasons_to_keep
+from mimopilot.tuning.design.response_design import Design, ResponseDesign
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
+from mimopilot.tuning.provenance import Provenance
+from mimopilot.tuning.reference_model import SecondOrder
+from mimopilot.tuning.spec import TuningSpec
+
+#: The rate loop's model that VRFT starts from: bandwidth times delay and rotor lag, its range (rad/s), its damping.
+REACHABLE, SLOWEST, FASTEST, DAMPING = 1.0, 5.0, 60.0, 0.7
+#: Most designs: each that lacks a certificate tightens the next.
+MAX_DESIGNS = 5
+MOTORS_UNKNOWN = (
+    "the log does not contain the motors' commands (PX4: actuator_motors): their limits are taken as those of a "
+    "quadrotor that hovers at half thrust"
+)
+VEHICLE_DAMPS = (
+    "the attitude model asks for less damping than the vehicle has: Kd_i would be negative and is bounded at 0, which "
+    "costs following"
+)
+
+
+def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gains:
+    """The best gains of the structure within the certificate's margins, for all logs of one vehicle.
+
+    Parameters
+    ----------
+    measured : sequence of PlantEstimates
+        One for each flight; the first says what is not tuned.
+    spec : TuningSpec
+        Method, structure, limits.
+
+    Returns
+    -------
+    Gains
+        With a certificate from each log. Its provenance holds the predicted figures of these and the flown gains, and
+        why the flown ones are better, if they are.
+
+    Raises
+    ------
+    TuningError
+        When no gains of the structure are certified.
+    """
+    bench = ResponseDesign.of(measured, spec.design)
+    inner = _rate_model(bench)
+    starts, origin = starting_points(measured, spec, inner, bench)
+    found, certificates = _certified_design(bench, measured, spec, starts, inner)
+    warnings = [] if all(one.experiment.motors for one in measured) else [MOTORS_UNKNOWN]
+    if found.vehicle_damps:
+        warnings.append(VEHICLE_DAMPS)
+    provenance = Provenance(
+        method=spec.method,
+        inner_model=(inner, inner),
+        outer_model=(found.model, found.model),
+        standard_deviation={name: value.tolist() for name, value in found.deviations.items()},
+        warnings=tuple(warnings),
+        details={
+            "structure": spec.structure,
+            "start": origin,
+            "limited_by": found.active,
+            "design": spec.design.model_dump(),
+            **comparison(found.gains, measured, bench, found.model),
+        },
+    )
+    return replace(found.gains, provenance=provenance).with_certificate(_weakest(certificates))
+
+
+def _certified_design(
+    bench: ResponseDesign,
+    measured: Sequence[PlantEstimates],
+    spec: TuningSpec,
+    starts: Sequence[Gains],
+    inner: SecondOrder,
+) -> tuple[Design, list[Certificate]]:
+    """The first design that is certified on every log, with tighter limits after each that is not."""
+    source = measured[0].experiment.source
+    bandwidth = None
+    for _ in range(MAX_DESIGNS):
+        found = bench.design(starts, spec.structure, spec.method == "mimo", bandwidth)
+        certificates = [certificate(found.gains, one, spec, inner, found.model) for one in measured]
+        missing = [one for one in certificates if one.verdict != Verdict.CERTIFIED]
+        if not missing:
+            return found, certificates
+        starts, bandwidth = [found.gains], found.model.omega
+        bench = bench.tighter(found.gains)
+    limits = f"; the design is limited by {', '.join(found.active)}" if found.active else ""
+    raise TuningError(
+        f"{source}: no gains of this structure are certified, nothing is written: {missing[0].reason}{limits}"
+    )
+
+
+def certificate(
+    gains: Gains, measured: PlantEstimates, spec: TuningSpec, inner: SecondOrder, outer: SecondOrder
+) -> Certificate:
+    """The certificate of a designed set from one log."""
+    models = ([model.discretise(gains.Ts)] * 2 for model in (inner, outer))
+    log, thresholds = measured.experiment.sha256, spec.certificate
+    return certify(gains, measured.response, *models, log, thresholds, lambda: measured.model)
+
+
+def _weakest(certificates: Sequence[Certificate]) -> Certificate:
+    """The certificate with the thinnest margin; it holds those of the other logs."""
+    weakest = max(certificates, key=lambda one: one.figures["Ms"] + one.figures["Ms_error"])
+    return replace(weakest, further=tuple(one.as_table() for one in certificates if one is not weakest))
+
+
+def _rate_model(bench: ResponseDesign) -> SecondOrder:
+    """A rate loop that the slowest of the plants can reach."""
+    lag = max(plant.shape[0] + plant.shape[1] for plant in bench.plants)
+    top = min(plant.omega[plant.band.stop - 1] for plant in bench.plants) / 2
+    fastest = max(SLOWEST, min(FASTEST, float(top)))
+    return SecondOrder(round(float(np.clip(REACHABLE / max(lag, 1e-3), SLOWEST, fastest)), 1), DAMPING)
+
+
+def starting_points(
+    measured: Sequence[PlantEstimates], spec: TuningSpec, inner: SecondOrder, bench: ResponseDesign
+) -> tuple[list[Gains], str]:
+    """Gain sets that a search begins at, and their origin: VRFT's of the first log, and the flown ones."""
+    first = measured[0].experiment
+    base = starting_set(first, spec)
+    starts, origin = [], []
+    try:
+        task = spec.model_copy(update={"inner": (inner, inner)})
+        starts.append(estimate(first, task, None, measured[0].body).gains)
+        origin.append("VRFT")
+    except TuningError:  # no estimate of that model: another start does
+        pass
+    if first.flown is not None:
+        starts.append(replace(first.flown, filters=base.filters, limits=base.limits, yaw=base.yaw))
+        origin.append("flown")
+    if not starts:
+        decoupled = inner.omega * np.linalg.inv(bench.plants[0].body.B)
+        starts.append(replace(base, Kp_o=inner.omega / 3 * np.eye(2), Kp_i=decoupled, Ki_i=decoupled))
+        origin.append("rigid body")
+    return starts, ", ".join(origin)
+
+
+def comparison(
+    gains: Gains, measured: Sequence[PlantEstimates], bench: ResponseDesign, model: SecondOrder
+) -> dict[str, Any]:
+    """Predicted figures of a set and of the flown gains, as plain values, and why the flown ones are better."""
+    tasks = [(plant, manoeuvres(plant, model.discretise(plant.Ts))) for plant in bench.plants]
+    new = [predict(gains, *task) for task in tasks]
+    found: dict[str, Any] = {"predicted": {"tuned": _plain(new)}}
+    flown = [one.experiment.flown for one in measured]
+    if all(flown):
+        before = [predict(one, *task) for one, task in zip(flown, tasks, strict=True) if one is not None]
+        found["predicted"]["flown"] = _plain(before)
+        keep = reasons_to_keep(new, before, bench.limits.Ms, bench.limits.noise)
+        found |= {"better_than_flown": not keep, "keep_flown": keep}
+    return found
+
+
+def _plain(predictions: Sequence[Prediction]) -> list[dict[str, Any]]:
+    """Predictions as TOML and JSON values."""
+    return [
+        {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(one).items()}
+        for one in predictions
+    ]

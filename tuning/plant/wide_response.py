@@ -1,0 +1,175 @@
+"""The measured response, continued below its band and up to the Nyquist frequency, with its error and the noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES, PlantResponse
+from mimopilot.tuning.plant.noise_spectrum import noise_root
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
+from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, ResponseShape, fit_shape, shape_response
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody
+
+#: rad/s. Below it a vehicle that holds its attitude does not move.
+LOWEST = 0.1
+#: Largest relative step between neighbouring frequencies in the band and above it, and below it, where the response is
+#: that of a rigid body.
+STEP, STEP_BELOW = 0.05, 0.15
+#: Frequencies at each end of the band whose mean ratio to the fitted shape is continued.
+END_BELOW, END_ABOVE = 9, 5
+#: Share of the Nyquist frequency at which the grid ends: the integrator's response is real there.
+TOP = 0.999
+
+Complex = NDArray[np.complex128]
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class WideResponse:
+    """Response of a plant from `LOWEST` to the Nyquist frequency.
+
+    Attributes
+    ----------
+    omega : (K,) array, rad/s
+    G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
+    band : slice
+        Frequencies at which it was measured. Below and above, the fitted shape of a rigid body behind rotors and a
+        delay continues it.
+    error_i, error_o : (K, 2, 6) arrays
+        With X (6, 2) of unit complex normals, error_i X reach is as likely as the error of G_i; zero outside the band.
+    reach : (K, 2, 2) array
+    noise : (K, 4, 4) array
+        Square root of the spectrum of the noise of rates and angles, see `tuning.plant.noise_spectrum`.
+    body : RigidBody
+    response : PlantResponse
+        Everything that was measured, also outside the band.
+    shape : ResponseShape
+        Delay (s), rotor lag (s) and damping (1/s) of the fitted shape.
+    Ts : float, s
+    """
+
+    omega: Signal
+    G_i: Complex
+    G_o: Complex
+    band: slice
+    error_i: Complex
+    error_o: Complex
+    reach: Complex
+    noise: Complex
+    body: RigidBody
+    response: PlantResponse
+    shape: ResponseShape
+    Ts: float
+
+    @property
+    def noise_weight(self) -> Signal:
+        """Weights of the sum over frequency that is a variance, (K,)."""
+        weight: Signal = _trapezoid(self.omega) * self.Ts / np.pi
+        return weight
+
+    def draw(self, generator: np.random.Generator) -> WideResponse:
+        """A plant drawn from the error of the response."""
+        shape = (len(self.omega), 6, 2)
+        X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
+        return replace(
+            self,
+            G_i=self.G_i + self.error_i @ X @ self.reach,
+            G_o=self.G_o + self.error_o @ X @ self.reach,
+        )
+
+
+def wide_response(measured: PlantEstimates) -> WideResponse:
+    """The response of an experiment, continued on both sides.
+
+    Raises
+    ------
+    TuningError
+        When the response is known at too few frequencies.
+    """
+    plant, body = measured.response, measured.body
+    run = plant.known_run()
+    if len(run) < MIN_FREQUENCIES:
+        raise TuningError(
+            f"{measured.experiment.source}: the excitation reaches fewer than {MIN_FREQUENCIES} frequencies in a row; "
+            "record a longer or stronger excitation"
+        )
+    known = plant.at(run)
+    dense = known.interpolated(STEP)
+    low = _spaced(LOWEST, dense.omega[0], STEP_BELOW)[:-1] if dense.omega[0] > LOWEST else np.empty(0)
+    high = _spaced(dense.omega[-1], TOP * np.pi / plant.Ts, STEP)[1:]
+    size = np.linalg.norm(known.G_i, axis=(1, 2))[:, None, None]
+    shape, _, _, _ = fit_shape(known.omega, known.G_i, 1 / (known.deviation() ** 2 + (SHAPE_ERROR * size) ** 2))
+
+    def ratio(where: slice) -> Complex:
+        found: Complex = np.mean(dense.G_i[where] / _column(shape_response(dense.omega[where], shape)), axis=0)
+        return found
+
+    below = ratio(slice(0, END_BELOW)).real * _column(shape_response(low, shape))
+    above = ratio(slice(-END_ABOVE, None)) * _column(shape_response(high, shape))
+    omega = np.concatenate([low, dense.omega, high])
+    band = slice(len(low), len(low) + len(dense.omega))
+    error_i = np.zeros((len(omega), 2, 6), complex)
+    error_o, reach = np.zeros_like(error_i), np.zeros((len(omega), 2, 2), complex)
+    error_i[band] = dense.root[:, 2:4] - dense.G_i @ dense.root[:, :2]
+    error_o[band] = dense.root[:, 4:] - dense.G_o @ dense.root[:, :2]
+    reach[band] = dense.reach
+    return WideResponse(
+        omega=omega,
+        G_i=np.concatenate([below, dense.G_i, above]),
+        G_o=np.concatenate([below / _column(1j * low), dense.G_o, above / _column(1j * high)]),
+        band=band,
+        error_i=error_i,
+        error_o=error_o,
+        reach=reach,
+        noise=noise_root(measured.experiment, plant, omega),
+        body=body,
+        response=plant,
+        shape=shape,
+        Ts=plant.Ts,
+    )
+
+
+def hat_weights(omega: Signal, fine: Signal, values: NDArray[Any]) -> NDArray[Any]:
+    """Weights w with sum(w f(omega)) the integral of values f over `fine`, for f linear between the frequencies omega.
+
+    A spectrum with many lobes, such as a doublet's, is then integrated on a coarse grid.
+
+    Parameters
+    ----------
+    omega : (K,) array, rad/s
+    fine : (F,) array, rad/s
+        Grid on which `values` is resolved.
+    values : (F,) or (F, n) array
+
+    Returns
+    -------
+    (K,) or (K, n) array
+    """
+    products = (values.T * _trapezoid(fine)).T
+    cell = np.clip(np.searchsorted(omega, fine) - 1, 0, len(omega) - 2)
+    part = np.clip((fine - omega[cell]) / (omega[cell + 1] - omega[cell]), 0.0, 1.0)
+    weights = np.zeros((len(omega), *values.shape[1:]), values.dtype)
+    np.add.at(weights, cell, (products.T * (1 - part)).T)
+    np.add.at(weights, cell + 1, (products.T * part).T)
+    return weights
+
+
+def _trapezoid(omega: Signal) -> Signal:
+    """Weights of the trapezoidal rule."""
+    steps = np.diff(omega)
+    weights: Signal = (np.append(steps, 0.0) + np.append(0.0, steps)) / 2
+    return weights
+
+
+def _spaced(first: float, last: float, step: float) -> Signal:
+    """Frequencies from first to last, whose neighbours differ by at most `step` of themselves."""
+    return np.geomspace(first, last, int(np.ceil(np.log(last / first) / np.log1p(step))) + 1)
+
+
+def _column(values: NDArray[Any]) -> NDArray[Any]:
+    return values[:, None, None]
