@@ -7,7 +7,7 @@ same bits as the command of its name.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -87,7 +87,7 @@ def inspect(path: PathLike, columns: PathLike | None = None) -> Inspection:
 
 @reproducible
 def tune(
-    log: Log,
+    log: Log | Sequence[Log],
     *,
     inner: Model | None = None,
     outer: Model | None = None,
@@ -96,14 +96,15 @@ def tune(
     columns: PathLike | None = None,
     **options: Any,
 ) -> Gains:
-    """Find the gains of the attitude cascade from one flight.
+    """Find the best gains of the attitude cascade from one flight, or from several of one vehicle.
 
     Parameters
     ----------
-    log : str, Path or Experiment
+    log : str, Path or Experiment, or a list of them
         Flight with excitation.
     inner, outer : tuple, optional
-        Reference models of the rate and the attitude loop: (omega rad/s, damping, delay samples).
+        Reference models of the rate and the attitude loop: (omega rad/s, damping, delay samples). With one of them
+        VRFT finds the gains for the models, as in the thesis.
     spec : str, Path or TuningSpec, optional
         Specification; TOML where it is a path. What is given here overrides it.
     repeat : str, Path or Experiment, optional
@@ -116,7 +117,8 @@ def tune(
     Returns
     -------
     Gains
-        With their certificate, standard deviations and warnings.
+        With their certificate, standard deviations and warnings. `provenance.details` holds the predicted figures of
+        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``.
 
     Raises
     ------
@@ -127,7 +129,8 @@ def tune(
 
     task = _spec(spec, {"inner": inner, "outer": outer, **options})
     second = None if repeat is None else _experiment(repeat, columns)
-    return tune_cascade(_experiment(log, columns), task, repeat=second)
+    logs = log if isinstance(log, list | tuple) else [log]
+    return tune_cascade([_experiment(one, columns) for one in logs], task, repeat=second)
 
 
 @reproducible
@@ -165,36 +168,33 @@ def certify(
 def advise(
     log: Log,
     *,
-    outer: Model | None = None,
     spec: PathLike | TuningSpec | None = None,
     columns: PathLike | None = None,
     watch: Callable[[Iterable[Any]], Iterable[Any]] = iter,
 ) -> Advice:
-    """Scan models of the rate loop and derivative filters; recommend one.
+    """Design the gains as `tune` does, and the alternatives around them.
 
     Parameters
     ----------
     log : str, Path or Experiment
-    outer : tuple, optional
-        Attitude loop: (omega rad/s, damping, delay samples).
     spec, columns
         As in `tune`.
     watch : callable
-        Wraps the iteration over the grid, for a progress bar.
+        Wraps the iteration over the alternatives, for a progress bar.
 
     Returns
     -------
     Advice
-        Its `recommended` candidate holds tuned and certified gains.
+        Its `recommended` candidate holds the gains that `tune` finds.
 
     Raises
     ------
     Error
-        When the log cannot be tuned from, or no candidate is certified.
+        When the log cannot be tuned from, or no gains are certified.
     """
     from mimopilot.tuning.design.advise import advise as scan
 
-    return scan(_experiment(log, columns), _spec(spec, {"outer": outer}), watch=watch)
+    return scan(_experiment(log, columns), _spec(spec, {}), watch=watch)
 
 
 def load_gains(path: PathLike) -> Gains:

@@ -23,9 +23,6 @@ GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default t
 ColumnsOption = Annotated[
     Path | None, typer.Option(help="Names, units and signs of the columns of a CSV or MATLAB file (TOML).")
 ]
-OuterOption = Annotated[
-    str | None, typer.Option(help="Attitude loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 10,0.7,0 by default.")
-]
 FaultOption = Annotated[
     list[str] | None,
     typer.Option("--fault", help="KIND[:TARGET][=SIZE]@AT[+DURATION], seconds; see mimopilot faults --kinds."),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,21 +12,23 @@ from mimopilot.cli.options import (
     ColumnsOption,
     JsonOption,
     LogArgument,
-    OuterOption,
     warn,
 )
 from mimopilot.common.console import print_json, print_table, progress_console
 from mimopilot.common.errors import check_not_given
 
 if TYPE_CHECKING:
-    from mimopilot.tuning.design.advise import Candidate
     from mimopilot.tuning.experiment import Experiment
     from mimopilot.tuning.gains import Gains
     from mimopilot.tuning.logs.columns import Columns
     from mimopilot.tuning.spec import TuningSpec
 
-#: Candidates that `advise` prints; ``--json`` has all.
-SHOWN = 24
+#: Columns of the tables of predicted figures.
+PREDICTED = ("", "follows [deg]", "other axis [deg]", "after torque [deg]", "noise of u", "Ms")
+PREDICTED_TITLE = (
+    "Predicted, roll / pitch. RMS in doublets of 10 degrees, 0.4 to 2 s: to the model\n({model}) and of the other axis; "
+    "after a step of torque; of the torque at hover"
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -35,27 +36,30 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: mimopilot inspect flight.ulg")(inspect)
     app.command(epilog="Example: mimopilot identify flight.ulg --order 4 --out plant.toml")(identify)
     app.command(
-        epilog="Example: mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out my.gains.toml; "
-        "mimopilot tune logs --campaign --out tuned"
+        epilog="Example: mimopilot tune flight.ulg --out my.gains.toml; mimopilot tune light.ulg heavy.ulg --out both.gains.toml; "
+        "mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out thesis.gains.toml"
     )(tune)
     app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
-    app.command(epilog="Example: mimopilot advise flight.ulg --outer 10,0.7,0 --out my.gains.toml")(advise)
+    app.command(epilog="Example: mimopilot advise flight.ulg")(advise)
 
 
 def tune(
-    logs: Annotated[list[Path], typer.Argument(help="Flight log; with --campaign many, or folders of them.")],
+    logs: Annotated[
+        list[Path],
+        typer.Argument(help="Flight log, or several of one vehicle; with --campaign many, or folders of them."),
+    ],
     out: Annotated[Path, typer.Option(help="Where the gains are written: FILE.gains.toml; a folder with --campaign.")],
     method: Annotated[
         str | None, typer.Option(help="mimo (full matrices, the default) or siso (each axis by itself).")
     ] = None,
     inner: Annotated[
-        str | None, typer.Option(help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples); 30,0.7,0 by default.")
-    ] = None,
-    outer: OuterOption = None,
-    doublet: Annotated[
         str | None,
-        typer.Option(help="Refine all gains for a doublet: DEGREES,SECONDS (whole length), such as 22.5,0.42."),
+        typer.Option(
+            help="Rate loop: OMEGA,ZETA,DELAY (rad/s, damping, samples). The thesis' way: VRFT finds the gains for "
+            "these models instead of the best ones."
+        ),
     ] = None,
+    outer: Annotated[str | None, typer.Option(help="Attitude loop, likewise.")] = None,
     structure: Annotated[
         str | None,
         typer.Option(help="Terms of the rate controller: P, PI, PD or PID (the default), F behind for feed-forward."),
@@ -63,14 +67,14 @@ def tune(
     instrument: Annotated[
         str | None,
         typer.Option(
-            help="external (lags of the injected torque, the default), u (of the total torque), model, repeated."
+            help="Of VRFT, with --inner or --outer: external (lags of the injected torque, the default), u (of the total torque), model, repeated."
         ),
     ] = None,
     repeat: Annotated[
-        Path | None, typer.Option(help="Log of a second flight of the same experiment: instrument repeated.")
+        Path | None, typer.Option(help="Log of a second flight of the same experiment: instrument repeated of VRFT.")
     ] = None,
     window: Annotated[
-        int | None, typer.Option(help="Lags of the instrument, samples; by default from the models.")
+        int | None, typer.Option(help="Lags of VRFT's instrument, samples; by default from the models.")
     ] = None,
     spec: Annotated[
         Path | None, typer.Option(help="Specification (TOML): the above, and what the log lacks.")
@@ -79,21 +83,22 @@ def tune(
     campaign: Annotated[
         bool, typer.Option("--campaign", help="Tune each of many logs, and show how gains and certificates spread.")
     ] = False,
+    require_better: Annotated[
+        bool, typer.Option("--require-better", help="Exit code 1 if the flown gains are better.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the gains of the attitude cascade from one flight."""
+    """Find the best gains of the attitude cascade from one flight, and compare them with those that flew."""
     import mimopilot as mp
-    from mimopilot.tuning.errors import TuningError
     from mimopilot.tuning.logs.columns import load_columns
     from mimopilot.tuning.parameters import MATRICES
-    from mimopilot.tuning.spec import load_spec, parse_doublet, parse_model
+    from mimopilot.tuning.spec import load_spec, parse_model
 
     task = load_spec(
         spec,
         method=method,
         inner=parse_model(inner) if inner else None,
         outer=parse_model(outer) if outer else None,
-        manoeuvre=parse_doublet(doublet) if doublet else None,
         structure=structure,
         instrument=instrument or ("repeated" if repeat else None),
         window=window,
@@ -102,23 +107,71 @@ def tune(
         check_not_given("belongs to one log, --campaign tunes many; leave it out", repeat=repeat)
         tune_campaign(logs, task, out, load_columns(columns) if columns else None, as_json)
         return
-    if len(logs) > 1:
-        raise TuningError(f"{len(logs)} logs: gains are tuned from one; --campaign tunes each by itself")
-    log = logs[0]
-    experiment = read_warned(log, columns)
-    gains = mp.tune(experiment, spec=task, repeat=read_warned(repeat, columns) if repeat else None)
+    if not task.for_models:
+        text = "belongs to VRFT for given models; give --inner or --outer, too"
+        check_not_given(text, instrument=instrument, repeat=repeat, window=window)
+    experiments = [read_warned(log, columns) for log in logs]
+    second = read_warned(repeat, columns) if repeat else None
+    gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
     gains.save(out)
-    deviations = gains.provenance.standard_deviation
-    warn(log, (warning for warning in gains.provenance.warnings if warning not in experiment.warnings))
+    known = {warning for experiment in experiments for warning in experiment.warnings}
+    warn(logs[0], (warning for warning in gains.provenance.warnings if warning not in known))
+    details, deviations = gains.provenance.details, gains.provenance.standard_deviation
+    comparison = {name: details[name] for name in ("predicted", "better_than_flown", "keep_flown") if name in details}
     if as_json:
         matrices: dict[str, Any] = {name: getattr(gains, name).tolist() for name in MATRICES}
+        models = gains.provenance.as_table()
         found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}
         certificate = gains.certificate.as_table() if gains.certificate else None
-        print_json({**found, "derivative_cutoff_hz": gains.derivative_cutoff_hz, "certificate": certificate})
+        print_json(
+            {
+                **found,
+                "derivative_cutoff_hz": gains.derivative_cutoff_hz,
+                "attitude_model": models["outer_model"][0],
+                **comparison,
+                "certificate": certificate,
+            }
+        )
+    else:
+        names = " and ".join(log.name for log in logs)
+        print_gains(f"{task.method.upper()} gains from {names} (standard deviation)", gains, deviations)
+        print_comparison(gains, [log.name for log in logs])
+        print_certificate(gains)
+        print(f"written to {out}")
+    if require_better and not comparison.get("better_than_flown", False):
+        raise typer.Exit(1)
+
+
+def print_comparison(gains: Gains, logs: list[str]) -> None:
+    """Predicted figures of a designed set beside those of the flown gains, and the conclusion."""
+    details = gains.provenance.details
+    predicted = details.get("predicted")
+    if predicted is None or gains.provenance.outer_model is None:
         return
-    print_gains(f"{task.method.upper()} gains from {log.name} (standard deviation)", gains, deviations)
-    print_certificate(gains)
-    print(f"written to {out}")
+    model = f"{gains.provenance.outer_model[0].bandwidth:g} rad/s"
+    rows = []
+    for place, log in enumerate(logs):
+        for name in ("flown", "siso", "tuned"):
+            if name in predicted:
+                shown = {"siso": "SISO"}.get(name, name)
+                rows.append([f"{shown}, {log}" if len(logs) > 1 else shown, *prediction_cells(predicted[name][place])])
+    print_table(PREDICTED_TITLE.format(model=model), PREDICTED, rows)
+    if details.get("better_than_flown"):
+        print("better than the gains that flew: in following and on the other axis, within the limits of Ms and noise")
+    for reason in details.get("keep_flown", ()):
+        print(f"keep what you fly: {reason}")
+    if details["limited_by"]:
+        print(f"limited by: {', '.join(details['limited_by'])}")
+
+
+def prediction_cells(figures: Mapping[str, Any]) -> list[str]:
+    """Cells of a row of predicted figures, see `PREDICTED`."""
+    pairs = [figures[name] for name in ("follow_deg", "offaxis_deg", "disturbance_deg")]
+    return [
+        *(f"{roll:.2f} / {pitch:.2f}" for roll, pitch in pairs),
+        "{:.4f} / {:.4f}".format(*figures["noise"]),
+        f"{figures['Ms']:.2f}",
+    ]
 
 
 def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Columns | None, as_json: bool) -> None:
@@ -172,57 +225,66 @@ def certify(
 
 def advise(
     log: LogArgument,
-    outer: OuterOption = None,
     spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
     columns: ColumnsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Scan bandwidth, damping and delay of the rate loop's model, and derivative filters; recommend one and say why."""
+    """Show the gains that tune finds beside the alternatives: slower, faster, quieter, SISO, other derivative filters."""
+    from dataclasses import asdict
+
     from rich.progress import track
 
     import mimopilot as mp
-    from mimopilot.tuning.spec import load_spec, parse_model
+    from mimopilot.tuning.spec import load_spec
 
-    task = load_spec(spec, outer=parse_model(outer) if outer else None)
     found = mp.advise(
         read_warned(log, columns),
-        spec=task,
-        watch=lambda grid: track(list(grid), "tuning", console=progress_console(), transient=True),
+        spec=load_spec(spec),
+        watch=lambda grid: track(list(grid), "designing", console=progress_console(), transient=True),
     )
     best = found.recommended
-    assert best.gains is not None
     if out is not None:
         best.gains.save(out)
-
-    def shown(candidate: Candidate) -> dict[str, Any]:
-        return {name: value for name, value in vars(candidate).items() if name != "gains"}
-
     if as_json:
+        candidates = [
+            {
+                "name": one.name,
+                "bandwidth": one.bandwidth,
+                "derivative_cutoff_hz": one.gains.derivative_cutoff_hz,
+                **asdict(one.prediction),
+                "verdict": str(one.gains.verdict()[0]),
+                "reason": one.gains.verdict()[1],
+            }
+            for one in found.candidates
+        ]
         print_json(
             {
-                "recommended": shown(best),
+                "recommended": candidates[0],
                 "nonminimum_phase_zero_rad_s": found.zero,
-                "candidates": [shown(candidate) for candidate in found.candidates],
+                "candidates": candidates,
+                "refused": found.refused,
             }
         )
         return
-    rows = []
-    ordered = sorted(found.candidates, key=lambda c: (c.verdict != best.verdict, math.hypot(*c.follow_deg)))
-    for c in ordered[:SHOWN]:
-        pairs = [f"{a:.2f} / {b:.2f}" for a, b in (c.follow_deg, c.offaxis_deg, c.effort)]
-        name = "{:g}, {:g}, {}".format(*c.inner)
-        delta = "{:.2f} +- {:.2f}".format(*c.delta)
-        row = ["* " + name if c is best else name, f"{c.cutoff_hz:g}", f"{c.fit:.2f}", *pairs, delta, c.verdict]
-        rows.append(row)
-    print("Rate loop: rad/s, damping, delay in samples; predicted RMS of an 18 degree doublet, roll / pitch")
-    columns_shown = ["model", "D [Hz]", "fit", "to the model [deg]", "off-axis [deg]", "torque", "delta", "certificate"]
-    print_table(f"{len(rows)} of {len(ordered)}, certified ones first, by how they follow", columns_shown, rows)
-    zero = "no non-minimum-phase zero" if found.zero is None else f"non-minimum-phase zero at {found.zero:.1f} rad/s"
-    print(f"{zero} from torque to rates")
+    rows = [
+        [
+            one.name,
+            f"{one.bandwidth:g}",
+            f"{one.gains.derivative_cutoff_hz:g}",
+            *prediction_cells(asdict(one.prediction)),
+            str(one.gains.verdict()[0]),
+        ]
+        for one in found.candidates
+    ]
+    columns_shown = ["", "model [rad/s]", "D [Hz]", *PREDICTED[1:], "certificate"]
+    print_table(PREDICTED_TITLE.format(model="its own; flown: the recommended one's"), columns_shown, rows)
+    for name, reason in found.refused.items():
+        print(f"{name}: {reason}")
     print(
-        "recommended: --inner {:g},{:g},{} with a derivative filter of {:g} Hz: certified, follows within 10 % of the "
-        "best of those, with the least torque".format(*best.inner, best.cutoff_hz)
+        "no non-minimum-phase zero from torque to rates"
+        if found.zero is None
+        else f"non-minimum-phase zero at {found.zero:.1f} rad/s from torque to rates"
     )
 
 
@@ -238,10 +300,12 @@ def print_certificate(gains: Gains) -> None:
         return
     rows = [
         ["peak of the sensitivity, Ms", f"{figures['Ms']:.2f} +- {figures['Ms_error']:.2f}"],
-        ["small gain of the rate loop, delta", f"{figures['delta']:.2f} +- {figures['delta_error']:.2f}"],
         ["disk margin", f"{figures['disk_margin']:.2f}"],
         ["all axes at once", f"{figures['simultaneous_gain_db']:.1f} dB, {figures['simultaneous_phase_deg']:.0f} deg"],
     ]
+    if "predicted" not in gains.provenance.details:  # asked for a model of the rate loop
+        delta = f"{figures['delta']:.2f} +- {figures['delta_error']:.2f}"
+        rows.append(["small gain of the rate loop, delta", delta])
     for axis in ROLL_PITCH:
         kind = figures["gain_margin"][axis]
         gain = "gain not known" if kind == "not known" else f"{figures['gain_margin_db'][axis]:.1f} dB"

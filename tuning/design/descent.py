@@ -32,6 +32,9 @@ ENOUGH, SHORTEST, MAX_STEPS = 1e-3, 1e-3, 60
 INFEASIBLE = 5e-3
 #: Weight of the other axis' error over that of the own one: decoupling costs little tracking accuracy.
 OTHER_AXIS = 2.0
+#: Weight of the coupling that gains add through the rigid body, over that of a relative error of following: two
+#: integral gains of opposite sign that cancel in every manoeuvre would otherwise be left to noise.
+COUPLING = 0.03
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
@@ -86,20 +89,14 @@ class DesignTask:
         ]
         return list(dict.fromkeys(name for margin, name in sorted(margins) if margin < within))
 
-    def step(self, vector: Signal, radius: float, plants: Sequence[WideResponse] | None = None) -> Signal:
-        """The best step within the convex constraints, none of its elements above `radius`.
-
-        Parameters
-        ----------
-        vector : (n,) array
-        radius : float
-        plants : sequence of WideResponse, optional
-            Other plants than the task's.
-        """
+    def step(self, vector: Signal, radius: float) -> Signal:
+        """The best step within the convex constraints, none of its elements above `radius`."""
         problem = ConicProblem(len(vector))
         gradient, curvature = np.zeros(len(vector)), np.zeros((len(vector), len(vector)))
-        for task, plant in zip(self.plants, plants or [task.plant for task in self.plants], strict=True):
-            loop = LoopGradient(plant, self.free, vector)
+        for loop, task in zip(self.loops(vector), self.plants, strict=True):
+            rows = COUPLING * self.free.coupling(loop.plant.body.B)
+            gradient += 2 * rows.T @ rows @ vector / len(self.plants)
+            curvature += 2 * rows.T @ rows / len(self.plants)
             for errors, slopes in _errors(loop, task.manoeuvres, derivative=True):
                 gradient += 2 * np.real(slopes.conj() @ errors) / len(self.plants)
                 curvature += 2 * np.real(slopes.conj() @ slopes.T) / len(self.plants)
@@ -108,11 +105,15 @@ class DesignTask:
         return problem.solve(gradient, curvature, PENALTY, radius)
 
     def _cost(self, loops: Sequence[LoopGradient]) -> float:
-        return sum(
+        energies = [
             float(np.sum(np.abs(errors) ** 2))
             for loop, task in zip(loops, self.plants, strict=True)
-            for errors, _ in _errors(loop, task.manoeuvres)
-        ) / len(self.plants)
+            for errors in (
+                *(errors for errors, _ in _errors(loop, task.manoeuvres)),
+                COUPLING * self.free.coupling(loop.plant.body.B) @ loop.vector,
+            )
+        ]
+        return sum(energies) / len(self.plants)
 
     def _violation(self, loops: Sequence[LoopGradient]) -> float:
         return sum(

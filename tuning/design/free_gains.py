@@ -61,8 +61,21 @@ class FreeGains:
             parts[name] = matrix
         return replace(self.base, certificate=None, **parts)  # type: ignore[arg-type]
 
+    def coupling(self, B: Signal) -> Signal:
+        """Coupling that the gains add through a plant, as a matrix (2 m, n) to multiply the vector with.
 
-def free_gains(base: Gains, body: RigidBody, structure: str, full: bool) -> FreeGains:
+        The off-diagonal elements of B times each rate gain, and of the attitude gain, in units of the diagonal: zero
+        when the gains decouple the rigid body.
+        """
+        rows = np.zeros((2 * len(self.units), len(self.size)))
+        names = list(self.units)
+        for place, (name, row, column) in enumerate(self.places()):
+            effect = np.eye(2)[:, row] if name == ATTITUDE.matrix else B[:, row] / np.abs(B).max()
+            rows[2 * names.index(name) + column, place] = effect[1 - column]
+        return rows
+
+
+def free_gains(base: Gains, body: RigidBody, structure: str = "".join(TERMS), full: bool = True) -> FreeGains:
     """The attitude gain and the terms of a structure.
 
     Parameters

@@ -12,7 +12,6 @@ from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, PERIODS, Manoeuvres
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import TERMS
 from mimopilot.tuning.plant.wide_response import WideResponse
 
 #: Time after a doublet that its RMS counts, s.
@@ -59,7 +58,7 @@ def predict(gains: Gains, plant: WideResponse, task: Manoeuvres) -> Prediction:
     task : Manoeuvres
         On the plant's frequencies.
     """
-    free = free_gains(gains, plant.body, "".join(TERMS), full=True)
+    free = free_gains(gains, plant.body)
     loop = LoopGradient(plant, free, free.vector(gains))
     follow = [_rms(np.abs(loop.T[:, i, i] - task.target) ** 2, task) for i in range(2)]
     offaxis = [_rms(np.abs(loop.T[:, 1 - i, i]) ** 2, task) for i in range(2)]

@@ -27,9 +27,9 @@ from mimopilot.tuning.design.constraints import (
     gain_above_band,
     structural_modes,
 )
-from mimopilot.tuning.design.descent import INFEASIBLE, DesignTask, PlantTask, descend
+from mimopilot.tuning.design.descent import INFEASIBLE, LARGEST_RADIUS, DesignTask, PlantTask, descend
 from mimopilot.tuning.design.free_gains import FreeGains, free_gains
-from mimopilot.tuning.design.prediction import predict
+from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, TERMS
@@ -93,7 +93,8 @@ class Design:
     active : list of str
         What limits the design, the tightest first.
     deviations : mapping
-        Matrix -> (2, 2) standard deviations in its unit: the spread to expect if the flight were repeated.
+        Matrix -> (2, 2) standard deviations in its unit: the spread to expect if the flight were repeated. Empty if
+        they were not asked for.
     vehicle_damps : bool
         Whether a negative derivative gain would follow better.
     """
@@ -159,7 +160,14 @@ class ResponseDesign:
             return replace(self, limited=[a | b for a, b in zip(self.limited, exceeded, strict=True)])
         return replace(self, limits=self.limits.model_copy(update={"Ms": TIGHTER * self.limits.Ms}))
 
-    def design(self, starts: Sequence[Gains], structure: str, full: bool, bandwidth: float | None = None) -> Design:
+    def design(
+        self,
+        starts: Sequence[Gains],
+        structure: str,
+        full: bool,
+        bandwidth: float | None = None,
+        deviations: bool = True,
+    ) -> Design:
         """The best gains for the best bandwidth.
 
         Parameters
@@ -172,6 +180,8 @@ class ResponseDesign:
             False: the diagonals only (SISO).
         bandwidth : float, rad/s, optional
             Of the attitude model; by default it is found.
+        deviations : bool
+            Compute the standard deviations: as many steps as `DRAWS`.
         """
         free = free_gains(starts[0], self.plants[0].body, structure, full)
         task = self._task(free, starts, FIRST_BANDWIDTH if bandwidth is None else bandwidth)
@@ -186,7 +196,7 @@ class ResponseDesign:
             cost=task.cost(vector),
             violation=task.violation(vector),
             active=task.active(vector, ACTIVE),
-            deviations=_deviations(task, vector),
+            deviations=self._deviations(task, vector) if deviations else {},
             vehicle_damps=_vehicle_damps(task, vector),
         )
 
@@ -213,6 +223,27 @@ class ResponseDesign:
         while merit(best + 1) <= enough:
             best += 1
         return BANDWIDTHS[best], *found[best][1:]
+
+    def _deviations(self, task: DesignTask, vector: Signal) -> dict[str, Signal]:
+        """Standard deviation of each free matrix: the step that plants drawn from the errors of the response ask for."""
+        generator = np.random.default_rng(0)
+        around = task.step(vector, LARGEST_RADIUS)
+        steps = [self._drawn(task, generator).step(vector, LARGEST_RADIUS) - around for _ in range(DRAWS)]
+        found = {name: np.zeros((2, 2)) for name in task.free.units}
+        spread = np.sqrt(np.mean(np.square(steps), axis=0)) * task.free.size
+        for (name, row, column), value in zip(task.free.places(), spread, strict=True):
+            found[name][row, column] = value
+        return found
+
+    def _drawn(self, task: DesignTask, generator: np.random.Generator) -> DesignTask:
+        """The task around plants drawn from the errors of the responses."""
+        plants = []
+        for one, experiment in zip(task.plants, self.experiments, strict=True):
+            plant = one.plant.draw(generator)
+            noise = NoiseLimit(self.limits.noise * flown_noise(experiment, plant))
+            limits = [noise if isinstance(limit, NoiseLimit) else limit for limit in one.constraints]
+            plants.append(replace(one, plant=plant, constraints=limits))
+        return replace(task, plants=plants)
 
     def _task(self, free: FreeGains, starts: Sequence[Gains], bandwidth: float) -> DesignTask:
         """Cost and constraints around every plant."""
@@ -252,9 +283,8 @@ def flown_noise(experiment: Experiment, plant: WideResponse) -> Signal:
     """RMS of the torque at hover (normalised) under the flown gains, (2,); as recorded where they are not known."""
     if experiment.flown is None:
         return flown_torque_noise(experiment, plant.response, plant.omega)
-    model = SecondOrder(FIRST_BANDWIDTH, DAMPING).discretise(plant.Ts)
-    flown = replace(experiment.flown, filters=replace(experiment.flown.filters, Ts=plant.Ts))
-    return np.array(predict(flown, plant, manoeuvres(plant, model)).noise)
+    free = free_gains(replace(experiment.flown, filters=replace(experiment.flown.filters, Ts=plant.Ts)), plant.body)
+    return LoopGradient(plant, free, free.vector(experiment.flown)).noise_rms
 
 
 def flown_amplitude(experiment: Experiment) -> float:
@@ -294,17 +324,3 @@ def _vehicle_damps(task: DesignTask, vector: Signal) -> bool:
     ]
     free = replace(task, plants=plants)
     return free.merit(descend(free, vector, ROUGHLY)) < (1 - COSTS) * task.merit(vector)
-
-
-def _deviations(task: DesignTask, vector: Signal) -> dict[str, Signal]:
-    """Standard deviation of each free matrix: the step that plants drawn from the error of the response ask for."""
-    generator = np.random.default_rng(0)
-    around = task.step(vector, 1.0)
-    steps = [
-        task.step(vector, 1.0, [one.plant.draw(generator) for one in task.plants]) - around for _ in range(DRAWS)
-    ]
-    found = {name: np.zeros((2, 2)) for name in task.free.units}
-    spread = np.sqrt(np.mean(np.square(steps), axis=0)) * task.free.size
-    for (name, row, column), value in zip(task.free.places(), spread, strict=True):
-        found[name][row, column] = value
-    return found

@@ -18,7 +18,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.provenance import Provenance
-from mimopilot.tuning.reference_model import SecondOrder
+from mimopilot.tuning.reference_model import ContinuousModel, SecondOrder
 from mimopilot.tuning.spec import TuningSpec
 
 #: The rate loop's model that VRFT starts from: bandwidth times delay and rotor lag, its range (rad/s), its damping.
@@ -74,7 +74,7 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
             "start": origin,
             "limited_by": found.active,
             "design": spec.design.model_dump(),
-            **comparison(found.gains, measured, bench, found.model),
+            **comparison(found, measured, bench, spec),
         },
     )
     return replace(found.gains, provenance=provenance).with_certificate(_weakest(certificates))
@@ -105,7 +105,7 @@ def _certified_design(
 
 
 def certificate(
-    gains: Gains, measured: PlantEstimates, spec: TuningSpec, inner: SecondOrder, outer: SecondOrder
+    gains: Gains, measured: PlantEstimates, spec: TuningSpec, inner: ContinuousModel, outer: ContinuousModel
 ) -> Certificate:
     """The certificate of a designed set from one log."""
     models = ([model.discretise(gains.Ts)] * 2 for model in (inner, outer))
@@ -151,19 +151,25 @@ def starting_points(
 
 
 def comparison(
-    gains: Gains, measured: Sequence[PlantEstimates], bench: ResponseDesign, model: SecondOrder
+    found: Design, measured: Sequence[PlantEstimates], bench: ResponseDesign, spec: TuningSpec
 ) -> dict[str, Any]:
-    """Predicted figures of a set and of the flown gains, as plain values, and why the flown ones are better."""
-    tasks = [(plant, manoeuvres(plant, model.discretise(plant.Ts))) for plant in bench.plants]
-    new = [predict(gains, *task) for task in tasks]
-    found: dict[str, Any] = {"predicted": {"tuned": _plain(new)}}
+    """Predicted figures as plain values: of a design, of the flown gains, and of the same design axis by axis.
+
+    ``keep_flown`` says why the flown gains are better; it is empty if they are not.
+    """
+    tasks = [(plant, manoeuvres(plant, found.model.discretise(plant.Ts))) for plant in bench.plants]
+    new = [predict(found.gains, *task) for task in tasks]
+    shown = {"tuned": new}
+    if spec.method == "mimo":
+        siso = bench.design([found.gains], spec.structure, full=False, bandwidth=found.model.omega, deviations=False)
+        shown["siso"] = [predict(siso.gains, *task) for task in tasks]
+    result: dict[str, Any] = {}
     flown = [one.experiment.flown for one in measured]
     if all(flown):
-        before = [predict(one, *task) for one, task in zip(flown, tasks, strict=True) if one is not None]
-        found["predicted"]["flown"] = _plain(before)
-        keep = reasons_to_keep(new, before, bench.limits.Ms, bench.limits.noise)
-        found |= {"better_than_flown": not keep, "keep_flown": keep}
-    return found
+        shown["flown"] = [predict(one, *task) for one, task in zip(flown, tasks, strict=True) if one is not None]
+        keep = reasons_to_keep(new, shown["flown"], bench.limits.Ms, bench.limits.noise)
+        result = {"better_than_flown": not keep, "keep_flown": keep}
+    return {"predicted": {name: _plain(figures) for name, figures in shown.items()}, **result}
 
 
 def _plain(predictions: Sequence[Prediction]) -> list[dict[str, Any]]:

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES, PlantResponse
+from mimopilot.tuning.plant.frequency_response import GROWTH, MIN_FREQUENCIES, PlantResponse
+from mimopilot.tuning.plant.local_polynomial import FREEDOM
 from mimopilot.tuning.plant.noise_spectrum import noise_root
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, ResponseShape, fit_shape, shape_response
@@ -45,6 +46,8 @@ class WideResponse:
     reach : (K, 2, 2) array
     noise : (K, 4, 4) array
         Square root of the spectrum of the noise of rates and angles, see `tuning.plant.noise_spectrum`.
+    noise_deviation : (K,) array
+        Relative standard deviation of the noise's size.
     body : RigidBody
     response : PlantResponse
         Everything that was measured, also outside the band.
@@ -61,6 +64,7 @@ class WideResponse:
     error_o: Complex
     reach: Complex
     noise: Complex
+    noise_deviation: Signal
     body: RigidBody
     response: PlantResponse
     shape: ResponseShape
@@ -73,13 +77,14 @@ class WideResponse:
         return weight
 
     def draw(self, generator: np.random.Generator) -> WideResponse:
-        """A plant drawn from the error of the response."""
+        """A plant drawn from the errors of the response and of the noise."""
         shape = (len(self.omega), 6, 2)
         X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
         return replace(
             self,
             G_i=self.G_i + self.error_i @ X @ self.reach,
             G_o=self.G_o + self.error_o @ X @ self.reach,
+            noise=self.noise * _column(1 + self.noise_deviation * generator.standard_normal(len(self.omega))),
         )
 
 
@@ -127,6 +132,7 @@ def wide_response(measured: PlantEstimates) -> WideResponse:
         error_o=error_o,
         reach=reach,
         noise=noise_root(measured.experiment, plant, omega),
+        noise_deviation=_noise_deviation(omega, measured.experiment.seconds),
         body=body,
         response=plant,
         shape=shape,
@@ -157,6 +163,16 @@ def hat_weights(omega: Signal, fine: Signal, values: NDArray[Any]) -> NDArray[An
     np.add.at(weights, cell, (products.T * (1 - part)).T)
     np.add.at(weights, cell + 1, (products.T * part).T)
     return weights
+
+
+def _noise_deviation(omega: Signal, seconds: float) -> Signal:
+    """Relative standard deviation of the size of a noise whose spectrum is a mean over windows of the DFT's bins.
+
+    The power of a mean over m bins deviates by 1 / sqrt(m), its square root by half of that. A window is `GROWTH` of its
+    frequency wide on both sides, or holds the least number of bins.
+    """
+    bins = np.maximum(FREEDOM, 2 * GROWTH * omega * seconds / (2 * np.pi))
+    return np.asarray(0.5 / np.sqrt(bins))
 
 
 def _trapezoid(omega: Signal) -> Signal:
