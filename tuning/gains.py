@@ -128,8 +128,8 @@ class Gains:
             if given is _NOT_GIVEN:
                 if self.uses(row):
                     raise TuningError(
-                        f"{row.section}.{name}: missing; it has no default while {row.option} is not 0: give it, or set "
-                        f"{row.option} to 0"
+                        f"{row.section}.{name}: missing; it has no default while {row.option} is not 0: give it, or "
+                        f"set {row.option} to 0"
                     )
                 given = np.full((2, 2), row.default)
             matrix = np.array(given, dtype=np.float64)

@@ -69,7 +69,8 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
 def _is_left_out(table: dict[str, Any], row: Row) -> bool:
     """Whether the file lacks a matrix that it may lack; `Gains` refuses that while the matrix' option is on."""
     section = table.get(row.section)
-    return row.shape is Shape.MATRIX and row.default is not None and isinstance(section, dict) and row.key not in section
+    optional = row.shape is Shape.MATRIX and row.default is not None
+    return optional and isinstance(section, dict) and row.key not in section
 
 
 def _entry(table: dict[str, Any], row: Row) -> Any:

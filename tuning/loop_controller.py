@@ -37,7 +37,8 @@ class LoopController:
         shapes = {np.shape(matrix) for matrix in self.gains.values()}
         if not self.gains or set(self.gains) - set(LOOP_TERMS) or len(shapes) != 1 or len(shapes.pop()) != 2:
             raise TuningError(
-                f"controller: got terms {sorted(self.gains)}, expected letters of {''.join(LOOP_TERMS)}, one shape for all"
+                f"controller: got terms {sorted(self.gains)}, expected letters of {''.join(LOOP_TERMS)}, "
+                "one shape for all"
             )
 
     @classmethod

@@ -85,7 +85,6 @@ def tune(
     import mimopilot as mp
     from mimopilot.tuning.errors import TuningError
     from mimopilot.tuning.logs.columns import load_columns
-    from mimopilot.tuning.parameters import MATRICES
     from mimopilot.tuning.spec import load_spec, parse_doublet, parse_model
 
     task = load_spec(
@@ -111,7 +110,7 @@ def tune(
     deviations = gains.provenance.standard_deviation
     warn(log, (warning for warning in gains.provenance.warnings if warning not in experiment.warnings))
     if as_json:
-        matrices: dict[str, Any] = {name: getattr(gains, name).tolist() for name in MATRICES}
+        matrices: dict[str, Any] = {name: matrix.tolist() for name, matrix in gains.matrices.items()}
         found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}
         certificate = gains.certificate.as_table() if gains.certificate else None
         print_json({**found, "derivative_cutoff_hz": gains.derivative_cutoff_hz, "certificate": certificate})
@@ -339,14 +338,12 @@ def read_warned(log: Path, columns: Path | None) -> Experiment:
 
 def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None:
     """The matrices of a set as a table, with standard deviations where they are known."""
-    from mimopilot.tuning.parameters import MATRICES
-
     rows = []
-    for name in MATRICES:
+    for name, matrix in gains.matrices.items():
         row = [name]
         for i in range(2):
             for j in range(2):
-                text = f"{getattr(gains, name)[i][j]:.4f}"
+                text = f"{matrix[i][j]:.4f}"
                 row.append(f"{text} ({deviations[name][i][j]:.4f})" if name in deviations else text)
         rows.append(row)
     print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch"], rows)
