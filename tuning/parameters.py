@@ -102,8 +102,8 @@ MODEL_DAMPING = Valid(0.1, 2.0)
 #: their sign: no mode alternates from sample to sample.
 MODEL_STEP = 0.25
 
-# Without motor lag the ideal Kff_o is 1, and the ideal Kaff_i the inertia over the torque of u = 1: of the size of Kd_i,
-# so of the same range.
+# Without motor lag the ideal Kff_o is 1, and the ideal Kaff_i the inertia over the torque of u = 1: of the size of
+# Kd_i, so of the same range.
 _MODEL_GAINS = tuple(
     replace(gain, default=0.0, option=MODEL)
     for gain in (

@@ -82,7 +82,7 @@ def test_each_feedforward_halves_the_distance_to_the_model_and_decouples(vehicle
     sets = (replace(gains, Kff_o=zero, Kaff_i=zero), replace(gains, Kaff_i=zero), gains)
     flights = [fly(vehicle.airframe, Autopilot(vehicle.airframe, one), scenario, 3, noise=False) for one in sets]
     model = gains.filters.followed.response(flights[0].record["setpoint"][:, 0].astype(float))
-    errors = [np.degrees(np.std(flight.record["attitude"][:, 0] - model)) for flight in flights]
+    errors = [np.degrees(np.sqrt(np.mean((one.record["attitude"][:, 0] - model) ** 2))) for one in flights]
     assert errors == pytest.approx([4.9, 2.3, 1.0], rel=0.1)
     coupled = fly(vehicle.airframe, fresh(vehicle), scenario, 3, noise=False).record["attitude"][:, 1]
     assert np.abs(flights[-1].record["attitude"][:, 1]).max() < 0.5 * np.abs(coupled).max()
