@@ -51,8 +51,11 @@ from mimopilot.tuning.gains import Gains
 CLOCK = 168e6
 #: Control period that the budget is for, s.
 PERIOD = 4e-3
-#: Limits, all chosen: instructions of a step, share of a period, bytes of code and of stack.
-MAX_INSTRUCTIONS, MAX_SHARE, MAX_TEXT_BYTES, MAX_STACK_BYTES = 400, 0.0015, 2048, 128
+#: Limits, all chosen: bytes of code and of stack; instructions of a step and share of a period, without and with model
+#: following.
+MAX_TEXT_BYTES, MAX_STACK_BYTES = 3072, 128
+MAX_STEP = (400, 0.0015)
+MAX_STEP_FOLLOWING = (540, 0.002)
 EMULATORS = ("unicorn", "qemu")
 #: C library functions that the controller may call: copying and filling memory.
 LIBRARY = {"memcpy", "memset", "memmove"}
@@ -208,7 +211,7 @@ def processor_in_the_loop(
         return [
             BudgetItem("rows", "rows", rows),
             BudgetItem("rows_different", "rows that differ from the host", different_rows(outputs, expected), 0),
-            *_time_items(step_costs(image, periods)),
+            *_time_items(step_costs(image, periods), *(MAX_STEP_FOLLOWING if gains.filters.followed else MAX_STEP)),
             *_size_items(image),
         ]
 
@@ -218,18 +221,18 @@ def different_rows(a: NDArray[Any], b: NDArray[Any]) -> int:
     return int((a.view(np.uint8) != b.view(np.uint8)).reshape(len(a), -1).any(axis=1).sum())
 
 
-def _time_items(costs: NDArray[np.int64]) -> list[BudgetItem]:
+def _time_items(costs: NDArray[np.int64], max_instructions: int, max_share: float) -> list[BudgetItem]:
     instructions, lower, upper = costs.T
     most = int(upper.max())
     return [
         BudgetItem("instructions_min", "instructions per step, minimum", int(instructions.min())),
         BudgetItem("instructions_mean", "instructions per step, mean", float(instructions.mean())),
-        BudgetItem("instructions_max", "instructions per step, maximum", int(instructions.max()), MAX_INSTRUCTIONS),
+        BudgetItem("instructions_max", "instructions per step, maximum", int(instructions.max()), max_instructions),
         BudgetItem("cycles_lower", "cycles of the longest step, lower estimate", int(lower.max())),
         BudgetItem("cycles_upper", "cycles of the longest step, upper estimate", most),
         BudgetItem("microseconds_lower", "the same at 168 MHz, us, lower estimate", float(lower.max() / CLOCK * 1e6)),
         BudgetItem("microseconds_upper", "the same at 168 MHz, us, upper estimate", most / CLOCK * 1e6),
-        BudgetItem("budget_share", "share of 4 ms, upper estimate", most / CLOCK / PERIOD, MAX_SHARE),
+        BudgetItem("budget_share", "share of 4 ms, upper estimate", most / CLOCK / PERIOD, max_share),
     ]
 
 

@@ -39,6 +39,15 @@ OUTPUT = np.dtype(
     ]
 )
 
+MODEL = np.dtype(
+    [
+        ("angle", "<f4", 2),
+        ("rate", "<f4", 2),
+        ("acceleration", "<f4", 2),
+        ("running", "<i4"),
+    ]
+)
+
 STATE = np.dtype(
     [
         ("gains", "<f4", len(PARAMETERS)),
@@ -49,6 +58,7 @@ STATE = np.dtype(
         ("rates", "<f4", 3),
         ("age", "<i4", 9),
         ("fault_count", "<u4"),
+        ("model", MODEL),
     ]
 )
 

@@ -144,6 +144,8 @@ def _validity() -> Iterator[str]:
                 yield f"{member} {'>=' if row.valid.lowest_included else '>'} {float_literal(low)}"
             if math.isfinite(high):
                 yield f"{member} {'<=' if row.valid.highest_included else '<'} {float_literal(high)}"
+            if math.isfinite(row.largest_in_period):
+                yield f"{member} * gains.period <= {float_literal(row.largest_in_period)}"
 
 
 def _manifest(files: dict[str, str], gains: Gains, target: str) -> str:

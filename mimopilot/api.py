@@ -129,7 +129,7 @@ def tune(
 
     task = _spec(spec, {"inner": inner, "outer": outer, **options})
     second = None if repeat is None else _experiment(repeat, columns)
-    logs = log if isinstance(log, list | tuple) else [log]
+    logs: Sequence[Log] = log if isinstance(log, list | tuple) else [log]  # type: ignore[list-item]
     return tune_cascade([_experiment(one, columns) for one in logs], task, repeat=second)
 
 

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 # As the command line does, before numpy is loaded: results are compared with printed ones.
@@ -42,6 +43,17 @@ def coupled_gains() -> Gains:
         filters=Filters(Ts=0.004, derivative_cutoff_hz=30.0),
         limits=Limits(rate_max=(5.0, 4.0, 3.0), moment_max=(1.0, 0.9, 0.8), integral_max=(0.3, 0.25, 0.2)),
         moment_scale=(2.54592, 2.54592, 0.2736),
+    )
+
+
+def following_gains() -> Gains:
+    """`coupled_gains` with model following: another controller, with both of its matrices full."""
+    gains = coupled_gains()
+    return replace(
+        gains,
+        filters=replace(gains.filters, model_omega=9.0, model_damping=0.8),
+        Kff_o=np.array([[0.9, 0.04], [-0.03, 1.05]]),
+        Kaff_i=np.array([[0.006, 0.0005], [-0.0004, 0.007]]),
     )
 
 

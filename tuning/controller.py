@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import MATRICES
+from mimopilot.tuning.parameters import MATRICES, YAW_GAINS
 
 # The same numbers as in `firmware_templates/core/mimo_pid.hpp`.
 #: Periods for which the last valid input replaces an invalid one: 0.1 s at 250 Hz.
@@ -35,6 +35,15 @@ class Step:
     fault_count: int
 
 
+@dataclass(frozen=True)
+class ModelState:
+    """Attitude model of roll and pitch: angle (rad), rate (rad/s) and angular acceleration (rad/s^2)."""
+
+    angle: list[Any]
+    rate: list[Any]
+    acceleration: list[Any]
+
+
 class Controller:
     """The flown controller, one period at a time, in the precision of `dtype`.
 
@@ -54,6 +63,8 @@ class Controller:
         self.setpoint, self.attitude, self.rates = list(zero), list(zero), list(zero)
         self.age = [[HOLD_SAMPLES + 1] * 3 for _ in range(3)]
         self.fault_count = 0
+        #: None: it starts at the measured attitude, at rest, with the next armed sample without a fault.
+        self.model: ModelState | None = None
 
     def _load(self, gains: Gains) -> None:
         """Round and store the gains: block-diagonal 3x3 matrices, yaw last."""
@@ -62,7 +73,7 @@ class Controller:
             name: [
                 [f(v) for v in getattr(gains, name)[0]] + [f(0)],
                 [f(v) for v in getattr(gains, name)[1]] + [f(0)],
-                [f(0), f(0), f(getattr(gains.yaw, name))],
+                [f(0), f(0), f(getattr(gains.yaw, name)) if name in YAW_GAINS else f(0)],
             ]
             for name in MATRICES
         }
@@ -70,6 +81,7 @@ class Controller:
         self.moment_max = [f(v) for v in gains.limits.moment_max]
         self.integral_max = [f(v) for v in gains.limits.integral_max]
         self.pole, self.period = f(gains.filters.derivative_pole), f(gains.Ts)
+        self.omega, self.damping = f(gains.filters.model_omega), f(gains.filters.model_damping)
 
     def _times(self, name: str, x: list[Any], axis: int) -> Any:
         """One row of a matrix times x."""
@@ -79,31 +91,58 @@ class Controller:
     def _clamp(self, value: Any, limit: Any) -> Any:
         return limit if value > limit else -limit if value < -limit else value
 
-    def _rates_setpoint(self) -> list[Any]:
+    def _advanced_model(self) -> ModelState | None:
+        """The attitude model one period later; None: no model following."""
+        if self.omega == 0:
+            return None
+        if self.model is None:
+            zero = self.f(0)
+            return ModelState(self.attitude[:2], [zero, zero], [zero, zero])
+        stiffness, friction = self.omega * self.omega, self.f(2) * self.damping * self.omega
+        angle, rate, acceleration = [], [], []
+        for j in range(2):
+            acceleration.append(stiffness * (self.setpoint[j] - self.model.angle[j]) - friction * self.model.rate[j])
+            rate.append(self.model.rate[j] + self.period * acceleration[j])
+            angle.append(self.model.angle[j] + self.period * rate[j])
+        return ModelState(angle, rate, acceleration)
+
+    def _rates_setpoint(self, model: ModelState | None) -> list[Any]:
         f = self.f
-        error = [s - a for s, a in zip(self.setpoint, self.attitude, strict=True)]
+        wanted = self.setpoint if model is None else [*model.angle, self.setpoint[2]]
+        error = [s - a for s, a in zip(wanted, self.attitude, strict=True)]
         turn, half_turn = f(2 * np.pi), f(np.pi)
         while error[2] > half_turn:
             error[2] = error[2] - turn
         while error[2] < -half_turn:
             error[2] = error[2] + turn
-        return [self._clamp(self._times("Kp_o", error, j), self.rate_max[j]) for j in range(3)]
+        r = [self._times("Kp_o", error, j) for j in range(3)]
+        if model is not None:
+            r = [r[0] + self._times("Kff_o", model.rate, 0), r[1] + self._times("Kff_o", model.rate, 1), r[2]]
+        return [self._clamp(r[j], self.rate_max[j]) for j in range(3)]
 
-    def _output(self, integral: list[Any]) -> list[Any]:
-        """V = ((Kp e + I) - Kd d) + Kff r, in this order of rounding."""
-        r = self._rates_setpoint()
+    def _output(self, integral: list[Any], model: ModelState | None) -> list[Any]:
+        """V = ((Kp e + I) - Kd d) + (Kff r + Kaff al), in this order of rounding."""
+        r = self._rates_setpoint(model)
         e = [a - b for a, b in zip(r, self.rates, strict=True)]
+        feedforward = [self._times("Kff_i", r, j) for j in range(3)]
+        if model is not None:
+            for j in range(2):
+                feedforward[j] = feedforward[j] + self._times("Kaff_i", model.acceleration, j)
         return [
-            ((self._times("Kp_i", e, j) + integral[j]) - self._times("Kd_i", self.derivative, j))
-            + self._times("Kff_i", r, j)
+            ((self._times("Kp_i", e, j) + integral[j]) - self._times("Kd_i", self.derivative, j)) + feedforward[j]
             for j in range(3)
         ]
 
     def set_gains(self, gains: Gains) -> None:
-        """Change the gains; I is adjusted within its limit so that the output is continuous (bumpless)."""
-        before = self._output(self.integral)
+        """Change the gains; I is adjusted within its limit so that the output is continuous (bumpless).
+
+        The outputs compared are those of the next period if the inputs stay as they are.
+        """
+        before = self._output(self.integral, self._advanced_model())
         self._load(gains)
-        rest = self._output([self.f(0)] * 3)
+        rest = self._output([self.f(0)] * 3, self._advanced_model())
+        if self.omega == 0:
+            self.model = None
         for j in range(3):
             integrates = any(gain != 0 for gain in self.matrix["Ki_i"][j])
             self.integral[j] = self._clamp(before[j] - rest[j], self.integral_max[j]) if integrates else self.f(0)
@@ -141,7 +180,7 @@ class Controller:
         saturation : (3,) array, optional
             Sign of the torque that the allocator could not produce in the last period.
         armed, landed : bool
-            Disarmed: I = 0. Landed: I held.
+            Disarmed: I = 0, and the attitude model stays at the measured attitude. Landed: I held.
         """
         f = self.f
         u_bar = [f(0)] * 3 if excitation is None else [f(v) for v in excitation]
@@ -164,23 +203,28 @@ class Controller:
         if fault:
             return self._damp_rates(valid, fault, armed)
 
-        r = self._rates_setpoint()
+        if not armed:
+            self.model = None
+        model = self._advanced_model()
+        self.model = model if armed else None
+        r = self._rates_setpoint(model)
         e = [a - b for a, b in zip(r, self.rates, strict=True)]
         dI = [self.period * self._times("Ki_i", e, j) for j in range(3)]
-        attempt = self._output([i + d for i, d in zip(self.integral, dI, strict=True)])
+        attempt = self._output([i + d for i, d in zip(self.integral, dI, strict=True)], model)
         for j in range(3):
             high = attempt[j] + u_bar[j] > self.moment_max[j] or flags[j] > 0
             low = attempt[j] + u_bar[j] < -self.moment_max[j] or flags[j] < 0
             if landed or (high and dI[j] > 0) or (low and dI[j] < 0):
                 dI[j] = f(0)
             self.integral[j] = self._clamp(self.integral[j] + dI[j], self.integral_max[j]) if armed else f(0)
-        v = self._output(self.integral)
+        v = self._output(self.integral, model)
         u = [self._clamp(v[j] + u_bar[j], self.moment_max[j]) for j in range(3)]
         return Step(np.array(u, f), np.array(r, f), 0, self.fault_count)
 
     def _damp_rates(self, valid: list[bool], fault: int, armed: bool) -> Step:
         """U = -Kp y_i - Kd d on axes with a valid rate, zero on the others; I is frozen."""
         f = self.f
+        self.model = None
         if not armed:
             self.integral = [f(0)] * 3
         y = [rate if ok else f(0) for rate, ok in zip(self.rates, valid, strict=True)]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, Filters
 from mimopilot.tuning.parameters import MATRICES
 
 Signal = NDArray[np.float64]
@@ -21,7 +21,7 @@ class GainStack:
 
     Attributes
     ----------
-    Kp_o, Kp_i, Ki_i, Kd_i, Kff_i : (K, 1, 2, 2) arrays
+    Kp_o, Kp_i, Ki_i, Kd_i, Kff_i, Kff_o, Kaff_i : (K, 1, 2, 2) arrays
         As in `tuning.gains.Gains`.
     limits : (3, 2) array
         Of rates (rad/s), torque and integral, the same for all.
@@ -34,6 +34,8 @@ class GainStack:
     Ki_i: Signal
     Kd_i: Signal
     Kff_i: Signal
+    Kff_o: Signal
+    Kaff_i: Signal
     limits: Signal
     filters: Filters
 
@@ -57,5 +59,6 @@ class GainStack:
         return GainStack(**every, limits=self.limits, filters=self.filters)
 
     def stacked(self) -> Signal:
-        """All matrices in one array, (K, 5, 2, 2)."""
-        return np.concatenate([getattr(self, name) for name in MATRICES], axis=1)
+        """The attitude controller's matrix and those of `tuning.law.LOOP_TERMS` in one array, (K, 5, 2, 2)."""
+        names = (ATTITUDE.matrix, *(term.matrix for term in LOOP_TERMS.values()))
+        return np.concatenate([getattr(self, name) for name in names], axis=1)

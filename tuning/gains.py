@@ -1,6 +1,7 @@
 """The gains of the cascaded controller: the contract between tuning, code generation and simulation.
 
 One controller is five 2x2 matrices for roll and pitch, five scalars for yaw, its period and filters, and its limits.
+Model following adds two matrices.
 Element (i, j) of a matrix maps the error on axis j to output i. Every scalar has a short code, such as ``RP_RR``
 (rate P, roll from roll). On a vehicle the parameter's name is that code with the prefix ``MIMO_``. The table of all of
 them is `tuning.parameters`.
@@ -23,7 +24,7 @@ from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameter_row import ANY, AXES, POSITIVE, Row, Shape, Valid
-from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, rows
+from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, YAW_GAINS, rows
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
 
@@ -33,6 +34,8 @@ Triple = tuple[float, float, float]
 #: Reference models of the thesis' flights (chapter 6): rate loop, attitude loop.
 THESIS_INNER = (SecondOrder(20.0, 0.4),) * 2
 THESIS_OUTER = (SecondOrder(10.0, 0.7),) * 2
+#: Stands for a matrix that was not given: zeros, but only while the option that it belongs to is off.
+_NOT_GIVEN: Matrix = np.empty((0, 0))
 #: Schema of the gains file.
 SCHEMA = 2
 #: Seal of a certificate that was read from a gains file of schema 1.
@@ -88,6 +91,9 @@ class Gains:
         Control period and filters.
     limits : Limits
         Saturations.
+    Kff_o, Kaff_i : (2, 2) arrays, 1, s^2
+        Model following: rate setpoint from the rate of the attitude model, torque from its angular acceleration. Zero
+        if not given, which is an error while the model is on (`filters.model_omega`).
     moment_scale : tuple of 3 float or None, N m
         Torque of u = 1 on roll, pitch and yaw. None: not known.
     certificate : Certificate or None
@@ -99,7 +105,7 @@ class Gains:
     Raises
     ------
     TuningError
-        When a matrix is not 2x2, a number is not finite, or a limit is out of its range.
+        When a matrix is not 2x2 or is missing, a number is not finite, or a limit is out of its range.
     """
 
     Kp_o: Matrix
@@ -110,13 +116,23 @@ class Gains:
     yaw: YawGains
     filters: Filters
     limits: Limits = Limits()
+    Kff_o: Matrix = field(default_factory=lambda: _NOT_GIVEN)
+    Kaff_i: Matrix = field(default_factory=lambda: _NOT_GIVEN)
     moment_scale: Triple | None = None
     certificate: Certificate | None = None
     provenance: Provenance = field(default_factory=Provenance)
 
     def __post_init__(self) -> None:
-        for name in MATRICES:
-            matrix = np.array(getattr(self, name), dtype=np.float64)
+        for row in rows(Shape.MATRIX):
+            name, given = row.key, getattr(self, row.key)
+            if given is _NOT_GIVEN:
+                if self.uses(row):
+                    raise TuningError(
+                        f"{row.section}.{name}: missing; it has no default while {row.option} is not 0: give it, or "
+                        f"set {row.option} to 0"
+                    )
+                given = np.full((2, 2), row.default)
+            matrix = np.array(given, dtype=np.float64)
             if matrix.shape != (2, 2):
                 raise TuningError(f"{name}: got shape {matrix.shape}, expected (2, 2), roll then pitch")
             matrix.flags.writeable = False
@@ -126,13 +142,21 @@ class Gains:
             for where, value in self._named(row):
                 if not valid.holds(value):
                     raise TuningError(f"{where}: got {value}{_unit(row)}, expected {_expectation(valid)}")
+                if _exceeds_period(row, value, self.Ts):
+                    raise TuningError(
+                        f"{where}: got {value}{_unit(row)}, expected at most {row.largest_in_period:g}/Ts, "
+                        f"{row.largest_in_period / self.Ts:g}{_unit(row)}"
+                    )
         for axis, value in zip(AXES, self.moment_scale or (), strict=False):
             if not POSITIVE.holds(value):
                 raise TuningError(f"moment_scale ({axis}): got {value} N m, expected {POSITIVE}")
 
     @classmethod
     def from_rows(cls, values: Mapping[Row, Any], **others: Any) -> Gains:
-        """A set from what it holds for each row of the parameter table, see `of`; `others`: the other attributes."""
+        """A set from what it holds for the rows of the parameter table, see `of`; `others`: the other attributes.
+
+        A row with a default may be left out.
+        """
         parts: dict[Shape, dict[str, Any]] = {shape: {} for shape in Shape}
         for row, value in values.items():
             shaped = np.reshape(value, (2, 2)) if row.shape is Shape.MATRIX else value
@@ -165,6 +189,19 @@ class Gains:
         """Value of a row of the parameter table: a matrix, a triple or a number."""
         holder = {Shape.MATRIX: self, Shape.YAW: self.yaw, Shape.AXES: self.limits}.get(row.shape, self.filters)
         return getattr(holder, row.key)
+
+    def uses(self, row: Row) -> bool:
+        """Whether a row has an effect: it belongs to no option, or to one that is switched on."""
+        return not row.option or getattr(self.filters, row.option) != 0
+
+    @property
+    def matrices(self) -> dict[str, Matrix]:
+        """Name -> gain matrix of those that are used; see `uses`."""
+        return {row.key: self.of(row) for row in rows(Shape.MATRIX) if self.uses(row)}
+
+    def at_default(self, row: Row) -> bool:
+        """Whether every number of a row is its default; False if it has none."""
+        return row.default is not None and all(value == row.default for value in self._values(row))
 
     def _values(self, row: Row) -> list[float]:
         """`of` as a list, in the order of `Row.codes`."""
@@ -236,7 +273,7 @@ class Gains:
         numbers: dict[str, float] = {}
         for row in ROWS:
             values = self._values(row)
-            if row.default is None or any(value != row.default for value in values):
+            if not self.at_default(row):
                 numbers |= dict(zip(row.codes, (row.element(value, self.Ts) for value in values), strict=True))
                 numbers |= {row.key: values[0]} if row.shape is Shape.POLE else {}
         return sha256(json.dumps([content, numbers, self.moment_scale], sort_keys=True, default=str))
@@ -275,7 +312,7 @@ class Gains:
             raise TuningError("moment_scale: the torque of u = 1 in N m is not known; write it into the gains file")
         ratio = np.array(self.moment_scale) / np.array(scale)
         matrices = {name: getattr(self, name) * ratio[:2, None] for name in MATRICES if name.endswith("_i")}
-        yaw = {name: getattr(self.yaw, name) * float(ratio[2]) for name in MATRICES if name.endswith("_i")}
+        yaw = {name: getattr(self.yaw, name) * float(ratio[2]) for name in YAW_GAINS if name.endswith("_i")}
         limits = {
             name: tuple(min(float(v * r), 1.0) for v, r in zip(getattr(self.limits, name), ratio, strict=True))
             for name in ("moment_max", "integral_max")
@@ -306,8 +343,23 @@ def _unit(row: Row) -> str:
     return f" {row.unit}" if row.unit and row.shape in (Shape.SCALAR, Shape.AXES) and row.unit != "norm" else ""
 
 
+def _exceeds_period(row: Row, value: float, Ts: float) -> bool:
+    """Whether the product with the period is too large; in single precision, as the controller checks it."""
+    if not np.isfinite(row.largest_in_period):
+        return False
+    with np.errstate(over="ignore"):
+        return bool(np.float32(value) * np.float32(Ts) > np.float32(row.largest_in_period))
+
+
 def _expectation(valid: Valid) -> str:
     return str(valid) if valid != ANY else f"{valid}; tune again or correct the file"
+
+
+#: The law of a set with model following, in its file.
+_MODEL_COMMENT = (
+    "# Model following, roll and pitch: th is the angle of the attitude model, second order from r_o (model_omega,",
+    "# model_damping):  r_i = Kp_o (th - y_o) + Kff_o dth/dt;  u has the additional term Kaff_i d2th/dt2",
+)
 
 
 def gains_to_toml(gains: Gains) -> str:
@@ -315,22 +367,26 @@ def gains_to_toml(gains: Gains) -> str:
 
     def line(row: Row) -> str:
         value = gains.of(row)
-        notes = {Shape.SCALAR: row.unit, Shape.POLE: "0: no filter"}
-        note = f"  # {notes[row.shape]}" if row.shape in notes else ""
+        note = {Shape.SCALAR: row.unit, Shape.POLE: "0: no filter"}.get(row.shape, "")
         plain = np.asarray(value, dtype=np.float64).tolist()
-        return f"{row.key} = {toml_value(plain)}{note}"
+        return f"{row.key} = {toml_value(plain)}{f'  # {note}' if note else ''}"
 
+    def lines_of(shape: Shape) -> list[str]:
+        return [line(row) for row in rows(shape) if not (row.option and not gains.uses(row) and gains.at_default(row))]
+
+    following = bool(gains.filters.model_omega)
     scale = toml_value(list(gains.moment_scale)) if gains.moment_scale else '"unknown"'
     lines = [
         "# mimopilot gains. Row: output; column: error; roll then pitch. Positive Kd damps.",
         "# r_i = Kp_o (r_o - y_o);  u = Kp_i (r_i - y_i) + I - Kd_i dy_i/dt + Kff_i r_i,  I += Ts Ki_i (r_i - y_i)",
+        *(_MODEL_COMMENT if following else ()),
         f"schema = {SCHEMA}",
-        *map(line, rows(Shape.SCALAR)),
-        *map(line, rows(Shape.POLE)),
+        *lines_of(Shape.SCALAR),
+        *lines_of(Shape.POLE),
         f"moment_scale = {scale}  # N m that u = 1 stands for: roll, pitch, yaw",
     ]
     for shape, head in ((Shape.MATRIX, ""), (Shape.YAW, ""), (Shape.AXES, "  # roll, pitch, yaw")):
-        lines += ["", f"[{rows(shape)[0].section}]{head}", *map(line, rows(shape))]
+        lines += ["", f"[{rows(shape)[0].section}]{head}", *lines_of(shape)]
     tables = {"certificate": gains.certificate, "provenance": gains.provenance}
     for name, content in tables.items():
         entries = content.as_table() if content is not None else {}

@@ -51,7 +51,7 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
         if not isinstance(table.get(name, {}), dict):
             raise TuningError(f"{where}: {name}: got {shown(table[name])}, expected a table")
     try:
-        values = {row: _entry(table, row) for row in ROWS}
+        values = {row: _entry(table, row) for row in ROWS if not _is_left_out(table, row)}
         certificate = Certificate.from_table(table["certificate"]) if "certificate" in table else None
         if certificate is not None and schema == 1:
             certificate = replace(certificate, seal=SCHEMA_1)
@@ -64,6 +64,13 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
         )
     except (Error, OverflowError) as error:
         raise TuningError(f"{where}: {error}") from error
+
+
+def _is_left_out(table: dict[str, Any], row: Row) -> bool:
+    """Whether the file lacks a matrix that it may lack; `Gains` refuses that while the matrix' option is on."""
+    section = table.get(row.section)
+    optional = row.shape is Shape.MATRIX and row.default is not None
+    return optional and isinstance(section, dict) and row.key not in section
 
 
 def _entry(table: dict[str, Any], row: Row) -> Any:

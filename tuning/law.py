@@ -3,6 +3,12 @@
     r = Kp_o (r_o - y_o)                                attitude controller: rate setpoint
     u = Kp e + Ki I(e) - Kd D(y) + Kff r + u_bar        rate controller, e = r - y
 
+With model following, roll and pitch follow an attitude model with angle th, rate w and acceleration al; see
+`tuning.reference_model.followed_model`:
+
+    r = Kp_o (th - y_o) + Kff_o w
+    u = Kp e + Ki I(e) - Kd D(y) + Kff r + Kaff al + u_bar
+
 Each term is a gain matrix, the signal that it acts on and a first-order filter. All of tuning derives the law from
 `TERMS`: VRFT's regressors, the inverse (`tuning.law_inverse`), the frequency response, the state space and the
 predicted doublets. The generated C++ and its reference, `tuning.controller`, are written by hand. Tests compare the
@@ -19,19 +25,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.parameter_row import pole_of
+from mimopilot.tuning.reference_model import ReferenceModel, followed_model
 
 Signal = NDArray[np.float64]
 Response = NDArray[np.complex128]
 
 #: Signals of the rate controller that a term can act on.
 ERROR, RATE, SETPOINT = "error", "rate", "setpoint"
+#: Signals of the attitude model that a term can act on: outside of the loop.
+MODEL_RATE, MODEL_ACCELERATION = "model rate", "model acceleration"
 #: Condition number above which a matrix counts as singular in double precision.
 SINGULAR = 1e12
 
 
 @dataclass(frozen=True)
 class Filters:
-    """Period and filters of the law.
+    """Period, filters and attitude model of the law.
 
     Attributes
     ----------
@@ -39,15 +48,26 @@ class Filters:
         Control period.
     derivative_cutoff_hz : float, Hz
         Cut-off f_d of the derivative's first-order filter; 0 means no filter.
+    model_omega : float, rad/s
+        Natural frequency of the attitude model; 0 means no model following.
+    model_damping : float
+        Damping ratio of the attitude model.
     """
 
     Ts: float
     derivative_cutoff_hz: float = 0.0
+    model_omega: float = 0.0
+    model_damping: float = 0.7
 
     @property
     def derivative_pole(self) -> float:
         """Pole a = exp(-2 pi f_d Ts) of the derivative filter; 0 when f_d = 0."""
         return pole_of(self.derivative_cutoff_hz, self.Ts)
+
+    @property
+    def followed(self) -> ReferenceModel | None:
+        """Attitude model of roll and of pitch; None: no model following."""
+        return followed_model(self.model_omega, self.model_damping, self.Ts) if self.model_omega else None
 
 
 @dataclass(frozen=True)
@@ -102,7 +122,7 @@ class Term:
     matrix : str
         Name of its gain matrix in `tuning.gains.Gains`.
     signal : str
-        Signal that it acts on: `ERROR`, `RATE` or `SETPOINT`.
+        Signal that it acts on: `ERROR`, `RATE`, `SETPOINT`, `MODEL_RATE` or `MODEL_ACCELERATION`.
     sign : int
         Sign with which it is added to u.
     filter : callable
@@ -130,11 +150,16 @@ TERMS = {
     "I": Term("Ki_i", ERROR, filter=_integral),
     "D": Term("Kd_i", RATE, -1, _derivative),
     "F": Term("Kff_i", SETPOINT),
+    "A": Term("Kaff_i", MODEL_ACCELERATION),
 }
+#: Those on signals of the rate loop. Tuning estimates them; the others do not change its stability.
+LOOP_TERMS = {letter: term for letter, term in TERMS.items() if term.signal in (ERROR, RATE, SETPOINT)}
 
 
 #: The attitude controller, which makes the rate setpoint; its error is that of the angles.
 ATTITUDE = Term("Kp_o", ERROR)
+#: Its feed-forward from the attitude model.
+ATTITUDE_FEEDFORWARD = Term("Kff_o", MODEL_RATE)
 
 
 class Matrices(Protocol):
@@ -146,8 +171,8 @@ class Matrices(Protocol):
 
 
 def rate_matrices(gains: Matrices) -> dict[str, Signal]:
-    """Letter -> matrix of the rate controller."""
-    return {letter: getattr(gains, term.matrix) for letter, term in TERMS.items()}
+    """Letter of `LOOP_TERMS` -> matrix of the rate controller."""
+    return {letter: getattr(gains, term.matrix) for letter, term in LOOP_TERMS.items()}
 
 
 def regressors(letters: str, error: Signal, rate: Signal, setpoint: Signal, filters: Filters) -> Signal:
@@ -156,7 +181,7 @@ def regressors(letters: str, error: Signal, rate: Signal, setpoint: Signal, filt
     Parameters
     ----------
     letters : str
-        Letters of `TERMS`, in that order.
+        Letters of `LOOP_TERMS`, in that order.
     error, rate, setpoint : (N, n) arrays
     filters : Filters
 
@@ -167,7 +192,7 @@ def regressors(letters: str, error: Signal, rate: Signal, setpoint: Signal, filt
     signals = {ERROR: error, RATE: rate, SETPOINT: setpoint}
     columns = []
     for letter in letters:
-        term = TERMS[letter]
+        term = LOOP_TERMS[letter]
         shape = term.filter(filters)
         filtered = signals[term.signal] if shape is None else shape.run(signals[term.signal])
         columns.append(filtered if term.sign > 0 else -filtered)
@@ -180,7 +205,7 @@ def rate_response(matrices: Mapping[str, Signal], filters: Filters, omega: Signa
     Parameters
     ----------
     matrices : mapping
-        Letter -> (..., n_u, n_y) matrix.
+        Letter of `LOOP_TERMS` -> (..., n_u, n_y) matrix.
     filters : Filters
     omega : (K,) array, rad/s
 
@@ -191,7 +216,7 @@ def rate_response(matrices: Mapping[str, Signal], filters: Filters, omega: Signa
     z = np.exp(1j * np.asarray(omega) * filters.Ts)[:, None, None]
     of_r: Any = np.zeros_like(z)
     of_y: Any = np.zeros_like(z)
-    for letter, term in TERMS.items():
+    for letter, term in LOOP_TERMS.items():
         if letter in matrices:
             shape, matrix = term.filter(filters), term.sign * matrices[letter]
             part = matrix if shape is None else shape.times(matrix, z)
@@ -225,7 +250,7 @@ def state_space(matrices: Mapping[str, Signal], filters: Filters) -> StateSpaceL
     Parameters
     ----------
     matrices : mapping
-        Letter -> (n_u, n) matrix.
+        Letter of `LOOP_TERMS` -> (n_u, n) matrix.
     filters : Filters
     """
     n_u, n = np.shape(next(iter(matrices.values())))
@@ -233,7 +258,7 @@ def state_space(matrices: Mapping[str, Signal], filters: Filters) -> StateSpaceL
     poles: list[float] = []
     inputs: list[tuple[str, Signal]] = []
     outputs: list[Signal] = []
-    for letter, term in TERMS.items():
+    for letter, term in LOOP_TERMS.items():
         if letter not in matrices:
             continue
         shape, matrix = term.filter(filters), term.sign * np.asarray(matrices[letter], float)
@@ -254,8 +279,29 @@ def attitude_matrix(gains: Matrices) -> Signal:
     return matrix
 
 
-def cascade_response(gains: Matrices, omega: Signal) -> tuple[Response, Response]:
-    """Frequency response of both controllers: u = C_o (r_o - y_o) - C_y y_i.
+def model_response(filters: Filters, omega: Signal) -> tuple[Response, Response, Response]:
+    """Frequency response of the attitude model, from attitude setpoint to its angle, rate and acceleration.
+
+    Parameters
+    ----------
+    filters : Filters
+        With a model; without one 1, 0 and 0: the setpoint itself, without feed-forward.
+    omega : (K,) array, rad/s
+
+    Returns
+    -------
+    angle, rate, acceleration : (K, 1, 1) arrays, 1, 1/s, 1/s^2
+    """
+    model, z = filters.followed, np.exp(1j * np.asarray(omega) * filters.Ts)[:, None, None]
+    if model is None:
+        return np.ones_like(z), np.zeros_like(z), np.zeros_like(z)
+    angle = model.frequency_response(omega)[:, None, None]
+    difference = (1 - 1 / z) / filters.Ts
+    return angle, difference * angle, difference**2 * angle
+
+
+def cascade_response(gains: Matrices, omega: Signal) -> tuple[Response, Response, Response]:
+    """Frequency response of both controllers: u = C_ref r_o - C_o y_o - C_y y_i.
 
     Parameters
     ----------
@@ -264,10 +310,16 @@ def cascade_response(gains: Matrices, omega: Signal) -> tuple[Response, Response
 
     Returns
     -------
-    C_o, C_y : (..., K, 2, 2) arrays
+    C_ref, C_o, C_y : (..., K, 2, 2) arrays
+        Without model following C_ref is C_o.
     """
     of_r, of_y = rate_response(rate_matrices(gains), gains.filters, omega)
-    return of_r @ attitude_matrix(gains), of_y
+    of_angle = of_r @ attitude_matrix(gains)
+    if gains.filters.followed is None:
+        return of_angle, of_angle, of_y
+    angle, rate, acceleration = model_response(gains.filters, omega)
+    feedforward = of_r @ getattr(gains, ATTITUDE_FEEDFORWARD.matrix) * rate
+    return of_angle * angle + feedforward + getattr(gains, TERMS["A"].matrix) * acceleration, of_angle, of_y
 
 
 class AllAxes(Matrices, Protocol):
@@ -295,15 +347,20 @@ def response(gains: AllAxes, omega: Signal) -> Response:
 
     def whole(name: str) -> Signal:
         matrix = np.zeros((3, 3))
-        matrix[:2, :2], matrix[2, 2] = getattr(gains, name), getattr(gains.yaw, name)
+        matrix[:2, :2], matrix[2, 2] = getattr(gains, name), getattr(gains.yaw, name, 0.0)
         return matrix
 
-    attitude, eye, none = whole(ATTITUDE.matrix), np.eye(3), np.zeros((3, 3))
-    matrices = {letter: whole(term.matrix) for letter, term in TERMS.items()}
+    eye, none = np.eye(3), np.zeros((3, 3))
+    roll_pitch, yaw = np.diag([1.0, 1.0, 0.0]), np.diag([0.0, 0.0, 1.0])
+    angle, rate, acceleration = (roll_pitch * part for part in model_response(gains.filters, omega))
+    attitude = whole(ATTITUDE.matrix)
+    matrices = {letter: whole(term.matrix) for letter, term in LOOP_TERMS.items()}
     found = np.zeros((len(omega), 6, 12), np.complex128)
-    found[:, :3] = np.hstack([attitude, -attitude, none, none])
+    found[:, :3] = np.hstack([none, -attitude, none, none])
+    found[:, :3, :3] = attitude @ (angle + yaw) + whole(ATTITUDE_FEEDFORWARD.matrix) @ rate
     of_r, of_y = rate_response(matrices, gains.filters, omega)
     found[:, 3:] = of_r @ found[:, :3]
+    found[:, 3:, :3] += whole(TERMS["A"].matrix) @ acceleration
     found[:, 3:, 6:9] -= of_y
     found[:, 3:, 9:] = eye
     return found

@@ -13,9 +13,9 @@ from scipy.signal import lfilter
 from mimopilot.tuning.errors import NotMinimumPhaseError
 from mimopilot.tuning.law import (
     ERROR,
+    LOOP_TERMS,
     RATE,
     SINGULAR,
-    TERMS,
     Filters,
     Matrices,
     Signal,
@@ -65,7 +65,7 @@ def inverse_law(matrices: Mapping[str, Signal], filters: Filters) -> InverseLaw:
     """
     direct: Any = 0.0
     poles, pushes = [], []
-    for letter, term in TERMS.items():
+    for letter, term in LOOP_TERMS.items():
         if letter in matrices and term.signal != RATE:
             shape, matrix = term.filter(filters), matrices[letter]
             direct = direct + (matrix if shape is None else shape.direct * matrix)
@@ -122,7 +122,7 @@ def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Si
             f"Ki_i = {matrices['I'].round(6).tolist()} should be positive definite"
         )
     known = u
-    for letter, term in TERMS.items():  # remove the part of u that the measured rates alone give
+    for letter, term in LOOP_TERMS.items():  # remove the part of u that the measured rates alone give
         if term.signal != ERROR:
             known = known - regressors(letter, rates, rates, rates, filters) @ matrices[letter].T
     n = u.shape[1]

@@ -9,7 +9,7 @@ import numpy as np
 
 from mimopilot.tuning import law
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law import TERMS, Filters
+from mimopilot.tuning.law import LOOP_TERMS, Filters
 from mimopilot.tuning.statespace import Response, Signal, StateSpace
 
 
@@ -35,9 +35,10 @@ class LoopController:
 
     def __post_init__(self) -> None:
         shapes = {np.shape(matrix) for matrix in self.gains.values()}
-        if not self.gains or set(self.gains) - set(TERMS) or len(shapes) != 1 or len(shapes.pop()) != 2:
+        if not self.gains or set(self.gains) - set(LOOP_TERMS) or len(shapes) != 1 or len(shapes.pop()) != 2:
             raise TuningError(
-                f"controller: got terms {sorted(self.gains)}, expected letters of {''.join(TERMS)}, one shape for all"
+                f"controller: got terms {sorted(self.gains)}, expected letters of {''.join(LOOP_TERMS)}, "
+                "one shape for all"
             )
 
     @classmethod
@@ -54,7 +55,7 @@ class LoopController:
     @property
     def terms(self) -> str:
         """Structure: letters of ``PIDF`` in that order."""
-        return "".join(term for term in TERMS if term in self.gains)
+        return "".join(term for term in LOOP_TERMS if term in self.gains)
 
     def gain(self, term: str) -> Signal:
         """Matrix of a term; zeros if the structure lacks it."""

@@ -74,6 +74,7 @@ class Valid:
 
 ANY = Valid()
 POSITIVE = Valid(lowest=0.0, lowest_included=False)
+NOT_NEGATIVE = Valid(lowest=0.0)
 STABLE_POLE = Valid(0.0, 1.0, highest_included=False)
 #: Control period, s: 1 Hz to 10 kHz.
 PERIOD = Valid(1e-4, 1.0)
@@ -103,10 +104,16 @@ class Row:
     diagonal_minimum : float or None
         Lower limit of a matrix' diagonal, if it differs from `minimum`.
     default : float or None
-        Value if a gains file lacks the key; None: the key is required. A gain matrix has none.
+        Value if a gains file lacks the key; None: the key is required. Only the gains of an option have one, which
+        holds only while the option is off.
+    option : str
+        Key of the row that switches on the option to which this row belongs, 0: off; empty: to none. While the option
+        is off, a gains file leaves out the row if it has its default.
     writable : bool
         False for values that are fixed in the firmware and published only to be checked.
     valid : Valid
+    largest_in_period : float
+        Largest product of the value and the control period; infinite: not limited.
     """
 
     key: str
@@ -120,8 +127,10 @@ class Row:
     comment: str = ""
     diagonal_minimum: float | None = None
     default: float | None = None
+    option: str = ""
     writable: bool = True
     valid: Valid = ANY
+    largest_in_period: float = math.inf
 
     @property
     def section(self) -> str:

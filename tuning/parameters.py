@@ -14,6 +14,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.parameter_row import (
     AXIS_LETTERS,
     AXIS_NAMES,
+    NOT_NEGATIVE,
     PERIOD,
     POSITIVE,
     PREFIX,
@@ -21,6 +22,7 @@ from mimopilot.tuning.parameter_row import (
     Parameter,
     Row,
     Shape,
+    Valid,
 )
 
 #: Longest parameter name of MAVLink (PARAM_SET.param_id) and PX4, characters.
@@ -90,9 +92,30 @@ _GAINS = (
     _gain("Kff_i", "RF", "s", 5.0, "torque from rate setpoint", "s, rate setpoint to torque"),
 )
 
+#: Key of the row that switches on model following.
+MODEL = "model_omega"
+#: Damping ratios of the attitude model. Below 0.1 it amplifies setpoints at its natural frequency more than five times.
+MODEL_DAMPING = Valid(0.1, 2.0)
+#: Largest omega Ts of the attitude model. Its recursion (see `tuning.reference_model.followed_model`) has the
+#: characteristic polynomial z^2 - (2 - 2 zeta omega Ts - (omega Ts)^2) z + 1 - 2 zeta omega Ts. By Jury's criterion it
+#: is stable if (omega Ts)^2 + 4 zeta omega Ts < 4. Up to 0.25, with a damping of at most 2, both coefficients also keep
+#: their sign: no mode alternates from sample to sample.
+MODEL_STEP = 0.25
+
+# Without motor lag the ideal Kff_o is 1, and the ideal Kaff_i the inertia over the torque of u = 1: of the size of
+# Kd_i, so of the same range.
+_MODEL_GAINS = tuple(
+    replace(gain, default=0.0, option=MODEL)
+    for gain in (
+        _gain("Kff_o", "AF", "", 5.0, "rate setpoint from model rate", "1, model's rate to rate setpoint"),
+        _gain("Kaff_i", "RA", "s^2", 0.5, "torque from model acceleration", "s^2, model's acceleration to torque"),
+    )
+)
+
 #: The table, in the order of the C++ struct.
 ROWS: tuple[Row, ...] = (
     *_GAINS,
+    *_MODEL_GAINS,
     *map(_yaw, _GAINS),
     _limit("rate_max", "RMAX", "rad/s", 0.01, 50.0, "limit of the rate setpoint", "rad/s"),
     _limit("moment_max", "UMAX", "norm", 0.01, 1.0, "limit of the torque, excitation included", "normalised"),
@@ -122,6 +145,36 @@ ROWS: tuple[Row, ...] = (
         writable=False,
         valid=PERIOD,
     ),
+    # Written before the frequency by an upload, so the model starts with its damping.
+    Row(
+        key="model_damping",
+        member="model_damping",
+        code="M_DAMP",
+        shape=Shape.SCALAR,
+        unit="",
+        minimum=0.3,
+        maximum=2.0,
+        description="attitude model: damping ratio",
+        comment="attitude model: damping ratio",
+        default=0.7,
+        option=MODEL,
+        valid=MODEL_DAMPING,
+    ),
+    Row(
+        key=MODEL,
+        member=MODEL,
+        code="M_OMEGA",
+        shape=Shape.SCALAR,
+        unit="rad/s",
+        minimum=0.0,
+        maximum=50.0,
+        description="attitude model: natural frequency; 0: no model following",
+        comment="rad/s, attitude model: natural frequency, 0: no model following",
+        default=0.0,
+        option=MODEL,
+        valid=NOT_NEGATIVE,
+        largest_in_period=MODEL_STEP,
+    ),
 )
 
 
@@ -132,6 +185,8 @@ def rows(*shapes: Shape) -> tuple[Row, ...]:
 
 #: Gain matrix -> code.
 MATRICES = {row.key: row.code for row in rows(Shape.MATRIX)}
+#: The gains of yaw; each has a matrix of the same name.
+YAW_GAINS = tuple(row.key for row in rows(Shape.YAW))
 #: Limit -> code.
 LIMITS = {row.key: row.code for row in rows(Shape.AXES)}
 

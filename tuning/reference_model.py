@@ -222,3 +222,31 @@ def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceM
         Ts,
         label=f"{omega:g} rad/s, {zeta:g}, {delay:d}",
     )
+
+
+@lru_cache(maxsize=256)
+def followed_model(omega: float, damping: float, Ts: float) -> ReferenceModel:
+    """Attitude model of the controller's model following, from attitude setpoint r to its angle th.
+
+    The flown recursion, semi-implicit Euler, of omega^2/(s^2 + 2 damping omega s + omega^2)::
+
+        al(k) = omega^2 (r(k) - th(k-1)) - 2 damping omega w(k-1)
+        w(k)  = w(k-1) + Ts al(k)
+        th(k) = th(k-1) + Ts w(k)
+
+    With q = (omega Ts)^2 and c = 2 damping omega Ts it is q z^2 / (z^2 - (2 - c - q) z + 1 - c). The rate w is
+    (1 - z^-1)/Ts times the angle, and the acceleration al is (1 - z^-1)/Ts times the rate.
+
+    Parameters
+    ----------
+    omega : float, rad/s
+        Natural frequency, above 0.
+    damping : float
+        Damping ratio.
+    Ts : float, s
+        Control period.
+    """
+    q, c = (omega * Ts) ** 2, 2 * damping * omega * Ts
+    return ReferenceModel(
+        (q, 0.0, 0.0), (1.0, c + q - 2.0, 1.0 - c), 0, Ts, label=f"{omega:g} rad/s, {damping:g}, as flown"
+    )

@@ -100,6 +100,8 @@ class TuningSpec(_SpecTable):
         Margins that the verdict needs.
     design : DesignLimits
         Limits of the design on the measured response.
+    follow_model : bool
+        Design for model following: the attitude model runs in the controller, with feed-forward.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
@@ -120,6 +122,7 @@ class TuningSpec(_SpecTable):
     limits: LimitsSpec | None = None
     certificate: Thresholds = DEFAULT_THRESHOLDS
     design: DesignLimits = DesignLimits()
+    follow_model: bool = False
 
     @field_validator("inner", "outer", mode="before")
     @classmethod

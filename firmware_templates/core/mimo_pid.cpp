@@ -74,14 +74,60 @@ float wrap(float angle)
 	return valid(gains);
 }
 
-// Attitude controller: rate setpoint r.
-[[gnu::noinline]] void outer_loop(const Gains &gains, const State &state, float (&r)[kAxes])
+bool follows(const Gains &gains) { return !within(gains.model_omega, 0.0F); }
+
+// One period of the attitude model: semi-implicit Euler.
+[[gnu::noinline]] void advance(const Gains &gains, const State &state, Model &model)
 {
-	const float roll = state.setpoint[0] - state.attitude[0];
-	const float pitch = state.setpoint[1] - state.attitude[1];
+	const float omega = gains.model_omega;
+	const float stiffness = omega * omega;
+	const float friction = (2.0F * gains.model_damping) * omega;
+
+	for (int j = 0; j < kModelAxes; j++) {
+		float angle = state.attitude[j];
+		float rate = 0.0F;
+		float acceleration = 0.0F;
+
+		if (model.running != 0) {
+			angle = model.angle[j];
+			rate = model.rate[j];
+			acceleration = stiffness * (state.setpoint[j] - angle) - friction * rate;
+			rate += gains.period * acceleration;
+			angle += gains.period * rate;
+		}
+
+		model.angle[j] = angle;
+		model.rate[j] = rate;
+		model.acceleration[j] = acceleration;
+	}
+}
+
+// Attitude controller: rate setpoint r.
+[[gnu::always_inline]] inline void outer_loop(const Gains &gains, const State &state, const Model &model,
+					      float (&r)[kAxes])
+{
+	const bool following = follows(gains);
+	float roll = state.setpoint[0];
+	float pitch = state.setpoint[1];
+
+	if (unlikely(following)) {
+		roll = model.angle[0];
+		pitch = model.angle[1];
+	}
+
+	roll -= state.attitude[0];
+	pitch -= state.attitude[1];
 	const float yaw = wrap(state.setpoint[2] - state.attitude[2]);
-	r[0] = clamp(row(gains.kp_o[0], roll, pitch), gains.rate_max[0]);
-	r[1] = clamp(row(gains.kp_o[1], roll, pitch), gains.rate_max[1]);
+	float roll_rate = row(gains.kp_o[0], roll, pitch);
+	float pitch_rate = row(gains.kp_o[1], roll, pitch);
+
+	if (unlikely(following)) {
+		roll_rate += row(gains.kff_o[0], model.rate[0], model.rate[1]);
+		pitch_rate += row(gains.kff_o[1], model.rate[0], model.rate[1]);
+	}
+
+	r[0] = clamp(roll_rate, gains.rate_max[0]);
+	r[1] = clamp(pitch_rate, gains.rate_max[1]);
 	r[2] = clamp(gains.yaw_kp_o * yaw, gains.rate_max[2]);
 }
 
@@ -96,14 +142,21 @@ struct Signals {
 	Axes rates_setpoint;
 	Axes error;
 	Axes derivative;
+	bool following;
+	float roll_acceleration;  // of the attitude model
+	float pitch_acceleration;
 };
 
-[[gnu::always_inline]] inline Signals signals(const State &state, const float (&r)[kAxes])
+[[gnu::always_inline]] inline Signals signals(const Gains &gains, const State &state, const Model &model,
+					      const float (&r)[kAxes])
 {
 	return {
 		{r[0], r[1], r[2]},
 		{r[0] - state.rates[0], r[1] - state.rates[1], r[2] - state.rates[2]},
 		{state.derivative[0], state.derivative[1], state.derivative[2]},
+		follows(gains),
+		model.acceleration[0],
+		model.acceleration[1],
 	};
 }
 
@@ -126,10 +179,14 @@ struct Terms {
 		};
 	}
 
+	float feedforward = row(gains.kff_i[j], x.rates_setpoint.roll, x.rates_setpoint.pitch);
+
+	if (unlikely(x.following)) { feedforward += row(gains.kaff_i[j], x.roll_acceleration, x.pitch_acceleration); }
+
 	return {
 		row(gains.kp_i[j], x.error.roll, x.error.pitch),
 		row(gains.kd_i[j], x.derivative.roll, x.derivative.pitch),
-		row(gains.kff_i[j], x.rates_setpoint.roll, x.rates_setpoint.pitch),
+		feedforward,
 		row(gains.ki_i[j], x.error.roll, x.error.pitch),
 	};
 }
@@ -139,15 +196,23 @@ float sum(const Terms &terms, float integral)
 	return ((terms.proportional + integral) - terms.derivative) + terms.feedforward;
 }
 
-// v of each axis.
-[[gnu::cold, gnu::noinline]] void evaluate(const Gains &gains, const State &state, const float (&integral)[kAxes],
-					   float (&v)[kAxes])
+void clear_integral(State &state)
+{
+	for (int j = 0; j < kAxes; j++) { state.integral[j] = 0.0F; }
+}
+
+// v of each axis, with the attitude model one period ahead.
+[[gnu::cold, gnu::noinline]] void evaluate(const Gains &gains, const State &state, float (&v)[kAxes])
 {
 	float r[kAxes];
-	outer_loop(gains, state, r);
-	const Signals x = signals(state, r);
+	Model model = state.model;
 
-	for (int j = 0; j < kAxes; j++) { v[j] = sum(inner_loop(gains, x, j), integral[j]); }
+	if (follows(gains)) { advance(gains, state, model); }
+
+	outer_loop(gains, state, model, r);
+	const Signals x = signals(gains, state, model, r);
+
+	for (int j = 0; j < kAxes; j++) { v[j] = sum(inner_loop(gains, x, j), state.integral[j]); }
 }
 
 // Accepts a value within its range, otherwise holds the last valid one. True: invalid for too long.
@@ -223,6 +288,7 @@ float accept_excitation(float value, uint32_t &fault_count)
 {
 	const Gains &gains = state.gains;
 	const int32_t lost = failed >> (2 * kAxes);
+	state.model.running = 0;
 	const float roll = (lost & 1) != 0 ? 0.0F : state.rates[0];
 	const float pitch = (lost & 2) != 0 ? 0.0F : state.rates[1];
 
@@ -245,8 +311,14 @@ void control(State &state, const Input &input, Output &output)
 	const Gains &gains = state.gains;
 	const bool integrating = input.armed != 0 && input.landed == 0;
 	const float period = integrating ? gains.period : 0.0F;
-	outer_loop(gains, state, output.rates_setpoint);
-	const Signals x = signals(state, output.rates_setpoint);
+
+	if (follows(gains)) {
+		advance(gains, state, state.model);
+		state.model.running = input.armed;
+	}
+
+	outer_loop(gains, state, state.model, output.rates_setpoint);
+	const Signals x = signals(gains, state, state.model, output.rates_setpoint);
 
 	for (int j = 0; j < kAxes; j++) {
 		const Terms terms = inner_loop(gains, x, j);
@@ -299,11 +371,11 @@ void control(State &state, const Input &input, Output &output)
 {
 	if (!acceptable(gains)) { return false; }
 
-	const float zero[kAxes] = {};
 	float before[kAxes];
 	float rest[kAxes];
-	evaluate(state.gains, state, state.integral, before);
-	evaluate(gains, state, zero, rest);
+	evaluate(state.gains, state, before);
+	clear_integral(state);
+	evaluate(gains, state, rest);
 
 	for (int j = 0; j < kAxes; j++) {
 		const bool unused = j == 2 ? within(gains.yaw_ki_i, 0.0F)
@@ -312,6 +384,9 @@ void control(State &state, const Input &input, Output &output)
 	}
 
 	state.gains = gains;
+
+	if (!follows(gains)) { state.model.running = 0; }
+
 	return true;
 }
 
@@ -320,7 +395,8 @@ void step(State &state, const Input &input, Output &output)
 	const int32_t failed = accept_inputs(state, input);
 
 	if (input.armed == 0) {
-		for (int j = 0; j < kAxes; j++) { state.integral[j] = 0.0F; }
+		clear_integral(state);
+		state.model.running = 0;
 	}
 
 	if (failed != 0) {

@@ -7,6 +7,17 @@
 //   v(k)   = Kp e(k) + I(k) - Kd d(k) + Kff r_i(k)
 //   u(k)   = sat( v(k) + u_bar(k) )
 //
+// Model following, if model_omega > 0 (wm; model_damping zm): roll and pitch follow a model of the attitude instead of
+// the setpoint. Its angle th, rate w and acceleration al of each axis are
+//
+//   al(k)  = wm^2 (r_o(k) - th(k-1)) - 2 zm wm w(k-1)
+//   w(k)   = w(k-1) + Ts al(k)
+//   th(k)  = th(k-1) + Ts w(k)
+//   r_i(k) = sat_rate( Kp_o (th(k) - y_o(k)) + Kff_o w(k) )
+//   v(k)   = Kp e(k) + I(k) - Kd d(k) + (Kff r_i(k) + Kaff al(k))
+//
+// The model starts at the measured attitude, at rest, with the first armed sample without a fault.
+//
 // Single precision, fixed period, no heap, no exceptions, no library calls: the same bits on every
 // IEEE 754 target. Angles are Euler angles (roll, pitch, yaw), axes body FRD.
 #pragma once
@@ -18,6 +29,7 @@
 namespace mimopilot {
 
 constexpr int kAxes = 3;            // roll, pitch, yaw
+constexpr int kModelAxes = 2;       // roll, pitch
 constexpr int32_t kHoldSamples = 25;  // an invalid input is held at its last valid value this long
 constexpr float kMaxRate = 100.0F;    // rad/s, a larger rate is invalid
 constexpr float kMaxAngle = 12.566371F;  // rad, 4 pi, a larger angle is invalid
@@ -41,6 +53,14 @@ struct Output {
 	uint32_t fault_count;          // invalid input samples since reset
 };
 
+// Attitude model.
+struct Model {
+	float angle[kModelAxes];         // th, rad
+	float rate[kModelAxes];          // w, rad/s
+	float acceleration[kModelAxes];  // al, rad/s^2
+	int32_t running;                 // 0: starts at the measured attitude
+};
+
 struct State {
 	Gains gains;
 	float integral[kAxes];
@@ -50,6 +70,7 @@ struct State {
 	float rates[kAxes];
 	int32_t age[3 * kAxes];  // samples since the last valid one: setpoint, attitude, rate
 	uint32_t fault_count;
+	Model model;
 };
 
 // Resets the controller. Returns false if the gains are refused; the torque then stays 0.

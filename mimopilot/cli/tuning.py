@@ -60,6 +60,9 @@ def tune(
         ),
     ] = None,
     outer: Annotated[str | None, typer.Option(help="Attitude loop, likewise.")] = None,
+    follow_model: Annotated[
+        bool, typer.Option("--follow-model", help="Run the attitude model in the controller, with feed-forward.")
+    ] = False,
     structure: Annotated[
         str | None,
         typer.Option(help="Terms of the rate controller: P, PI, PD or PID (the default), F behind for feed-forward."),
@@ -91,7 +94,6 @@ def tune(
     """Find the best gains of the attitude cascade from one flight, and compare them with those that flew."""
     import mimopilot as mp
     from mimopilot.tuning.logs.columns import load_columns
-    from mimopilot.tuning.parameters import MATRICES
     from mimopilot.tuning.spec import load_spec, parse_model
 
     task = load_spec(
@@ -100,6 +102,7 @@ def tune(
         inner=parse_model(inner) if inner else None,
         outer=parse_model(outer) if outer else None,
         structure=structure,
+        follow_model=follow_model or None,
         instrument=instrument or ("repeated" if repeat else None),
         window=window,
     )
@@ -110,6 +113,8 @@ def tune(
     if not task.for_models:
         text = "belongs to VRFT for given models; give --inner or --outer, too"
         check_not_given(text, instrument=instrument, repeat=repeat, window=window)
+    else:
+        check_not_given("belongs to the design; leave out --inner and --outer", follow_model=follow_model or None)
     experiments = [read_warned(log, columns) for log in logs]
     second = read_warned(repeat, columns) if repeat else None
     gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
@@ -119,7 +124,7 @@ def tune(
     details, deviations = gains.provenance.details, gains.provenance.standard_deviation
     comparison = {name: details[name] for name in ("predicted", "better_than_flown", "keep_flown") if name in details}
     if as_json:
-        matrices: dict[str, Any] = {name: getattr(gains, name).tolist() for name in MATRICES}
+        matrices: dict[str, Any] = {name: matrix.tolist() for name, matrix in gains.matrices.items()}
         models = gains.provenance.as_table()
         found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}
         certificate = gains.certificate.as_table() if gains.certificate else None
@@ -403,14 +408,12 @@ def read_warned(log: Path, columns: Path | None) -> Experiment:
 
 def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None:
     """The matrices of a set as a table, with standard deviations where they are known."""
-    from mimopilot.tuning.parameters import MATRICES
-
     rows = []
-    for name in MATRICES:
+    for name, matrix in gains.matrices.items():
         row = [name]
         for i in range(2):
             for j in range(2):
-                text = f"{getattr(gains, name)[i][j]:.4f}"
+                text = f"{matrix[i][j]:.4f}"
                 row.append(f"{text} ({deviations[name][i][j]:.4f})" if name in deviations else text)
         rows.append(row)
     print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch"], rows)

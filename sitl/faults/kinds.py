@@ -119,7 +119,7 @@ class Fault(BaseModel):
     position : 3 numbers, m, optional
         FRD, from the airframe's reference point.
     matrix : str, optional
-        ``Kp_o``, ``Kp_i``, ``Ki_i``, ``Kd_i`` or ``Kff_i``.
+        ``Kp_o``, ``Kp_i``, ``Ki_i``, ``Kd_i``, ``Kff_i``, ``Kff_o`` or ``Kaff_i``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -131,7 +131,7 @@ class Fault(BaseModel):
     motor: Annotated[int | None, Field(ge=1, le=16)] = None
     axis: Literal["roll", "pitch", "yaw"] | None = None
     position: Vector | None = None
-    matrix: Literal["Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i"] | None = None
+    matrix: Literal["Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i", "Kff_o", "Kaff_i"] | None = None
 
     @model_validator(mode="after")
     def _fits_its_kind(self) -> Fault:

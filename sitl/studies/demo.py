@@ -31,7 +31,6 @@ from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.reader import read_log
-from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.spec import load_spec
 
 AIRFRAME = "adam0"
@@ -199,7 +198,7 @@ def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
         ("MIMO, Table 5.4", printed["MIMO"]),
     ]
     rows = []
-    for name in MATRICES:
+    for name in gains["mimo"].matrices:
         if name == "Kff_i":
             continue  # zero in every gain set
         for label, values in sets:

@@ -191,6 +191,9 @@ def test_a_million_steps_with_invalid_inputs_and_gain_changes_stay_finite_and_li
             assert (np.abs(outputs[name]) <= limit).all()
         assert (np.abs(controller.state["integral"]) <= current[place("integral_max")]).all()
         assert np.isfinite(controller.state["derivative"]).all()
+        # Setpoints are within 4 pi; with the smallest damping ratio, 0.1, the model passes them sixfold at most.
+        assert (np.abs(controller.state["model"]["angle"]) < 8 * 4 * np.pi).all()
+        assert all(np.isfinite(controller.state["model"][name]).all() for name in ("rate", "acceleration"))
         faulty += int((outputs["fault"] != 0).sum())
         bumped += int((np.abs(outputs["moment"]) == limits["moment"]).any(axis=1).sum())
         changed = to_array(gains)
@@ -203,6 +206,8 @@ def test_a_million_steps_with_invalid_inputs_and_gain_changes_stay_finite_and_li
                 changed[place(row.key)] = rng.uniform(1e-3, 50, count)
             elif row.shape is Shape.POLE:
                 changed[place(row.key)] = rng.uniform(0, 0.999)
+        changed[place("model_damping")] = rng.uniform(0.1, 2.0)
+        changed[place("model_omega")] = rng.choice([0.0, 1e-30, 1.0, 62.5])
         if rng.random() < 0.3:
             changed[rng.integers(len(changed))] = rng.choice(wild[:6])
         if controller.set_gains(changed):

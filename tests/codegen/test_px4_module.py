@@ -11,6 +11,7 @@ from mimopilot.codegen.layout import INPUT
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.tuning.excitation import prbs
 from tests.codegen.px4_host import PX4_PARAMETERS, STANDARD, build, drive
+from tests.conftest import coupled_gains, following_gains
 
 HOLD_MODE = 4
 LEVEL = "attitude 1 0 0 0 0 1 0 0 0"
@@ -49,9 +50,12 @@ def assert_same_bits(got, expected):
     assert got.tobytes() == np.ascontiguousarray(expected).tobytes()
 
 
-def test_a_random_flight_gives_the_same_bits_as_the_native_library(program, gains):
-    rng = np.random.default_rng(7)
-    commands, rows = list(AIRBORNE), []
+@pytest.mark.parametrize("flown", [coupled_gains, following_gains])
+def test_a_random_flight_gives_the_same_bits_as_the_native_library(program, flown):
+    rng, gains = np.random.default_rng(7), flown()
+    programmed, elements = coupled_gains().elements(), gains.elements()
+    changed = [f"param MIMO_{code} {text(value)}" for code, value in elements.items() if value != programmed[code]]
+    commands, rows = [*changed, *AIRBORNE], []
     row = np.zeros(1, INPUT)[0]
     row["armed"] = 1
     move = wanted_q = None

@@ -13,18 +13,22 @@ from mimopilot.tuning.gains_file import gains_from_toml, load_gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.provenance import Provenance
+from tests.conftest import coupled_gains, following_gains
 
 FINITE = st.floats(-1e6, 1e6, allow_nan=False)
 
 
-@given(values=st.lists(FINITE, min_size=25, max_size=25), text=st.text(max_size=30))
-def test_a_gains_file_reads_back_to_the_same_bits(values, text):
+@given(
+    values=st.lists(FINITE, min_size=33, max_size=33),
+    model_omega=st.sampled_from([0.0, 3.0, 10.1]),
+    text=st.text(max_size=30),
+)
+def test_a_gains_file_reads_back_to_the_same_bits(values, model_omega, text):
     from mimopilot.tuning.gains import YawGains
 
     matrices = {name: np.reshape(values[4 * i : 4 * i + 4], (2, 2)) for i, name in enumerate(MATRICES)}
-    written = Gains(
-        **matrices, yaw=YawGains(*values[20:]), filters=Filters(0.004, 30.0), provenance=Provenance(log=text)
-    )
+    filters = Filters(0.004, 30.0, model_omega, 0.7 if model_omega < 5 else 1.1)
+    written = Gains(**matrices, yaw=YawGains(*values[28:]), filters=filters, provenance=Provenance(log=text))
     read = gains_from_toml(gains_to_toml(written), "test")
     assert read.elements() == written.elements()
     assert read.provenance == written.provenance
@@ -42,12 +46,12 @@ def test_every_element_can_be_replaced_by_its_code(gains):
 
 
 @pytest.mark.parametrize("name", list(MATRICES))
-def test_a_missing_matrix_is_an_error_and_never_zeros(gains, tmp_path, name):
+def test_a_missing_matrix_is_an_error_and_never_zeros(tmp_path, name):
     path = tmp_path / "x.gains.toml"
-    gains.save(path)
+    following_gains().save(path)
     lines = path.read_text().splitlines()
     section = lines.index("[roll_pitch]")
-    (drop,) = [i for i, line in enumerate(lines) if line.startswith(f"{name} =") and section < i < section + 6]
+    (drop,) = [i for i, line in enumerate(lines) if line.startswith(f"{name} =") and section < i < section + 8]
     path.write_text("\n".join(lines[:drop] + lines[drop + 1 :]))
     with pytest.raises(TuningError, match=rf"x.gains.toml.*roll_pitch.{name}: missing"):
         load_gains(path)
@@ -130,9 +134,11 @@ def test_an_edited_text_or_figure_voids_the_certificate(gains, old, new):
     assert edited.verdict() == ("void", "the gains or the certificate were edited after it was made")
 
 
-def test_an_edit_of_any_number_of_the_controller_voids_the_certificate(gains):
-    """Every gain and limit, the period, the cut-off and the unit of torque, even in the last bit."""
-    sealed = gains.with_certificate(CERTIFICATE)
+@pytest.mark.parametrize("base", [coupled_gains, following_gains])
+def test_an_edit_of_any_number_of_the_controller_voids_the_certificate(base):
+    """Every gain and limit, the period, the cut-off, the model and the unit of torque, even in the last bit."""
+    sealed = base().with_certificate(CERTIFICATE)
+    gains = sealed
     for code, value in gains.elements().items():
         changed = sealed.with_elements({code: math.nextafter(value, math.inf)})
         assert changed.verdict()[0] == "void", code

@@ -1,7 +1,9 @@
 """The gains file: schemas, defaults, and the parameter table behind it."""
 
 import dataclasses
+import re
 
+import numpy as np
 import pytest
 
 from mimopilot.tuning.certificate import Certificate, Verdict
@@ -10,8 +12,9 @@ from mimopilot.tuning.gains import Limits, YawGains, gains_to_toml
 from mimopilot.tuning.gains_file import gains_from_toml
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameter_row import Row, Shape
-from mimopilot.tuning.parameters import ROWS, rows
+from mimopilot.tuning.parameters import MATRICES, ROWS, rows
 from mimopilot.tuning.reference_model import SecondOrder
+from tests.conftest import coupled_gains, following_gains
 
 SCHEMA_1 = """
 schema = 1
@@ -90,7 +93,10 @@ def test_a_parameter_that_is_newer_than_the_file_has_the_default_of_the_table(mo
 def test_every_row_has_its_place_in_the_types_of_the_gains():
     for kind, shapes in ((YawGains, [Shape.YAW]), (Limits, [Shape.AXES]), (Filters, [Shape.POLE, Shape.SCALAR])):
         assert {field.name for field in dataclasses.fields(kind)} == {row.key for row in rows(*shapes)}
-    assert all(row.default is None for row in rows(Shape.MATRIX, Shape.YAW))  # there are no default gains
+    # There are no default gains, except of an option that is off.
+    assert all(row.default is None or row.option for row in rows(Shape.MATRIX, Shape.YAW))
+    defaults = {field.name: field.default for field in dataclasses.fields(Filters)}
+    assert all(defaults[row.key] == row.default for row in rows(Shape.SCALAR) if row.default is not None)
 
 
 def test_what_a_set_holds_for_its_rows_makes_the_same_set(gains):
@@ -120,3 +126,75 @@ def test_the_valid_values_of_a_row_are_said():
     row = Row("x", "x", "X", Shape.SCALAR, "", 0.0, 1.0, "of this test")
     assert row.valid.holds(-1e9)
     assert not row.valid.holds(float("nan"))
+
+
+def test_an_old_file_loads_without_model_following_and_is_written_without_its_keys(gains):
+    old = gains_from_toml(SCHEMA_1, "old")
+    assert old.filters.followed is None
+    assert not np.any(old.Kff_o) and not np.any(old.Kaff_i)
+    for one in (old, gains):
+        assert not re.search("model_|Kff_o|Kaff_i|Model", gains_to_toml(one))
+
+
+def test_a_file_with_model_following_holds_its_keys_and_its_law():
+    text = gains_to_toml(following_gains())
+    for line in ("model_damping = 0.8", "model_omega = 9.0  # rad/s", "Kff_o = [[0.9, 0.04], [-0.03, 1.05]]"):
+        assert f"\n{line}\n" in text
+    assert text.startswith(gains_to_toml(coupled_gains()).split("schema")[0] + "# Model following")
+    assert "schema = 2" in text
+    read = gains_from_toml(text, "x")
+    assert gains_to_toml(read) == text
+    assert read.elements() == following_gains().elements()
+    assert gains_from_toml(text.replace("model_damping = 0.8\n", ""), "x").filters.model_damping == 0.7
+
+
+def test_gains_that_are_kept_while_the_model_is_off_are_written(gains):
+    kept = dataclasses.replace(gains, Kff_o=np.eye(2))
+    assert list(kept.matrices) == ["Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i"]
+    read = gains_from_toml(gains_to_toml(kept), "x")
+    assert read.Kff_o.tolist() == [[1, 0], [0, 1]]
+    assert list(dataclasses.replace(kept, filters=following_gains().filters).matrices) == list(MATRICES)
+
+
+def test_a_matrix_that_is_missing_while_the_model_is_on_is_refused(gains):
+    on = gains_to_toml(gains).replace("Ts = 0.004", "Ts = 0.004\nmodel_omega = 9.0")
+    message = r"^x: roll_pitch\.Kff_o: missing; it has no default while model_omega is not 0: give it, or set model_om"
+    with pytest.raises(TuningError, match=message):
+        gains_from_toml(on, "x")
+    values = {row: gains.of(row) for row in ROWS if row.key not in ("Kaff_i", "model_omega")}
+    omega = next(row for row in ROWS if row.key == "model_omega")
+    with pytest.raises(TuningError, match=r"^roll_pitch\.Kaff_i: missing"):
+        type(gains).from_rows(values | {omega: 9.0})
+    assert not np.any(type(gains).from_rows(values).Kaff_i)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("model_omega = 62.6", r"model_omega: got 62\.6 rad/s, expected at most 0\.25/Ts, 62\.5 rad/s"),
+        ("model_omega = 1e300", "expected at most 0.25/Ts"),
+        ("model_omega = -1.0", "model_omega: got -1.0 rad/s, expected at least 0"),
+        ("model_omega = nan", "model_omega: got nan"),
+        ("model_omega = 9.0\nmodel_damping = 0.05", "model_damping: got 0.05, expected at least 0.1 and at most 2"),
+        ("model_omega = 9.0\nmodel_damping = 2.1", "model_damping: got 2.1, expected at least 0.1 and at most 2"),
+        ('model_omega = "9"', "model_omega: got .* expected a number"),
+    ],
+)
+def test_a_model_that_the_recursion_cannot_follow_is_refused(gains, line, message):
+    matrices = "Kff_o = [[1.0, 0.0], [0.0, 1.0]]\nKaff_i = [[0.0, 0.0], [0.0, 0.0]]"
+    text = gains_to_toml(gains).replace("Ts = 0.004", f"Ts = 0.004\n{line}")
+    with pytest.raises(TuningError, match=message):
+        gains_from_toml(text.replace("[roll_pitch]", f"[roll_pitch]\n{matrices}"), "x")
+
+
+def test_a_certificate_of_a_set_without_model_following_keeps_its_seal(gains):
+    """Sealed by the version before model following."""
+    sealed = gains.with_certificate(Certificate(Verdict.CERTIFIED, "before"))
+    assert sealed.certificate is not None
+    assert sealed.certificate.seal == "1cbc1c6bc57ef9fd7f70fee88c37821e4613e26325f0d51dec623df75e64e92f"
+
+
+def test_the_torque_of_the_models_acceleration_has_the_unit_of_torque(gains):
+    converted = following_gains().with_moment_scale((5.09184, 2.54592, 0.2736))
+    assert converted.Kaff_i == pytest.approx(following_gains().Kaff_i * [[0.5], [1.0]])
+    assert (converted.Kff_o == following_gains().Kff_o).all()

@@ -10,7 +10,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import gains_to_toml
 from mimopilot.tuning.gains_file import gains_from_toml
 from mimopilot.tuning.provenance import Provenance
-from mimopilot.tuning.reference_model import CONTINUOUS_MODELS, ReferenceModel, second_order
+from mimopilot.tuning.reference_model import CONTINUOUS_MODELS, ReferenceModel, followed_model, second_order
 from mimopilot.tuning.spec import load_spec
 
 TS = 1 / 250
@@ -110,3 +110,50 @@ def test_another_kind_of_model_is_one_class_and_one_row(monkeypatch, gains):
     read = gains_from_toml(gains_to_toml(tagged), "file")
     assert read.provenance.inner_model == spec.inner
     assert read.reference_models(0)[1].den == slow.den
+
+
+def recursion(setpoint, omega, damping, Ts):
+    """The flown attitude model, sample by sample: angle, rate and acceleration."""
+    angle = rate = 0.0
+    found = []
+    for r in setpoint:
+        acceleration = omega**2 * (r - angle) - 2 * damping * omega * rate
+        rate += Ts * acceleration
+        angle += Ts * rate
+        found.append((angle, rate, acceleration))
+    return np.array(found)
+
+
+@given(omega=st.floats(0.5, 62.5), damping=st.floats(0.1, 2.0), seed=st.integers(0, 100))
+def test_the_followed_model_is_the_flown_recursion(omega, damping, seed):
+    setpoint = np.random.default_rng(seed).normal(size=200)
+    model = followed_model(omega, damping, TS)
+    angle = recursion(setpoint, omega, damping, TS)[:, 0]
+    assert model.response(setpoint) == pytest.approx(angle, abs=1e-9)
+    assert sum(model.num) / sum(model.den) == pytest.approx(1, rel=1e-6)
+    # Stable, and no mode alternates from sample to sample.
+    poles = np.roots(model.den)
+    assert (np.abs(poles) < 1).all()
+    assert (poles.real >= 0).all()
+
+
+def test_the_followed_models_frequency_response_is_that_of_the_recursion():
+    w = 2 * np.pi * np.array([1, 2, 5, 20, 60]) / (1000 * TS)
+    model = followed_model(12.0, 0.6, TS)
+    for omega, expected in zip(w, model.frequency_response(w), strict=True):
+        k = np.arange(4000)
+        settled = slice(3000, 4000)  # whole periods, after the transient
+        angle = recursion(np.cos(omega * TS * k), 12.0, 0.6, TS)[settled, 0]
+        assert 2 * np.mean(angle * np.exp(-1j * omega * TS * k[settled])) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_followed_model_approaches_the_continuous_one_as_the_period_shrinks():
+    """First order in Ts: the error halves with the period."""
+    omega, damping = 10.0, 0.7
+    w = np.array([1.0, 5.0, 10.0, 30.0])
+    s = 1j * w
+    exact = omega**2 / (s**2 + 2 * damping * omega * s + omega**2)
+    errors = [np.abs(followed_model(omega, damping, Ts).frequency_response(w) - exact) for Ts in (2e-3, 1e-3, 1e-4)]
+    assert errors[0] / errors[1] == pytest.approx(2, rel=0.05)
+    assert errors[1] / errors[2] == pytest.approx(10, rel=0.05)
+    assert errors[2].max() < 2e-3

@@ -69,7 +69,7 @@ def loop_gain_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
     largest value on, w |G| is fitted by a sequence that does not rise, which also removes noise.
     """
     grid = np.concatenate([plant.omega, np.linspace(plant.omega[-1], np.pi / gains.Ts, GRID_POINTS)[1:]])
-    falling = singular_values(cascade_response(gains, grid)[1])[0] / grid
+    falling = singular_values(cascade_response(gains, grid)[2])[0] / grid
     highest = np.maximum.accumulate(falling[..., ::-1], axis=-1)[..., ::-1][..., : len(plant.omega)]
     bound: Signal = falling_gain(plant) * highest
     return bound
@@ -90,7 +90,7 @@ def attitude_gain_above(gains: Gains, plant: PlantResponse) -> float:
     """
     grid = np.linspace(plant.omega[-1], np.pi / gains.Ts, GRID_POINTS)
     path = (
-        np.linalg.norm(cascade_response(gains, grid)[0], ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
+        np.linalg.norm(cascade_response(gains, grid)[1], ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
     )
     return float(np.linalg.norm(plant.G_o[-1], ord=2) * path.max())
 
@@ -162,7 +162,7 @@ def _measured(plant: PlantResponse, gain: Signal, error: Signal) -> NDArray[np.b
 
 def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]:
     """sigma_max of the rate loop, (K,), and the RMS of the error's norm: two deviations of an element."""
-    controller = cascade_response(gains, plant.omega)[1]
+    controller = cascade_response(gains, plant.omega)[2]
     gain = singular_values(controller @ plant.G_i)[0]
     # Independent errors of the elements: C E has the covariance sum |C_ij|^2 dev_jk^2.
     spread = np.sqrt(np.abs(controller) ** 2 @ plant.deviation() ** 2)

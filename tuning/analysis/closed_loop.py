@@ -39,7 +39,7 @@ class CascadeLoop:
     Attributes
     ----------
     L_i : rate loop alone, cut at u.
-    L_u : whole loop, cut at u: C_y G_i + C_o G_o, with u = C_o (r_o - y_o) - C_y y_i.
+    L_u : whole loop, cut at u: C_y G_i + C_o G_o, with u = C_ref r_o - C_o y_o - C_y y_i.
     T_o : from attitude setpoint to attitude.
     U_o : from attitude setpoint to u.
     """
@@ -51,10 +51,10 @@ class CascadeLoop:
 
 
 def whole_loop(gains: Gains | GainStack, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
-    """L_i and L_u as in `CascadeLoop`, and the attitude path C_o, (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
-    C_o, C_y = law.cascade_response(gains, plant.omega)
+    """L_i and L_u as in `CascadeLoop`, and the setpoint's path C_ref, (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
+    C_ref, C_o, C_y = law.cascade_response(gains, plant.omega)
     L_i = C_y @ plant.G_i
-    return L_i, L_i + C_o @ plant.G_o, C_o
+    return L_i, L_i + C_o @ plant.G_o, C_ref
 
 
 def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:

@@ -20,7 +20,7 @@ _SIGNALS = {law.ERROR: ERROR, law.RATE: RATE, law.SETPOINT: SETPOINT}
 def law_terms(filters: law.Filters) -> Signal:
     """Terms of the law as numbers, (4, 5): signal, sign, direct gain, zero and pole of the filter."""
     numbers = []
-    for term in law.TERMS.values():
+    for term in law.LOOP_TERMS.values():
         shape = term.filter(filters)
         response = (1.0, 0.0, 0.0) if shape is None else (shape.direct, shape.zero, shape.pole)
         numbers.append([float(_SIGNALS[term.signal]), float(term.sign), *response])

@@ -234,7 +234,7 @@ def starting_set(experiment: Experiment, spec: TuningSpec) -> Gains:
         )
     zero = np.zeros((2, 2))
     cutoff = spec.derivative_cutoff_hz
-    filters = replace(flown.filters, Ts=experiment.Ts) if flown else Filters(experiment.Ts)
+    filters = replace(flown.filters, Ts=experiment.Ts, model_omega=0.0) if flown else Filters(experiment.Ts)
     yaw = YawGains(**spec.yaw.model_dump()) if spec.yaw else flown.yaw  # type: ignore[union-attr]
     limits = Limits(**spec.limits.model_dump()) if spec.limits else flown.limits if flown else Limits()
     return Gains(

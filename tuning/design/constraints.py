@@ -230,7 +230,7 @@ def structural_modes(plant: WideResponse, others: NDArray[np.bool_] | None = Non
         Further frequencies of `plant.response`.
     """
     response = plant.response
-    rigid = float(singular_values(plant.body.B)[0]) * np.abs(shape_response(response.omega, plant.shape))
+    rigid = float(np.linalg.norm(plant.body.B, ord=2)) * np.abs(shape_response(response.omega, plant.shape))
     gain, deviation = singular_values(response.G_i)[0], response.deviation()
     seen = response.known() | np.any(response.coherence > COHERENT, axis=1)
     rises = np.flatnonzero(seen & (gain - np.linalg.norm(deviation, axis=(1, 2)) > RISES * rigid))

@@ -9,12 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import ATTITUDE, TERMS
+from mimopilot.tuning.law import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, TERMS
+from mimopilot.tuning.parameter_row import Shape
+from mimopilot.tuning.parameters import rows
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 
 #: Typical bandwidths of the attitude and of the rate loop, rad/s, and ratios Ki over Kp (1/s) and Kd over Kp (s) of
 #: multirotors of 0.3 to 5 kg: the units of the search.
 ATTITUDE_BANDWIDTH, RATE_BANDWIDTH, INTEGRAL, DERIVATIVE = 5.0, 20.0, 2.0, 0.02
+#: Matrices that act on angles or on the attitude model's rate: a decoupled one is diagonal. The others become so behind
+#: the control effectiveness.
+ATTITUDE_MATRICES = (ATTITUDE.matrix, ATTITUDE_FEEDFORWARD.matrix)
+#: The feed-forward from the attitude model's acceleration.
+ACCELERATION = TERMS["A"]
 
 Signal = NDArray[np.float64]
 
@@ -67,32 +74,35 @@ class FreeGains:
         The off-diagonal elements of B times each rate gain, and of the attitude gain, in units of the diagonal: zero
         when the gains decouple the rigid body.
         """
-        rows = np.zeros((2 * len(self.units), len(self.size)))
+        found = np.zeros((2 * len(self.units), len(self.size)))
         names = list(self.units)
         for place, (name, row, column) in enumerate(self.places()):
-            effect = np.eye(2)[:, row] if name == ATTITUDE.matrix else B[:, row] / np.abs(B).max()
-            rows[2 * names.index(name) + column, place] = effect[1 - column]
-        return rows
+            effect = np.eye(2)[:, row] if name in ATTITUDE_MATRICES else B[:, row] / np.abs(B).max()
+            found[2 * names.index(name) + column, place] = effect[1 - column]
+        return found
 
 
-def free_gains(base: Gains, body: RigidBody, structure: str = "".join(TERMS), full: bool = True) -> FreeGains:
-    """The attitude gain and the terms of a structure.
+def free_gains(base: Gains, body: RigidBody, structure: str = "".join(LOOP_TERMS), full: bool = True) -> FreeGains:
+    """The attitude gain, the terms of a structure and, where `base` follows a model, its feed-forward.
 
     Parameters
     ----------
     base : Gains
-        Filters, limits and yaw.
+        Filters, attitude model, limits and yaw.
     body : RigidBody
         Its control effectiveness gives the units.
     structure : str
-        Letters of `tuning.law.TERMS`.
+        Letters of `tuning.law.LOOP_TERMS`.
     full : bool
         False: the diagonals only.
     """
-    proportional = RATE_BANDWIDTH / float(np.abs(body.B).max())
+    acceleration = 1 / float(np.abs(body.B).max())
+    proportional = RATE_BANDWIDTH * acceleration
     ratio = {"P": 1.0, "I": INTEGRAL, "D": DERIVATIVE, "F": 1.0}
     units = {ATTITUDE.matrix: ATTITUDE_BANDWIDTH}
     units |= {TERMS[letter].matrix: proportional * ratio[letter] for letter in structure}
-    zero = {term.matrix: np.zeros((2, 2)) for letter, term in TERMS.items() if letter not in structure}
+    if base.filters.followed is not None:
+        units |= {ATTITUDE_FEEDFORWARD.matrix: 1.0, ACCELERATION.matrix: acceleration}
+    zero = {row.key: np.zeros((2, 2)) for row in rows(Shape.MATRIX) if row.key not in units}
     where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
     return FreeGains(replace(base, certificate=None, **zero), units, where)  # type: ignore[arg-type]

@@ -1,6 +1,7 @@
 """The closed loop around a plant and its exact derivatives with respect to the gains.
 
-u = C_ref r_o - C_o y_o - C_y y_i. Each gain adds products of a column and a row to the controller: dL = alpha beta',
+u = C_ref r_o - C_o y_o - C_y y_i, with C_ref = C_r (Kp_o m + Kff_o m_w) + Kaff_i m_a: m, m_w and m_a are the attitude
+model's angle, rate and acceleration, or 1, 0 and 0 without one. Each gain adds products of a column and a row to the controller: dL = alpha beta',
 dC_ref = alpha gamma', so all derivatives are products of a column and a row, too:
 
     S = (I + L)^-1,  L = C_y G_i + C_o G_o        dS = -(S alpha) (beta' S)
@@ -17,15 +18,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.tuning.design.free_gains import FreeGains
-from mimopilot.tuning.law import ATTITUDE, TERMS, rate_response
+from mimopilot.tuning.design.free_gains import ACCELERATION, FreeGains
+from mimopilot.tuning.law import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, model_response, rate_response
 from mimopilot.tuning.plant.wide_response import WideResponse
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
-#: Matrix -> letter of its term.
-LETTERS = {term.matrix: letter for letter, term in TERMS.items()}
+#: Matrix -> letter of its term of the rate loop.
+LETTERS = {term.matrix: letter for letter, term in LOOP_TERMS.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +112,31 @@ class LoopGradient:
         return np.linalg.inv(np.eye(2) + self.L_u).astype(np.complex128)
 
     @cached_property
+    def _model(self) -> tuple[Complex, Complex, Complex]:
+        """Angle, rate and acceleration of the attitude model, (K, 1, 1) each."""
+        return model_response(self.free.base.filters, self.plant.omega)
+
+    @cached_property
+    def _rate_setpoint(self) -> Complex:
+        """From the attitude setpoint to the rate setpoint, without the measured angles, (K, 2, 2)."""
+        angle, rate, _ = self._model
+        found: Complex = self.matrices[ATTITUDE.matrix] * angle
+        return found + self.matrices[ATTITUDE_FEEDFORWARD.matrix] * rate if self._follows else found
+
+    @property
+    def _follows(self) -> bool:
+        return ATTITUDE_FEEDFORWARD.matrix in self.matrices
+
+    @cached_property
+    def C_ref(self) -> Complex:  # noqa: N802
+        """From the attitude setpoint to u, loops open, (K, 2, 2)."""
+        found: Complex = self.C_r @ self._rate_setpoint
+        return found + self.matrices[ACCELERATION.matrix] * self._model[2] if self._follows else found
+
+    @cached_property
     def U(self) -> Complex:  # noqa: N802
         """From the attitude setpoint to u, (K, 2, 2)."""
-        return self.S @ self.C_o
+        return self.S @ self.C_ref
 
     @cached_property
     def T(self) -> Complex:  # noqa: N802
@@ -151,6 +174,8 @@ class LoopGradient:
         count, eye, N = len(self.plant.omega), np.eye(2), self.plant.noise
         Kp_o = self.matrices[ATTITUDE.matrix]
         angle, noise_o = Kp_o @ self.plant.G_o, Kp_o @ N[:, 2:]
+        model_angle, model_rate, model_acceleration = (part[:, 0] for part in self._model)
+        none, noiseless = np.zeros(2), np.zeros(4)
         parts: dict[str, list[Complex]] = {name: [] for name in ("alpha", "beta", "gamma", "xi", "beta_i")}
 
         def add(**rows: NDArray[np.generic]) -> None:
@@ -162,19 +187,28 @@ class LoopGradient:
                 add(
                     alpha=self.C_r[:, :, row],
                     beta=self.plant.G_o[:, column],
-                    gamma=eye[column],
+                    gamma=model_angle * eye[column],
                     xi=N[:, 2 + column],
-                    beta_i=np.zeros(2),
+                    beta_i=none,
                 )
-                continue
-            of_r, of_y = (shape[:, 0] for shape in self._shapes[name])
-            add(
-                alpha=eye[row],
-                beta=of_y * self.plant.G_i[:, column] + of_r * angle[:, column],
-                gamma=of_r * Kp_o[column],
-                xi=of_y * N[:, column] + of_r * noise_o[:, column],
-                beta_i=of_y * self.plant.G_i[:, column],
-            )
+            elif name in LETTERS:
+                of_r, of_y = (shape[:, 0] for shape in self._shapes[name])
+                add(
+                    alpha=eye[row],
+                    beta=of_y * self.plant.G_i[:, column] + of_r * angle[:, column],
+                    gamma=of_r * self._rate_setpoint[:, column],
+                    xi=of_y * N[:, column] + of_r * noise_o[:, column],
+                    beta_i=of_y * self.plant.G_i[:, column],
+                )
+            else:  # feed-forward: outside of the loop
+                first = name == ATTITUDE_FEEDFORWARD.matrix
+                add(
+                    alpha=self.C_r[:, :, row] if first else eye[row],
+                    beta=none,
+                    gamma=(model_rate if first else model_acceleration) * eye[column],
+                    xi=noiseless,
+                    beta_i=none,
+                )
         size = self.free.size[None, :, None]
         found = {name: np.stack(rows, axis=1).astype(np.complex128) for name, rows in parts.items()}
         found["alpha"] = found["alpha"] * size

@@ -32,7 +32,7 @@ from mimopilot.tuning.design.free_gains import FreeGains, free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import ATTITUDE, TERMS
+from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS
 from mimopilot.tuning.motors import Motors
 from mimopilot.tuning.plant.noise_spectrum import flown_torque_noise
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
@@ -173,9 +173,10 @@ class ResponseDesign:
         Parameters
         ----------
         starts : sequence of Gains
-            Where the search begins; the first gives filters, limits and yaw.
+            Where the search begins; the first gives filters, limits and yaw. If it follows a model, the model's
+            bandwidth is that of the design.
         structure : str
-            Letters of `tuning.law.TERMS`.
+            Letters of `tuning.law.LOOP_TERMS`.
         full : bool
             False: the diagonals only (SISO).
         bandwidth : float, rad/s, optional
@@ -191,7 +192,7 @@ class ResponseDesign:
             bandwidth, task, vector = self._best_bandwidth(task, vector)
         vector = descend(task, vector, EXACTLY)
         return Design(
-            gains=free.gains(vector),
+            gains=task.free.gains(vector),
             model=SecondOrder(bandwidth, DAMPING),
             cost=task.cost(vector),
             violation=task.violation(vector),
@@ -249,7 +250,7 @@ class ResponseDesign:
         """Cost and constraints around every plant."""
         model = SecondOrder(bandwidth, DAMPING).discretise(free.base.Ts)
         return DesignTask(
-            free,
+            _following(free, bandwidth),
             [
                 PlantTask(plant, manoeuvres(plant, model), self._constraints(free, starts, place))
                 for place, plant in enumerate(self.plants)
@@ -299,7 +300,7 @@ def flown_amplitude(experiment: Experiment) -> float:
 
 def _scaled(task: DesignTask, start: Gains) -> Signal:
     """A starting point with its rate gains scaled to the least merit: the search begins near its constraints."""
-    rate = [TERMS[letter].matrix for letter in TERMS]
+    rate = [term.matrix for term in LOOP_TERMS.values()]
     scaled = [
         task.free.vector(replace(start, **{name: factor * getattr(start, name) for name in rate}))  # type: ignore[arg-type]
         for factor in SCALES
@@ -311,7 +312,15 @@ def _with_bandwidth(task: DesignTask, bandwidth: float) -> DesignTask:
     """The task for another attitude model."""
     model = SecondOrder(bandwidth, DAMPING).discretise(task.free.base.Ts)
     plants = [replace(one, manoeuvres=replace(one.manoeuvres, model=model)) for one in task.plants]
-    return replace(task, plants=plants)
+    return replace(task, free=_following(task.free, bandwidth), plants=plants)
+
+
+def _following(free: FreeGains, bandwidth: float) -> FreeGains:
+    """The free gains with this bandwidth of the attitude model, if they follow one."""
+    if free.base.filters.followed is None:
+        return free
+    filters = replace(free.base.filters, model_omega=bandwidth, model_damping=DAMPING)
+    return replace(free, base=replace(free.base, filters=filters))
 
 
 def _vehicle_damps(task: DesignTask, vector: Signal) -> bool:

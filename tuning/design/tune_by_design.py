@@ -13,9 +13,10 @@ from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
 from mimopilot.tuning.design.prediction import Prediction, predict, reasons_to_keep
-from mimopilot.tuning.design.response_design import Design, ResponseDesign
+from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ContinuousModel, SecondOrder
@@ -25,6 +26,8 @@ from mimopilot.tuning.spec import TuningSpec
 REACHABLE, SLOWEST, FASTEST, DAMPING = 1.0, 5.0, 60.0, 0.7
 #: Most designs: each that lacks a certificate tightens the next.
 MAX_DESIGNS = 5
+#: Matrices of the loop itself: without feed-forward from an attitude model.
+LOOP_MATRICES = (ATTITUDE.matrix, *(term.matrix for term in LOOP_TERMS.values()))
 MOTORS_UNKNOWN = (
     "the log does not contain the motors' commands (PX4: actuator_motors): their limits are taken as those of a "
     "quadrotor that hovers at half thrust"
@@ -108,9 +111,15 @@ def certificate(
     gains: Gains, measured: PlantEstimates, spec: TuningSpec, inner: ContinuousModel, outer: ContinuousModel
 ) -> Certificate:
     """The certificate of a designed set from one log."""
-    models = ([model.discretise(gains.Ts)] * 2 for model in (inner, outer))
-    log, thresholds = measured.experiment.sha256, spec.certificate
-    return certify(gains, measured.response, *models, log, thresholds, lambda: measured.model)
+    return certify(
+        gains,
+        measured.response,
+        [inner.discretise(gains.Ts)] * 2,
+        [outer.discretise(gains.Ts)] * 2,
+        measured.experiment.sha256,
+        spec.certificate,
+        lambda: measured.model,
+    )
 
 
 def _weakest(certificates: Sequence[Certificate]) -> Certificate:
@@ -131,20 +140,25 @@ def starting_points(
     measured: Sequence[PlantEstimates], spec: TuningSpec, inner: SecondOrder, bench: ResponseDesign
 ) -> tuple[list[Gains], str]:
     """Gain sets that a search begins at, and their origin: VRFT's of the first log, and the flown ones."""
-    first = measured[0].experiment
+    first, B = measured[0].experiment, bench.plants[0].body.B
     base = starting_set(first, spec)
+    # The bandwidth is the design's.
+    filters = replace(base.filters, model_omega=FIRST_BANDWIDTH if spec.follow_model else 0.0)
+    inverse = np.asarray(np.linalg.inv(B), np.float64)
+    base = replace(base, filters=filters, Kff_o=np.eye(2), Kaff_i=inverse)
     starts, origin = [], []
     try:
         task = spec.model_copy(update={"inner": (inner, inner)})
-        starts.append(estimate(first, task, None, measured[0].body).gains)
+        estimated = estimate(first, task, None, measured[0].body).gains
+        starts.append(replace(base, **{name: getattr(estimated, name) for name in LOOP_MATRICES}))
         origin.append("VRFT")
     except TuningError:  # no estimate of that model: another start does
         pass
     if first.flown is not None:
-        starts.append(replace(first.flown, filters=base.filters, limits=base.limits, yaw=base.yaw))
+        starts.append(replace(base, **{name: getattr(first.flown, name) for name in LOOP_MATRICES}))
         origin.append("flown")
     if not starts:
-        decoupled = inner.omega * np.linalg.inv(bench.plants[0].body.B)
+        decoupled = inner.omega * inverse
         starts.append(replace(base, Kp_o=inner.omega / 3 * np.eye(2), Kp_i=decoupled, Ki_i=decoupled))
         origin.append("rigid body")
     return starts, ", ".join(origin)

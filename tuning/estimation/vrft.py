@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.regression import Regression, Solution, solve
-from mimopilot.tuning.law import TERMS, Filters, regressors
+from mimopilot.tuning.law import LOOP_TERMS, Filters, regressors
 from mimopilot.tuning.reference_model import ReferenceModel
 
 Signal = NDArray[np.float64]
@@ -189,9 +189,9 @@ def vrft(
     TuningError
         When a segment is too short, a model's period differs, or the regressors are not excited.
     """
-    letters = "".join(term for term in TERMS if term in terms)
+    letters = "".join(term for term in LOOP_TERMS if term in terms)
     if not letters or len(letters) != len(terms) or weight not in ("optimal", "identity"):
-        known = "".join(TERMS)
+        known = "".join(LOOP_TERMS)
         raise TuningError(
             f"got terms {terms!r} and weight {weight!r}, expected letters of {known}, and optimal or identity"
         )

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains, Limits
 from mimopilot.tuning.parameter_row import AXIS_LETTERS, PREFIX, Row, Shape
 from mimopilot.tuning.parameters import ROWS, SCALE
@@ -103,14 +104,14 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     Returns
     -------
     Gains or None
-        None when the parameters do not describe a complete controller. Elements without a ``MIMO_`` parameter in
-        the log (yaw, limits) are the autopilot's own.
+        None when the parameters do not describe a complete controller, or one that cannot run with that period.
+        Elements without a ``MIMO_`` parameter in the log (yaw, limits) are the autopilot's own.
     """
     # Vehicles store float32: use the shortest decimal that rounds to the same float32.
     values = {name: float(str(np.float32(value))) for name, value in parameters.items()}
     found: dict[Row, Any] = {_PERIOD: Ts}
     for row in ROWS:
-        if row is _PERIOD:
+        if row is _PERIOD or (row.default is not None and not any(PREFIX + code in values for code in row.codes)):
             continue
         numbers = []
         for code in row.codes:
@@ -119,12 +120,12 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
         if not all(row.shape is Shape.POLE or row.valid.holds(number) for number in numbers):
             return None
         found[row] = numbers[0] if len(numbers) == 1 else numbers
-    scale = [values.get(f"{PREFIX}{SCALE}_{letter}") for letter in AXIS_LETTERS]
-    return Gains.from_rows(
-        found,
-        moment_scale=None if None in scale else tuple(scale),
-        provenance=Provenance("flown"),
-    )
+    scale: Any = tuple(values.get(f"{PREFIX}{SCALE}_{letter}") for letter in AXIS_LETTERS)
+    try:
+        gains = Gains.from_rows(found, provenance=Provenance("flown"))
+    except TuningError:  # such as an attitude model that is too fast for the period of the log
+        return None
+    return replace(gains, moment_scale=None if None in scale else scale)
 
 
 def _of_the_file(row: Row, element: float, Ts: float) -> float:
@@ -139,6 +140,8 @@ def _stock(row: Row, code: str, values: Mapping[str, float]) -> float:
         return values.get(stock.cutoffs.get(row.key, ""), row.default or 0.0)
     if row.shape is Shape.SCALAR:
         return math.nan if row.default is None else row.default
+    if row.shape is not Shape.AXES and row.key not in stock.gains:
+        return math.nan
     *_, axes = code.rpartition("_")
     if axes[0] != axes[-1]:
         return 0.0

@@ -8,7 +8,6 @@ from typing import Any
 
 from mimopilot.common.console import print_table
 from mimopilot.tuning.logs.inspection import Inspection
-from mimopilot.tuning.parameters import MATRICES
 
 #: Signal -> its name, its unit in the table, and the factor from SI to that unit.
 _NAMES = {
@@ -36,7 +35,7 @@ def as_mapping(found: Inspection) -> dict[str, Any]:
         if experiment is None
         else {"Ts": experiment.Ts, "seconds": experiment.seconds, "segments": [list(s) for s in experiment.segments]},
         "excitation": {name: asdict(report) for name, report in found.excitation.items()},
-        "flown": None if found.flown is None else {name: getattr(found.flown, name).tolist() for name in MATRICES},
+        "flown": None if found.flown is None else {name: m.tolist() for name, m in found.flown.matrices.items()},
         "warnings": list(found.warnings),
         "notes": list(recording.notes),
         "tunable": found.reason is None,
@@ -72,8 +71,7 @@ def print_inspection(found: Inspection) -> None:
         low, high = excitation.band_hz
         print(f"excitation {name}: {excitation.rms:.4f} RMS, 90 % of its power from {low:.2f} to {high:.2f} Hz")
     if found.flown is not None:
-        flown = found.flown
-        diagonals = [f"{name} {getattr(flown, name)[0, 0]:.4g} / {getattr(flown, name)[1, 1]:.4g}" for name in MATRICES]
+        diagonals = [f"{name} {m[0, 0]:.4g} / {m[1, 1]:.4g}" for name, m in found.flown.matrices.items()]
         print(f"flown (roll / pitch): {', '.join(diagonals)}")
     for note in recording.notes:
         print(f"note: {note}")

@@ -19,7 +19,7 @@ from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameter_row import AXES, AXIS_LETTERS, PREFIX, Parameter
-from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, MATRICES, PARAMETERS, ROWS, Setting
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, MATRICES, PARAMETERS, ROWS, YAW_GAINS, Setting
 
 #: Largest off-diagonal gain, as a share of its row's diagonal, that a stock profile drops without the option; chosen.
 DROPPED_SHARE = 0.1
@@ -163,7 +163,7 @@ def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> Upload
                 + f"; the {profile} controller does not accept it: tune again, or use another profile"
             )
     if profile != "mimo":
-        plan = replace(plan, dropped=off_diagonal_shares(gains), notes=plan.notes + _lost_limits(gains))
+        plan = replace(plan, dropped=off_diagonal_shares(gains), notes=plan.notes + _lost_features(gains))
         code, share = max(plan.dropped.items(), key=lambda item: item[1], default=("", 0.0))
         if share > DROPPED_SHARE and not drop:
             raise SitlError(
@@ -174,10 +174,10 @@ def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> Upload
 
 
 def off_diagonal_shares(gains: Gains) -> dict[str, float]:
-    """Code of each non-zero off-diagonal gain -> its size as a share of its row's diagonal."""
+    """Code of each non-zero off-diagonal gain -> its size as a share of its row's diagonal; without model following."""
     shares: dict[str, float] = {}
-    for name, code in MATRICES.items():
-        matrix = np.abs(getattr(gains, name))
+    for name in YAW_GAINS:
+        matrix, code = np.abs(getattr(gains, name)), MATRICES[name]
         for i, j in ((0, 1), (1, 0)):
             if matrix[i, j] > 0:
                 share = matrix[i, j] / matrix[i, i] if matrix[i, i] > 0 else math.inf
@@ -188,13 +188,15 @@ def off_diagonal_shares(gains: Gains) -> dict[str, float]:
 def _diagonal(gains: Gains, axis: int) -> list[float]:
     """P of the outer loop, then P, I, D and FF of the inner loop, of one axis."""
     if axis == 2:
-        return [getattr(gains.yaw, name) for name in MATRICES]
-    return [float(getattr(gains, name)[axis, axis]) for name in MATRICES]
+        return [getattr(gains.yaw, name) for name in YAW_GAINS]
+    return [float(getattr(gains, name)[axis, axis]) for name in YAW_GAINS]
 
 
-def _lost_limits(gains: Gains) -> tuple[str, ...]:
+def _lost_features(gains: Gains) -> tuple[str, ...]:
     lost = [axis for axis, limit in zip(AXES, gains.limits.moment_max, strict=True) if limit < 1]
-    return (f"moment_max ({', '.join(lost)}) has no counterpart and is not set",) if lost else ()
+    limits = (f"moment_max ({', '.join(lost)}) has no counterpart and is not set",) if lost else ()
+    model = ("model following has no counterpart: attitude setpoints act directly",) if gains.filters.followed else ()
+    return limits + model
 
 
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.

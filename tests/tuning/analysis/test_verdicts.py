@@ -247,3 +247,27 @@ def test_gains_that_the_log_makes_unstable_are_not_written():
             continue
         radius = Truth.of(airframe("adam0"), late=4).spectral_radius(tuned)
         assert radius < 1 or tuned.verdict()[0] not in ACCEPTED
+
+
+def test_model_following_changes_the_answer_to_the_setpoint_and_not_the_loops():
+    """Without feed-forward T_o is that without a model times the model; feed-forward adds G (C_r Kff_o w + Kaff al)."""
+    omega = np.geomspace(0.5, 200, 60)
+    plant, gains = integrating(omega), plain()
+    off = cascade_loop(gains, plant)
+    filters = dataclasses.replace(gains.filters, model_omega=8.0, model_damping=0.6)
+    model = dataclasses.replace(gains, filters=filters)
+    on = cascade_loop(model, plant)
+    z = np.exp(1j * omega * gains.Ts)
+    q, c = (8.0 * gains.Ts) ** 2, 2 * 0.6 * 8.0 * gains.Ts
+    M = (q * z**2 / (z**2 - (2 - c - q) * z + 1 - c))[:, None, None]
+    assert (on.L_u == off.L_u).all() and (on.L_i == off.L_i).all()
+    assert on.T_o == pytest.approx(off.T_o * M, rel=1e-12)
+    fed = dataclasses.replace(model, Kff_o=np.diag([1.0, 0.5]), Kaff_i=np.array([[0.01, 0.002], [0.0, 0.01]]))
+    w = ((z - 1) / (z * gains.Ts))[:, None, None] * M
+    al = ((z - 1) / (z * gains.Ts))[:, None, None] * w
+    # Plain P: C_r = Kp_i.
+    extra = gains.Kp_i @ fed.Kff_o * w + fed.Kaff_i * al
+    found = cascade_loop(fed, plant)
+    assert found.U_o - on.U_o == pytest.approx(np.linalg.solve(np.eye(2) + off.L_u, extra), abs=1e-12)
+    assert found.T_o == pytest.approx(plant.G_o @ found.U_o, rel=1e-12)
+    assert (found.L_u == off.L_u).all()

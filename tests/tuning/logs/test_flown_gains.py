@@ -1,7 +1,10 @@
+import re
+
 import numpy as np
 import pytest
 
 from mimopilot.tuning.logs.flown_gains import flown_gains
+from tests.conftest import following_gains
 
 PX4 = {
     **{f"MC_{axis}_P": 6.5 for axis in ("ROLL", "PITCH")},
@@ -48,3 +51,17 @@ def test_mimo_parameters_take_precedence():
 @pytest.mark.parametrize("missing", ["MC_ROLLRATE_P", "MC_YAW_P", "MC_RR_INT_LIM", "MC_ROLLRATE_MAX"])
 def test_parameters_of_an_incomplete_controller_give_no_gains(missing):
     assert flown_gains({k: v for k, v in PX4.items() if k != missing}, 0.004) is None
+
+
+def test_model_following_is_read_with_its_matrices_or_not_at_all():
+    flown = following_gains()
+    logged = {f"MIMO_{code}": np.float32(value) for code, value in flown.elements().items()}
+    read = flown_gains(logged, flown.Ts)
+    assert read is not None
+    assert (read.filters.model_omega, read.filters.model_damping) == (9.0, 0.8)
+    assert read.Kaff_i.tolist() == flown.Kaff_i.tolist()
+    without = flown_gains({name: v for name, v in logged.items() if not re.match("MIMO_(AF|RA|M)_", name)}, flown.Ts)
+    assert without is not None and without.filters.followed is None
+    assert flown_gains({name: v for name, v in logged.items() if not name.startswith("MIMO_AF")}, flown.Ts) is None
+    assert flown_gains({name: v for name, v in logged.items() if name != "MIMO_RA_RP"}, flown.Ts) is None
+    assert flown_gains(logged, 0.05) is None  # a model too fast for this period

@@ -13,9 +13,8 @@ from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.logs.flown_gains import flown_gains
-from mimopilot.tuning.parameters import MATRICES, PARAMETERS
-
-WRITTEN = sum(parameter.writable for parameter in PARAMETERS)
+from mimopilot.tuning.parameters import MATRICES, PARAMETERS, ROWS, YAW_GAINS
+from tests.conftest import coupled_gains, following_gains
 
 
 @pytest.fixture
@@ -51,9 +50,9 @@ def test_ardupilots_parameters_are_the_diagonal_gains_in_its_units(diagonal):
     values = make_plan(diagonal, "ardupilot-stock").values
     for axis, name in enumerate(("RLL", "PIT", "YAW")):
         if axis == 2:
-            terms = [getattr(diagonal.yaw, matrix) for matrix in MATRICES]
+            terms = [getattr(diagonal.yaw, matrix) for matrix in YAW_GAINS]
         else:
-            terms = [getattr(diagonal, matrix)[axis, axis] for matrix in MATRICES]
+            terms = [getattr(diagonal, matrix)[axis, axis] for matrix in YAW_GAINS]
         written = [
             values[f"ATC_{part}"] for part in (f"ANG_{name}_P", *(f"RAT_{name}_{t}" for t in ("P", "I", "D", "FF")))
         ]
@@ -107,6 +106,16 @@ def test_values_out_of_range_that_a_vehicle_would_accept_are_refused(diagonal, p
         make_plan(dataclasses.replace(diagonal, **change), profile)
 
 
+def test_a_stock_controller_flies_without_the_model_and_the_plan_says_so():
+    following = following_gains()
+    plan = make_plan(following, "px4-stock", drop=True)
+    off = dataclasses.replace(following, filters=dataclasses.replace(following.filters, model_omega=0.0))
+    assert plan.values == make_plan(off, "px4-stock", drop=True).values
+    assert plan.dropped == off_diagonal_shares(coupled_gains())
+    assert any("model following has no counterpart" in note for note in plan.notes)
+    assert not any("model" in note for note in make_plan(off, "px4-stock", drop=True).notes)
+
+
 @pytest.mark.parametrize("profile", PROFILES)
 def test_every_name_and_value_fits_a_mavlink_message(diagonal, profile):
     for name, value in make_plan(diagonal, profile).values.items():
@@ -123,7 +132,8 @@ def test_a_snapshot_must_be_complete_and_within_our_ranges(diagonal):
     assert [s.unit for s in plan.settings][:1] == ["1/s"]
     with pytest.raises(SitlError, match=r"old\.params: MIMO_RP_RR: got 99, expected -?[0-9.e-]+ to 5 s"):
         make_restore_plan(values | {"MIMO_RP_RR": 99.0}, "old.params")
-    with pytest.raises(SitlError, match=rf"holds {WRITTEN - 2} of our {WRITTEN} gains and lacks MIMO_RP_RP and 1 more"):
+    count = sum(len(row.codes) for row in ROWS if row.writable and row.default is None)
+    with pytest.raises(SitlError, match=rf"holds {count - 2} of our {count} gains and lacks MIMO_RP_RP and 1 more"):
         make_restore_plan({n: v for n, v in values.items() if n not in ("MIMO_RP_RP", "MIMO_D_POLE")}, "old.params")
     foreign = make_restore_plan({"MC_ROLL_P": 99.0}, "px4.params")
     assert (foreign.values, foreign.profile) == ({"MC_ROLL_P": 99.0}, "px4-stock")

@@ -33,17 +33,17 @@ def library(vehicle):
     return load_native(vehicle.default_gains())
 
 
-def pilot(vehicle, library):
-    gains = vehicle.default_gains()
+def pilot(vehicle, library, gains=None):
+    gains = gains or vehicle.default_gains()
     return Autopilot(vehicle.airframe, gains, NativeController(library, gains))
 
 
-def over_both(vehicle, library, scenario, *texts, seed=3):
+def over_both(vehicle, library, scenario, *texts, seed=3, gains=None):
     """The same flight in process and over MAVLink."""
     faults = tuple(map(parse_fault, texts))
-    flight = fly(vehicle.airframe, pilot(vehicle, library), replace(scenario, faults=faults), seed)
+    flight = fly(vehicle.airframe, pilot(vehicle, library, gains), replace(scenario, faults=faults), seed)
     with plant_process("adam0", 0, TS, seed, None, faults=faults) as port:
-        return flight, lockstep.fly(pilot(vehicle, library), scenario, port)
+        return flight, lockstep.fly(pilot(vehicle, library, gains), scenario, port)
 
 
 def test_a_flight_with_component_faults_and_delays_over_mavlink_equals_the_one_in_process(vehicle, library):
@@ -54,6 +54,15 @@ def test_a_flight_with_component_faults_and_delays_over_mavlink_equals_the_one_i
     flight, record = over_both(vehicle, library, doublet("roll", 0.3, 0.42, TS), *texts)
     assert np.isnan(record["rates"]).any()
     assert record.tobytes() == flight.record.tobytes()
+
+
+def test_a_flight_with_model_following_over_mavlink_equals_the_one_in_process(vehicle, library):
+    plain = vehicle.default_gains()
+    gains = replace(plain, filters=replace(plain.filters, model_omega=12.0), Kff_o=np.eye(2), Kaff_i=0.006 * np.eye(2))
+    flight, record = over_both(vehicle, library, doublet("roll", 0.3, 0.42, TS), gains=gains)
+    assert record.tobytes() == flight.record.tobytes()
+    other = fly(vehicle.airframe, pilot(vehicle, library), doublet("roll", 0.3, 0.42, TS), 3)
+    assert np.abs(flight.record["attitude"] - other.record["attitude"])[:, 0].max() > 0.02
 
 
 def test_the_link_loses_the_same_periods_over_mavlink(vehicle, library):
