@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 #: Columns of the tables of predicted figures.
 PREDICTED = ("", "follows [deg]", "other axis [deg]", "after torque [deg]", "noise of u", "Ms")
 PREDICTED_TITLE = (
-    "Predicted, roll / pitch. RMS in doublets of 10 degrees, 0.4 to 2 s: to the model\n({model}) and of the other axis; "
-    "after a step of torque; of the torque at hover"
+    "Predicted, roll / pitch. RMS in doublets of 10 degrees, 0.4 to 2 s: to the model\n"
+    "({model}) and of the other axis; after a step of torque; of the torque at hover"
 )
 
 
@@ -36,7 +36,8 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: mimopilot inspect flight.ulg")(inspect)
     app.command(epilog="Example: mimopilot identify flight.ulg --order 4 --out plant.toml")(identify)
     app.command(
-        epilog="Example: mimopilot tune flight.ulg --out my.gains.toml; mimopilot tune light.ulg heavy.ulg --out both.gains.toml; "
+        epilog="Example: mimopilot tune flight.ulg --out my.gains.toml; "
+        "mimopilot tune light.ulg heavy.ulg --out both.gains.toml; "
         "mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out thesis.gains.toml"
     )(tune)
     app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
@@ -70,7 +71,8 @@ def tune(
     instrument: Annotated[
         str | None,
         typer.Option(
-            help="Of VRFT, with --inner or --outer: external (lags of the injected torque, the default), u (of the total torque), model, repeated."
+            help="Of VRFT, with --inner or --outer: external (lags of the injected torque, the default), u (of the total "
+            "torque), model, repeated."
         ),
     ] = None,
     repeat: Annotated[
@@ -235,7 +237,7 @@ def advise(
     columns: ColumnsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the gains that tune finds beside the alternatives: slower, faster, quieter, SISO, other derivative filters."""
+    """Show the gains that tune finds beside alternatives: slower, faster, quieter, SISO, other derivative filters."""
     from dataclasses import asdict
 
     from rich.progress import track

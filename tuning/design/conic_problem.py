@@ -18,8 +18,8 @@ Signal = NDArray[np.float64]
 class ConicProblem:
     """Least g'd + d'Hd/2 + penalty sum(t) over a step d and relaxations t >= 0, within cones.
 
-    Every constraint is linear in d and scaled so that 1 is its typical size. Each has its own relaxation, so the problem
-    always has a solution.
+    Every constraint is linear in d and scaled so that 1 is its typical size. Each has its own relaxation, so the
+    problem always has a solution.
 
     Parameters
     ----------

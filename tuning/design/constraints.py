@@ -2,8 +2,9 @@
 
 A margin is relative: 0 at the limit, negative when violated. The distance of I + L from 0 is bounded by a convex inner
 approximation (A. Karimi, G. Galdos, "Fixed-order H-infinity controller design for nonparametric models by convex
-optimization", Automatica 46, 2010): P^H P >= P^H P_c + P_c^H P - P_c^H P_c, with P_c the present I + L, is linear in the
-gains. A 2x2 Hermitian matrix is positive semidefinite where (a + c, a - c, 2 Re b, 2 Im b) is in a second-order cone.
+optimization", Automatica 46, 2010): P^H P >= P^H P_c + P_c^H P - P_c^H P_c, with P_c the present I + L. The right side
+is linear in the gains. A 2x2 Hermitian matrix [[a, b], [b*, c]] is positive semidefinite where (a + c, a - c, 2 Re b,
+2 Im b) is in a second-order cone.
 """
 
 from __future__ import annotations
@@ -280,7 +281,8 @@ class Definite:
         scale, slope = self._scale(loop), np.zeros((3, problem.size))
 
         def parts(product: Signal) -> Signal:
-            return np.array([product[0, 0] + product[1, 1], product[0, 0] - product[1, 1], product[0, 1] + product[1, 0]])
+            (a, b), (c, d) = product
+            return np.array([a + d, a - d, b + c])
 
         for place, (name, row, column) in enumerate(loop.free.places()):
             if name == self.matrix:

@@ -1,8 +1,8 @@
 """The closed loop around a plant and its exact derivatives with respect to the gains.
 
 u = C_ref r_o - C_o y_o - C_y y_i, with C_ref = C_r (Kp_o m + Kff_o m_w) + Kaff_i m_a: m, m_w and m_a are the attitude
-model's angle, rate and acceleration, or 1, 0 and 0 without one. Each gain adds products of a column and a row to the controller: dL = alpha beta',
-dC_ref = alpha gamma', so all derivatives are products of a column and a row, too:
+model's angle, rate and acceleration, or 1, 0 and 0 without one. Each gain adds the product of a column and a row to the
+controller, dL = alpha beta' and dC_ref = alpha gamma', so all derivatives are such products:
 
     S = (I + L)^-1,  L = C_y G_i + C_o G_o        dS = -(S alpha) (beta' S)
     U = S C_ref,     T = G_o U                    dU = (S alpha) (gamma' - beta' U)

@@ -42,7 +42,8 @@ from mimopilot.tuning.spec import DesignLimits
 
 #: Bandwidths of the attitude model, rad/s: ten a factor of 3.16 (ISO 3, R20), from a heavy lifter to a small racer. No
 #: position controller or pilot uses a faster attitude.
-BANDWIDTHS = (2.8, 3.2, 3.6, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.2, 12.5, 14.0, 16.0, 18.0, 20.0, 22.4, 25.0)
+BANDWIDTHS = (2.8, 3.2, 3.6, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.2, 12.5, 14.0, 16.0, 18.0, 20.0, 22.4)
+BANDWIDTHS += (25.0,)
 #: Where the search begins, rad/s, and its first step along the table.
 FIRST_BANDWIDTH, FIRST_STRIDE = 10.0, 2
 #: Damping of the attitude model: 5 % overshoot, the usual choice.
@@ -226,7 +227,7 @@ class ResponseDesign:
         return BANDWIDTHS[best], *found[best][1:]
 
     def _deviations(self, task: DesignTask, vector: Signal) -> dict[str, Signal]:
-        """Standard deviation of each free matrix: the step that plants drawn from the errors of the response ask for."""
+        """Standard deviation of each free matrix: of the steps that plants drawn from the response's errors ask for."""
         generator = np.random.default_rng(0)
         around = task.step(vector, LARGEST_RADIUS)
         steps = [self._drawn(task, generator).step(vector, LARGEST_RADIUS) - around for _ in range(DRAWS)]
@@ -262,9 +263,10 @@ class ResponseDesign:
         plant, experiment, noise = self.plants[place], self.experiments[place], self.noise[place]
         B, floor = plant.body.B, 1 / self.limits.Ms
         proportional = max(float(plant.body.least(start.Kp_i)) for start in starts)
+        begin = slice(plant.band.start, plant.band.start + 1)
         found: list[Constraint] = [
             *(Distance(cut, slice(0, plant.band.stop), floor) for cut in Cut),
-            Distance(Cut.TORQUE, slice(plant.band.start, plant.band.start + 1), 1 / (SHARE * MAX_SENSITIVITY_BELOW_BAND)),
+            Distance(Cut.TORQUE, begin, 1 / (SHARE * MAX_SENSITIVITY_BELOW_BAND)),
             NoiseLimit(self.limits.noise * noise),
             gain_above_band(plant),
             structural_modes(plant, self.limited[place]),

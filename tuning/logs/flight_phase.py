@@ -22,9 +22,9 @@ SHORT = 0.1  # s on the ground during the excitation that need no warning
 def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str, ...]]:
     """The parts of a log that can be used for tuning.
 
-    An injected excitation marks the experiment, from its first to its last nonzero sample and until the response has
-    faded; without one it is the whole log. Of the experiment the part in flight is used: as the vehicle logged it, else from the first to the
-    last movement. Nothing is used from `BEFORE_TUMBLE` before a tumble on.
+    An injected excitation marks the experiment: from its first nonzero sample until the response to the last has faded.
+    Without one it is the whole log. Of the experiment the part in flight is used: as the vehicle logged it, else from
+    the first to the last movement. Nothing is used from `BEFORE_TUMBLE` before a tumble on.
 
     Parameters
     ----------

@@ -19,7 +19,6 @@ from mimopilot.tuning.parameters import ROWS, SCALE
 from mimopilot.tuning.provenance import Provenance
 
 
-
 @dataclass(frozen=True)
 class _Stock:
     """Parameters of an autopilot's own controller.

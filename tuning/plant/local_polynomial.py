@@ -19,8 +19,8 @@ from mimopilot.tuning.errors import TuningError
 ORDER = 2  # of the local polynomials
 FREEDOM = 8  # least degrees of freedom of the noise estimate in a window
 CENTRES = 1000  # largest number of frequencies
-#: Share of a signal's power that a wide window may leave unexplained, whatever narrow ones leave: a narrow window hardly
-#: tells a chirp near an end of the record from the record's transient.
+#: Share of a signal's power that a wide window may leave unexplained, whatever narrow ones leave: a narrow window
+#: hardly tells a chirp near an end of the record from the record's transient.
 NEGLIGIBLE = 3e-3
 #: A window is too wide if its noise exceeds that of narrow windows by this many standard deviations of the ratio.
 HIDDEN = 4.0

@@ -168,8 +168,8 @@ def hat_weights(omega: Signal, fine: Signal, values: NDArray[Any]) -> NDArray[An
 def _noise_deviation(omega: Signal, seconds: float) -> Signal:
     """Relative standard deviation of the size of a noise whose spectrum is a mean over windows of the DFT's bins.
 
-    The power of a mean over m bins deviates by 1 / sqrt(m), its square root by half of that. A window is `GROWTH` of its
-    frequency wide on both sides, or holds the least number of bins.
+    The power of a mean over m bins deviates by 1 / sqrt(m), its square root by half of that. A window is `GROWTH` of
+    its frequency wide on both sides, or holds the least number of bins.
     """
     bins = np.maximum(FREEDOM, 2 * GROWTH * omega * seconds / (2 * np.pi))
     return np.asarray(0.5 / np.sqrt(bins))
