@@ -71,8 +71,8 @@ def tune(
     instrument: Annotated[
         str | None,
         typer.Option(
-            help="Of VRFT, with --inner or --outer: external (lags of the injected torque, the default), u (of the total "
-            "torque), model, repeated."
+            help="Of VRFT, with --inner or --outer: external (lags of the injected torque, the default), u (of the "
+            "total torque), model, repeated."
         ),
     ] = None,
     repeat: Annotated[
