@@ -35,14 +35,10 @@ PeriodOption = Annotated[
 ]
 TailOption = Annotated[float | None, typer.Option(help="Level flight after a doublet, s.", show_default="1.5")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
-WorkersOption = Annotated[
-    int | None, typer.Option(min=1, max=1024, help="Processes; by default one for each core.")
-]
+WorkersOption = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes; by default one for each core.")]
 SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast as possible.")]
 LogOutOption = Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")]
-UncertifiedOption = Annotated[
-    bool, typer.Option("--uncertified", help="Accept gains whose stability is in doubt.")
-]
+UncertifiedOption = Annotated[bool, typer.Option("--uncertified", help="Accept gains whose stability is in doubt.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 TimeoutOption = Annotated[

@@ -79,9 +79,7 @@ def sitl(
         task = scenario_of(scenario, axis, amplitude_deg, period_s, None, fault or (), controller.Ts)
         faults = task.faults
     else:
-        check_not_given(
-            "only with a --scenario; give one", axis=axis, amplitude_deg=amplitude_deg, period_s=period_s
-        )
+        check_not_given("only with a --scenario; give one", axis=axis, amplitude_deg=amplitude_deg, period_s=period_s)
     if plant:
         check_not_given(
             "belong to the plant: with --plant, give them where it was started",

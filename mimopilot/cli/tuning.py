@@ -81,9 +81,7 @@ def tune(
     window: Annotated[
         int | None, typer.Option(help="Lags of VRFT's instrument, samples; by default from the models.")
     ] = None,
-    spec: Annotated[
-        Path | None, typer.Option(help="Specification (TOML): the above, and what the log lacks.")
-    ] = None,
+    spec: Annotated[Path | None, typer.Option(help="Specification (TOML): the above, and what the log lacks.")] = None,
     columns: ColumnsOption = None,
     campaign: Annotated[
         bool, typer.Option("--campaign", help="Tune each of many logs, and show how gains and certificates spread.")

@@ -93,14 +93,16 @@ def test_no_cutoff_means_no_filter(gains):
     assert gains.filters.derivative_pole == math.exp(-2 * math.pi * 30 * 0.004)
 
 
-CERTIFICATE = Certificate.from_table({
-    "verdict": "unstable",
-    "reason": "the determinant encircles 0: the rate loop alone is unstable",
-    "figures": {"Ms": 1.4, "phase_margin_deg": {"roll": 45.0, "pitch": 46.0}, "gain_margin": {"roll": "at least"}},
-    "band": [1.3, 100.0],
-    "thresholds": {"Ms": 1.8, "phase_deg": 40.0, "thin_Ms": 2.5, "thin_phase_deg": 25.0},
-    "log_sha256": "0123456789abcdef",
-})
+CERTIFICATE = Certificate.from_table(
+    {
+        "verdict": "unstable",
+        "reason": "the determinant encircles 0: the rate loop alone is unstable",
+        "figures": {"Ms": 1.4, "phase_margin_deg": {"roll": 45.0, "pitch": 46.0}, "gain_margin": {"roll": "at least"}},
+        "band": [1.3, 100.0],
+        "thresholds": {"Ms": 1.8, "phase_deg": 40.0, "thin_Ms": 2.5, "thin_phase_deg": 25.0},
+        "log_sha256": "0123456789abcdef",
+    }
+)
 
 
 def test_a_seal_survives_its_file_to_the_bit(gains):

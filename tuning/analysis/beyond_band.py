@@ -89,9 +89,7 @@ def attitude_gain_above(gains: Gains, plant: PlantResponse) -> float:
     G_o falls at least like 1/w^2 there, see `loop_gain_above`.
     """
     grid = np.linspace(plant.omega[-1], np.pi / gains.Ts, GRID_POINTS)
-    path = (
-        np.linalg.norm(cascade_response(gains, grid)[1], ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
-    )
+    path = np.linalg.norm(cascade_response(gains, grid)[1], ord=2, axis=(1, 2)) * (plant.omega[-1] / grid) ** 2
     return float(np.linalg.norm(plant.G_o[-1], ord=2) * path.max())
 
 

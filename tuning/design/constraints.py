@@ -89,8 +89,10 @@ class Distance:
         if self.cut is Cut.ATTITUDE:
             S = eye - loop.T[where]
             P = np.linalg.inv(S).astype(np.complex128)
-            return P, ProductGradient(loop.dT.left[where] @ P.transpose(0, 2, 1), loop.dT.right[where] @ P), np.full(
-                len(P), self.floor
+            return (
+                P,
+                ProductGradient(loop.dT.left[where] @ P.transpose(0, 2, 1), loop.dT.right[where] @ P),
+                np.full(len(P), self.floor),
             )
         whole = self.cut is Cut.TORQUE
         L, dL = (loop.L_u, loop.dL_u) if whole else (loop.L_i, loop.dL_i)

@@ -40,7 +40,7 @@ class VehicleState:
         0 roll, 1 pitch, 2 between them, -1 off.
     """
 
-    vehicle : Commander
+    vehicle: Commander
     stamp: int = -1
     record: Any = field(default_factory=lambda: np.zeros(1, RECORD)[0])
     plant: PlantState = UNKNOWN
