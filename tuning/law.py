@@ -305,7 +305,7 @@ def cascade_response(gains: Matrices, omega: Signal) -> tuple[Response, Response
 
     Parameters
     ----------
-    gains : Gains or GainStack
+    gains : Gains
     omega : (K,) array, rad/s
 
     Returns

@@ -1,4 +1,4 @@
-"""The motors identified from a log: how the allocator drives them, their saturation, the lag of their speed."""
+"""The motors identified from a log: how the allocator drives them, and their saturation."""
 
 from __future__ import annotations
 
@@ -7,12 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.tuning.statespace import StateSpace
 
 #: Smallest share of the torque's variance that the mixer explains; with less the commands belong to another torque.
 EXPLAINED = 0.95
-#: Range of rotors' break frequencies, rad/s: time constants of 10 to 200 ms.
-ROTORS = (5.0, 100.0)
 #: Fewest samples without a saturated motor for a fit.
 MIN_SAMPLES = 50
 #: A command this close to 0 or 1 is saturated: half a step of a 10 bit output.
@@ -100,15 +97,3 @@ def saturation_warnings(u: Signal, commands: Signal, motors: Motors | None, ampl
     )
     fitting = amplitude * float(np.clip(factors.min(), 0.0, 1.0))
     return [f"{text}; inject a torque of {fitting:.2g} instead of {amplitude:.2g}"]
-
-
-def rotor_lag(plant: StateSpace) -> float:
-    """Time constant (s) of the rotors' speed in a plant from torques to body rates; 0 if none is visible.
-
-    Around hover a rotor is one real pole on each axis. The slowest poles are the body's; those of filters are faster or
-    complex.
-    """
-    poles = np.log(plant.poles[len(plant.C) :].astype(complex)) / plant.Ts
-    speeds = -poles.real[np.abs(poles.imag) < -poles.real]
-    speeds = np.sort(speeds[(speeds >= ROTORS[0]) & (speeds <= ROTORS[1])])[: len(plant.C)]
-    return float(1 / np.mean(speeds)) if len(speeds) else 0.0

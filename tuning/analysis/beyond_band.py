@@ -8,7 +8,6 @@ from scipy.optimize import isotonic_regression
 
 from mimopilot.tuning.analysis import margins
 from mimopilot.tuning.analysis.closed_loop import cascade_loop, singular_values
-from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import cascade_response
 from mimopilot.tuning.plant.frequency_response import COHERENT, PlantResponse
@@ -60,8 +59,8 @@ def reason_beyond_band(gains: Gains, known: PlantResponse, gain_above: float) ->
     return ""
 
 
-def loop_gain_above(gains: Gains | GainStack, plant: PlantResponse) -> Signal:
-    """Upper bound of the rate loop's gain above each frequency of the plant, (K,); of a stack (sets, K).
+def loop_gain_above(gains: Gains, plant: PlantResponse) -> Signal:
+    """Upper bound of the rate loop's gain above each frequency of the plant, (K,).
 
     The supremum over w > w_k of sigma_max(G(w_k)) (w_k / w) sigma_max(C_y)(w). A rate is the integral of the torque
     over the inertia, behind motors and filters, so |G| falls at least like 1/w. A constant |G| would be the weaker

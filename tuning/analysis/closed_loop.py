@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning import law
-from mimopilot.tuning.gain_stack import GainStack
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.statespace import StateSpace
@@ -50,8 +49,8 @@ class CascadeLoop:
     U_o: Complex
 
 
-def whole_loop(gains: Gains | GainStack, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
-    """L_i and L_u as in `CascadeLoop`, and the setpoint's path C_ref, (K, 2, 2) each; of a stack (sets, K, 2, 2)."""
+def whole_loop(gains: Gains, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
+    """L_i and L_u as in `CascadeLoop`, and the setpoint's path C_ref, (K, 2, 2) each."""
     C_ref, C_o, C_y = law.cascade_response(gains, plant.omega)
     L_i = C_y @ plant.G_i
     return L_i, L_i + C_o @ plant.G_o, C_ref
