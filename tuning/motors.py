@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-
 #: Smallest share of the torque's variance that the mixer explains; with less the commands belong to another torque.
 EXPLAINED = 0.95
 #: Fewest samples without a saturated motor for a fit.

@@ -63,10 +63,8 @@ def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
     return CascadeLoop(L_i, L_u, plant.G_o @ U_o, U_o)
 
 
-def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
-    """Spectral radius of the closed loop around an identified plant, without limits.
-
-    The larger of two: the rate loop alone, and the whole cascade.
+def closed_loop_poles(gains: Gains, plant: StateSpace) -> Complex:
+    """Poles of the closed loop around a plant, without limits: those of the rate loop alone, then of the whole cascade.
 
     Parameters
     ----------
@@ -80,7 +78,7 @@ def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
     state, memory, rate, angle = np.split(start, [n, n + m, n + m + 2])
     now = plant.C @ state
     angle = angle + gains.Ts / 2 * (now + rate)
-    radius = 0.0
+    poles = []
     for setpoint in (np.zeros_like(now), -law.attitude_matrix(gains) @ angle):
         signals = {law.ERROR: setpoint - now, law.RATE: now, law.SETPOINT: setpoint}
         torque = flown.C @ memory + sum(flown.D[signal] @ values for signal, values in signals.items())
@@ -91,8 +89,14 @@ def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
             kept[-2:] = False
         # A filter whose output is not used, such as an integral with zero gain, is not part of the loop.
         kept[n : n + m] = np.any(flown.C, axis=0)
-        radius = max(radius, float(np.abs(np.linalg.eigvals(step[np.ix_(kept, kept)])).max()))
-    return radius
+        poles.append(np.linalg.eigvals(step[np.ix_(kept, kept)]))
+    found: Complex = np.concatenate(poles).astype(np.complex128)
+    return found
+
+
+def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
+    """Spectral radius of the closed loop around an identified plant; see `closed_loop_poles`."""
+    return float(np.abs(closed_loop_poles(gains, plant)).max())
 
 
 def doublet_spectrum(omega: Signal, seconds: float) -> Complex:

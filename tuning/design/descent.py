@@ -34,7 +34,7 @@ INFEASIBLE = 5e-3
 OTHER_AXIS = 2.0
 #: Weight of the coupling that gains add through the rigid body, over that of a relative error of following: two
 #: integral gains of opposite sign that cancel in every manoeuvre would otherwise be left to noise.
-COUPLING = 0.03
+COUPLING = 0.1
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mimopilot.tuning.analysis.closed_loop import singular_values
-from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, PERIODS, Manoeuvres
+from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, PERIODS, Manoeuvres, manoeuvres
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.wide_response import WideResponse
+from mimopilot.tuning.reference_model import second_order
+from mimopilot.tuning.spec import DesignLimits
 
 #: Time after a doublet that its RMS counts, s.
 TAIL = 1.0
 #: Off-axis RMS of a 10 degree doublet below which sets count as equally decoupled, deg: no pilot sees it.
 DECOUPLED = 0.1
 
+#: Least bandwidth over that of flown gains which keep the limit of Ms: a pilot feels a fifth.
+SLOWEST = 0.8
 #: Share of a limit within which a design keeps it.
 ROUNDING = 0.01
 
@@ -63,14 +67,23 @@ def predict(gains: Gains, plant: WideResponse, task: Manoeuvres) -> Prediction:
     follow = [_rms(np.abs(loop.T[:, i, i] - task.target) ** 2, task) for i in range(2)]
     offaxis = [_rms(np.abs(loop.T[:, 1 - i, i]) ** 2, task) for i in range(2)]
     disturbance = np.degrees(np.sqrt(np.einsum("ki,kji->i", task.step, np.abs(loop.D) ** 2) / TAIL))
-    inside = slice(0, plant.band.stop)
     return Prediction(
         follow_deg=(follow[0], follow[1]),
         offaxis_deg=(offaxis[0], offaxis[1]),
         disturbance_deg=(float(disturbance[0]), float(disturbance[1])),
         noise=(float(loop.noise_rms[0]), float(loop.noise_rms[1])),
-        Ms=float(1 / singular_values(np.eye(2) + loop.L_u[inside])[1].min()),
+        Ms=_peak(loop),
     )
+
+
+def sensitivity_peak(gains: Gains, plant: WideResponse) -> float:
+    """Ms of a set: largest singular value of the sensitivity, cut at the torques."""
+    free = free_gains(gains, plant.body)
+    return _peak(LoopGradient(plant, free, free.vector(gains)))
+
+
+def _peak(loop: LoopGradient) -> float:
+    return float(1 / singular_values(np.eye(2) + loop.L_u[: loop.plant.band.stop])[1].min())
 
 
 def _rms(power: np.ndarray, task: Manoeuvres) -> float:  # type: ignore[type-arg]
@@ -79,17 +92,36 @@ def _rms(power: np.ndarray, task: Manoeuvres) -> float:  # type: ignore[type-arg
     return float(np.degrees(AMPLITUDE) * np.sqrt(np.mean(energy / (np.array(PERIODS) + TAIL))))
 
 
-def reasons_to_keep(new: Sequence[Prediction], flown: Sequence[Prediction], Ms: float, noise: float) -> list[str]:
+def bandwidth(gains: Gains, plant: WideResponse, candidates: Sequence[float], damping: float) -> float:
+    """Bandwidth (rad/s) of the attitude model that a set follows best, of some candidates."""
+    free = free_gains(gains, plant.body)
+    T = LoopGradient(plant, free, free.vector(gains)).T
+    task = manoeuvres(plant, second_order(candidates[0], damping, 0, plant.Ts))
+
+    def error(omega: float) -> float:
+        asked = replace(task, model=second_order(omega, damping, 0, plant.Ts))
+        return float(asked.following @ sum(np.abs(T[:, i, i] - asked.target) ** 2 for i in range(2)))
+
+    return min(candidates, key=error)
+
+
+def reasons_to_keep(
+    new: Sequence[Prediction], flown: Sequence[Prediction], limits: DesignLimits, slower: float
+) -> list[str]:
     """Why a set is not better than the flown one on the same logs; empty: it is better.
 
     Parameters
     ----------
     new, flown : sequence of Prediction
         One for each log.
-    Ms, noise : float
-        Limits of the peak of the sensitivity, and of the torque's noise over the flown one's.
+    limits : DesignLimits
+    slower : float
+        Bandwidth of its attitude model over that of the flown gains.
     """
+    Ms, noise = limits.Ms, limits.noise
     reasons = []
+    if slower < SLOWEST and all(one.Ms <= Ms for one in flown):
+        reasons.append(f"its attitude is slower: {slower:.0%} of the flown bandwidth")
     for ours, theirs in zip(new, flown, strict=True):
         follow, before = np.hypot(*ours.follow_deg), np.hypot(*theirs.follow_deg)
         if follow >= before:

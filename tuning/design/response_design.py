@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.beyond_band import MAX_SENSITIVITY_BELOW_BAND, exceeded_frequencies
+from mimopilot.tuning.analysis.closed_loop import model_spectral_radius
 from mimopilot.tuning.analysis.manoeuvres import doublet_torque, manoeuvres
 from mimopilot.tuning.design.constraints import (
     SHARE,
@@ -30,6 +31,7 @@ from mimopilot.tuning.design.constraints import (
 from mimopilot.tuning.design.descent import INFEASIBLE, LARGEST_RADIUS, DesignTask, PlantTask, descend
 from mimopilot.tuning.design.free_gains import FreeGains, free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
+from mimopilot.tuning.design.prediction import SLOWEST, bandwidth, sensitivity_peak
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS
@@ -128,6 +130,10 @@ class ResponseDesign:
         RMS of the torque at hover under the flown gains, for each log.
     limited : sequence of (K,) bool array
         Frequencies of each measured response at which the rate loop's gain is limited, whatever the fitted body says.
+    flown_bandwidth : float or None, rad/s
+        Of the attitude model that the flown gains follow best, the fastest of all logs. None: not known.
+    slowest : float, rad/s
+        Least bandwidth of a design: the flown one, hardly less, if the flown gains keep the limit of Ms.
     """
 
     plants: Sequence[WideResponse]
@@ -135,6 +141,8 @@ class ResponseDesign:
     limits: DesignLimits
     noise: Sequence[Signal]
     limited: Sequence[NDArray[np.bool_]]
+    flown_bandwidth: float | None = None
+    slowest: float = BANDWIDTHS[0]
 
     @classmethod
     def of(cls, measured: Sequence[PlantEstimates], limits: DesignLimits) -> ResponseDesign:
@@ -148,7 +156,15 @@ class ResponseDesign:
         plants = [wide_response(one) for one in measured]
         experiments = [one.experiment for one in measured]
         noise = [flown_noise(one, plant) for one, plant in zip(experiments, plants, strict=True)]
-        return cls(plants, experiments, limits, noise, [np.zeros(len(one.response.omega), bool) for one in plants])
+        limited = [np.zeros(len(one.response.omega), bool) for one in plants]
+        flown = [one.flown for one in experiments]
+        if not all(flown):
+            return cls(plants, experiments, limits, noise, limited)
+        pairs = [(one, plant) for one, plant in zip(flown, plants, strict=True) if one is not None]
+        fastest = max(bandwidth(one, plant, BANDWIDTHS, DAMPING) for one, plant in pairs)
+        safe = all(sensitivity_peak(one, plant) <= limits.Ms for one, plant in pairs)
+        slowest = SLOWEST * fastest if safe else BANDWIDTHS[0]
+        return cls(plants, experiments, limits, noise, limited, fastest, slowest)
 
     def tighter(self, gains: Gains) -> ResponseDesign:
         """The design after gains that lacked a certificate.
@@ -186,11 +202,13 @@ class ResponseDesign:
             Compute the standard deviations: as many steps as `DRAWS`.
         """
         free = free_gains(starts[0], self.plants[0].body, structure, full)
-        task = self._task(free, starts, FIRST_BANDWIDTH if bandwidth is None else bandwidth)
-        ends = [descend(task, _scaled(task, start), ROUGHLY) for start in starts]
+        first = self.flown_bandwidth or FIRST_BANDWIDTH
+        task = self._task(free, starts, first if bandwidth is None else bandwidth)
+        stable = [start for start in starts if self._stable(start)]
+        ends = [descend(task, _scaled(task, start), ROUGHLY) for start in stable or starts]
         vector = min(ends, key=task.merit)
         if bandwidth is None:
-            bandwidth, task, vector = self._best_bandwidth(task, vector)
+            bandwidth, task, vector = self._best_bandwidth(task, vector, first)
         vector = descend(task, vector, EXACTLY)
         return Design(
             gains=task.free.gains(vector),
@@ -202,13 +220,17 @@ class ResponseDesign:
             vehicle_damps=_vehicle_damps(task, vector),
         )
 
-    def _best_bandwidth(self, task: DesignTask, vector: Signal) -> tuple[float, DesignTask, Signal]:
+    def _stable(self, gains: Gains) -> bool:
+        """Whether the loop around every fitted rigid body is stable: a descent keeps what it starts with."""
+        return all(model_spectral_radius(gains, plant.body.model(plant.Ts)) < 1 for plant in self.plants)
+
+    def _best_bandwidth(self, task: DesignTask, vector: Signal, begin: float) -> tuple[float, DesignTask, Signal]:
         """The largest bandwidth of nearly the least merit: along the table from the first one."""
-        first = BANDWIDTHS.index(FIRST_BANDWIDTH)
+        first = BANDWIDTHS.index(begin)
         found = {first: (task.merit(vector), task, vector)}
 
         def merit(place: int) -> float:
-            if not 0 <= place < len(BANDWIDTHS):
+            if not 0 <= place < len(BANDWIDTHS) or BANDWIDTHS[place] < self.slowest:
                 return np.inf
             if place not in found:
                 nearest = min(found, key=lambda known: abs(known - place))

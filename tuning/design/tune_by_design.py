@@ -181,8 +181,10 @@ def comparison(
     flown = [one.experiment.flown for one in measured]
     if all(flown):
         shown["flown"] = [predict(one, *task) for one, task in zip(flown, tasks, strict=True) if one is not None]
-        keep = reasons_to_keep(new, shown["flown"], bench.limits.Ms, bench.limits.noise)
-        result = {"better_than_flown": not keep, "keep_flown": keep}
+        fastest = bench.flown_bandwidth or found.model.omega
+        result["flown_bandwidth"] = fastest
+        keep = reasons_to_keep(new, shown["flown"], spec.design, found.model.omega / fastest)
+        result |= {"better_than_flown": not keep, "keep_flown": keep}
     return {"predicted": {name: _plain(figures) for name, figures in shown.items()}, **result}
 
 

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.plant.frequency_response import PlantResponse
-from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, fit_shape
+from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, ResponseShape, fit_shape
+from mimopilot.tuning.statespace import StateSpace
 
 #: rad/s. Above it frame modes and filters shape the response.
 UPPER = 60.0
@@ -29,10 +31,13 @@ class RigidBody:
         Torque scale times the inverse of the inertia.
     deviation : (2, 2) array, rad/s^2
         Standard deviation of each element.
+    shape : ResponseShape
+        Delay (s), rotor lag (s) and damping (1/s).
     """
 
     B: Signal
     deviation: Signal
+    shape: ResponseShape = (0.0, 0.0, 0.0)
 
     def determinant(self) -> tuple[float, float]:
         """Determinant of B and its standard deviation, rad^2/s^4."""
@@ -57,6 +62,31 @@ class RigidBody:
         action = self.B @ gain
         return np.asarray(np.linalg.eigvalsh((action + np.swapaxes(action, -1, -2)) / 2)[..., 0])
 
+    def model(self, Ts: float) -> StateSpace:
+        """From torque to body rates: rotors and body held over each period (zero-order hold), after whole periods.
+
+        The hold itself delays by half a period.
+        """
+        delay, lag, damping = self.shape
+        rate, one, none = -damping * np.eye(2), np.eye(2), np.zeros((2, 2))
+        if lag > 0:
+            A, B, C = (
+                np.block([[rate, self.B], [none, -one / lag]]),
+                np.vstack([none, one / lag]),
+                np.hstack([one, none]),
+            )
+        else:
+            A, B, C = rate, self.B, one
+        n, late = len(A), max(0, round(delay / Ts - 0.5))
+        held = expm(np.block([[A, B], [np.zeros((2, n + 2))]]) * Ts)
+        A, B = held[:n, :n], held[:n, n:]
+        # Every period of delay is a state that holds the torque.
+        chain = np.eye(2 * late, k=2)
+        chain[-2:] = 0.0
+        whole = np.block([[A, B, np.zeros((n, 2 * late - 2))], [np.zeros((2 * late, n)), chain]]) if late else A
+        drive = np.vstack([np.zeros((len(whole) - 2, 2)), one]) if late else B
+        return StateSpace(whole, drive, np.hstack([C, np.zeros((2, 2 * late))]), none, Ts)
+
 
 def rigid_body(plant: PlantResponse) -> RigidBody:
     """Fit of G_i = B exp(-j w delay) / ((1 + j w lag) (j w + damping)) with a real B to the known frequencies.
@@ -78,6 +108,6 @@ def rigid_body(plant: PlantResponse) -> RigidBody:
     plant = plant.at(use)
     size = np.linalg.norm(plant.G_i, axis=(1, 2))[:, None, None]
     weight = 1 / (plant.deviation() ** 2 + (SHAPE_ERROR * size) ** 2)
-    _, B, power, misfit = fit_shape(plant.omega, plant.G_i, weight)
+    shape, B, power, misfit = fit_shape(plant.omega, plant.G_i, weight)
     scale = max(1.0, misfit / (4 * len(plant.omega)))
-    return RigidBody(B, np.sqrt(scale / power))
+    return RigidBody(B, np.sqrt(scale / power), shape)
