@@ -22,7 +22,7 @@ from mimopilot.tuning.analysis.beyond_band import (
     sensitivity_at_band_start,
     sensitivity_peak_above,
 )
-from mimopilot.tuning.analysis.closed_loop import closed_loop_poles, model_spectral_radius
+from mimopilot.tuning.analysis.closed_loop import model_spectral_radius, slow_growth
 from mimopilot.tuning.analysis.nyquist import NyquistCount
 from mimopilot.tuning.analysis.stability_figures import nominal_and_drawn_loops, stability_figures
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Certificate, Thresholds, Verdict
@@ -118,17 +118,6 @@ def certify(
     return verdict(Verdict.THIN, "; ".join([*short, assumed]), figures, band)
 
 
-def _slow_growth(gains: Gains, body: RigidBody, below: float) -> float | None:
-    """Frequency (rad/s) of an unstable mode of the loop around the rigid body that is slower than `below`; None: none.
-
-    Nyquist's count closes the curve below the band by the shortest way, which skewed integral gains do not go.
-    """
-    poles = closed_loop_poles(gains, body.model(gains.Ts))
-    modes = np.log(poles[np.abs(poles) > 0]) / gains.Ts
-    growing = np.abs(modes[(modes.real > 0) & (np.abs(modes) < below)])
-    return float(growing.min()) if len(growing) else None
-
-
 def _missed_thresholds(figures: Mapping[str, Any], Ms: float, phase_deg: float) -> list[str]:
     """One text for each margin that misses its threshold, error included."""
     missed = []
@@ -152,7 +141,8 @@ def _reason_for_doubt(gains: Gains, plant: PlantResponse, known: PlantResponse, 
             "response falls; stiffen the frame, filter the rates (notch, lower cut-off), or lower the derivative's "
             "filter or gain"
         )
-    slow = _slow_growth(gains, body, float(known.omega[0]))
+    # Nyquist's count closes the curve below the band by the shortest way, which skewed integral gains do not go.
+    slow = slow_growth(gains, body.model(gains.Ts), float(known.omega[0]))
     if slow is not None:
         return (
             f"below the excitation, at {slow:.2g} rad/s, the loop around the fitted rigid body is unstable: the "

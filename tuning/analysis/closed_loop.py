@@ -99,6 +99,22 @@ def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
     return float(np.abs(closed_loop_poles(gains, plant)).max())
 
 
+def slow_growth(gains: Gains, plant: StateSpace, below: float) -> float | None:
+    """Frequency (rad/s) of an unstable mode of the loop around a model, slower than `below`; None: there is none.
+
+    Parameters
+    ----------
+    gains : Gains
+    plant : StateSpace
+        From torque to body rates.
+    below : float, rad/s
+    """
+    poles = closed_loop_poles(gains, plant)
+    modes = np.log(poles[np.abs(poles) > 0]) / gains.Ts
+    growing = np.abs(modes[(modes.real > 0) & (np.abs(modes) < below)])
+    return float(growing.min()) if len(growing) else None
+
+
 def doublet_spectrum(omega: Signal, seconds: float) -> Complex:
     """Fourier transform of a doublet: +1, then -1, each for half of its length.
 

@@ -9,16 +9,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mimopilot.tuning.analysis.closed_loop import slow_growth
 from mimopilot.tuning.analysis.manoeuvres import Manoeuvres
 from mimopilot.tuning.design.conic_problem import ConicProblem
 from mimopilot.tuning.design.constraints import Constraint
 from mimopilot.tuning.design.free_gains import FreeGains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.plant.wide_response import WideResponse
+from mimopilot.tuning.statespace import StateSpace
 
 #: Weight of the relative violations in the merit: above the constraints' multipliers, which are about the cost, 0.01.
 PENALTY = 1.0
@@ -48,6 +51,11 @@ class PlantTask:
     manoeuvres: Manoeuvres
     constraints: Sequence[Constraint]
 
+    @cached_property
+    def rigid(self) -> StateSpace:
+        """The fitted rigid body, from torque to body rates."""
+        return self.plant.body.model(self.plant.Ts)
+
 
 @dataclass(frozen=True, eq=False)
 class DesignTask:
@@ -75,7 +83,12 @@ class DesignTask:
         return self._violation(self.loops(vector))
 
     def merit(self, vector: Signal) -> float:
-        """Cost plus weighted violation."""
+        """Cost plus weighted violation; infinite if a loop grows slowly below the band, where no constraint sees it."""
+        gains = self.free.gains(vector)
+        for task in self.plants:
+            begin = float(task.plant.omega[task.plant.band.start])
+            if slow_growth(gains, task.rigid, begin) is not None:
+                return np.inf
         loops = self.loops(vector)
         found = self._cost(loops) + PENALTY * self._violation(loops)
         return found if np.isfinite(found) else np.inf

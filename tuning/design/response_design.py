@@ -204,7 +204,7 @@ class ResponseDesign:
         free = free_gains(starts[0], self.plants[0].body, structure, full)
         first = self.flown_bandwidth or FIRST_BANDWIDTH
         task = self._task(free, starts, first if bandwidth is None else bandwidth)
-        stable = [start for start in starts if self._stable(start)]
+        stable = [start for start in starts if self.is_stable(start)]
         ends = [descend(task, _scaled(task, start), ROUGHLY) for start in stable or starts]
         vector = min(ends, key=task.merit)
         if bandwidth is None:
@@ -220,7 +220,7 @@ class ResponseDesign:
             vehicle_damps=_vehicle_damps(task, vector),
         )
 
-    def _stable(self, gains: Gains) -> bool:
+    def is_stable(self, gains: Gains) -> bool:
         """Whether the loop around every fitted rigid body is stable: a descent keeps what it starts with."""
         return all(model_spectral_radius(gains, plant.body.model(plant.Ts)) < 1 for plant in self.plants)
 

@@ -157,7 +157,7 @@ def starting_points(
     if first.flown is not None:
         starts.append(replace(base, **{name: getattr(first.flown, name) for name in LOOP_MATRICES}))
         origin.append("flown")
-    if not starts:
+    if not any(bench.is_stable(start) for start in starts):
         decoupled = inner.omega * inverse
         starts.append(replace(base, Kp_o=inner.omega / 3 * np.eye(2), Kp_i=decoupled, Ki_i=decoupled))
         origin.append("rigid body")
