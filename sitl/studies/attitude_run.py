@@ -22,9 +22,11 @@ from mimopilot.sitl.studies.attitude_study import (
     DEFAULT,
     LEAD_S,
     MIMO,
+    MIMO_PRINTED,
     REFINED,
     SISO,
     SISO_OWN,
+    SISO_PRINTED,
     AttitudeStudy,
 )
 from mimopilot.sitl.studies.autotune import autotune
@@ -41,6 +43,7 @@ from mimopilot.tuning.motors import fit_motors
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.rigid_body_fit import rigid_body
+from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import SecondOrder
 from mimopilot.tuning.spec import Manoeuvre, TuningSpec
 
@@ -113,8 +116,16 @@ def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experimen
     default = _vehicle_and_library(study.airframe)[1]
     inner, outer = (SecondOrder(*model) for model in (study.inner, study.outer))
     siso_inner, siso_outer = (SecondOrder(*model) for model in study.siso_models)
-    siso = TuningSpec(method="siso", inner=(siso_inner, siso_inner), outer=(siso_outer, siso_outer))
-    mimo = TuningSpec(inner=(inner, inner), outer=(outer, outer))
+    siso = TuningSpec(method="siso", inner=(siso_inner, siso_inner), outer=(siso_outer, siso_outer), **study.options)
+    mimo = TuningSpec(inner=(inner, inner), outer=(outer, outer), **study.options)
+    if study.fitted:
+        return {
+            DEFAULT: default,
+            SISO: tune(siso_log, siso),
+            SISO_PRINTED: printed_gains(study, SISO, default),
+            MIMO: tune(log, mimo, measured),
+            MIMO_PRINTED: printed_gains(study, MIMO, default),
+        }
     found = {DEFAULT: default, AUTOTUNE: autotune(log, default), SISO: tune(siso_log, siso)}
     if siso_log is not log:
         found[SISO_OWN] = tune(log, siso)
@@ -124,6 +135,12 @@ def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experimen
     found[MIMO] = tune(log, mimo, measured)
     found[REFINED] = tune(log, mimo.model_copy(update={"manoeuvre": task}), measured)
     return found
+
+
+def printed_gains(study: AttitudeStudy, method: str, default: Gains) -> Gains:
+    """A gain set as the thesis prints it, in the frame (yaw, limits, filter) of the default gains."""
+    matrices: Any = {name: np.array(values) for name, values in study.gains_table[1][method].items()}
+    return replace(default, certificate=None, provenance=Provenance(f"{method}, {study.gains_table[0]}"), **matrices)
 
 
 def logs(study: AttitudeStudy, seed: int) -> tuple[Flight, Experiment, Experiment]:
