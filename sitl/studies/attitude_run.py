@@ -150,6 +150,19 @@ def logs(study: AttitudeStudy, seed: int) -> tuple[Flight, Experiment, Experimen
     return flight, log, other
 
 
+def _short_doublets(study: AttitudeStudy, gains: Gains) -> list[Scenario]:
+    """The doublets without noise: the flight after them does not count, and a balanced vehicle needs no hover before.
+
+    An unbalanced one gets its trim as injected torque: the integrators would need seconds of hover to find it.
+    """
+    short = study.doublets(gains.Ts, tail=0.1, lead=0.1)
+    if study.lead_s == LEAD_S:
+        return short
+    long = study.doublets(gains.Ts)[0]
+    trim = fly_set(study.airframe, gains, long, 0, noise=False).record["moment"][long.window[0] - 1]
+    return [replace(task, excitation=np.tile(trim.astype(np.float64), (len(task.setpoint), 1))) for task in short]
+
+
 def optimum(study: AttitudeStudy) -> dict[str, Gains]:
     """The best gains on the true plant, within the certificate's margins.
 
@@ -166,8 +179,7 @@ def optimum(study: AttitudeStudy) -> dict[str, Gains]:
         found.append(tune_all(study, measured, siso_log))
         errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
         bands.append(plant.omega[plant.coherent_run()[[0, -1]]])
-    # Without noise a balanced vehicle needs no hover before, and the flight after the doublet does not count.
-    doublets = study.doublets(log.Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
+    doublets = _short_doublets(study, found[0][REFINED])
     spent = [
         [flown_effort(fly_set(study.airframe, gains[REFINED], task, 0, noise=False)) for task in doublets]
         for gains in found
