@@ -406,6 +406,7 @@ def experiment(
     bandwidth: float = 50.0,
     seed: int = 0,
     excitation_seed: int | None = None,
+    both_axes: bool = False,
 ) -> Experiment:
     """Fly a simulated experiment with a PRBS added to the torque on roll, then on pitch.
 
@@ -424,6 +425,8 @@ def experiment(
         Of the measurement noise, and of the excitation where `excitation_seed` is not given.
     excitation_seed : int, optional
         Of the excitation.
+    both_axes : bool
+        Excite roll and pitch at once, for `seconds_per_axis` in all.
 
     Returns
     -------
@@ -440,7 +443,7 @@ def experiment(
 
     body, controller = vehicle(airframe, gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
-    plan = ExperimentPlan(body, controller, seconds_per_axis, strength, bandwidth, excitation_seed)
+    plan = ExperimentPlan(body, controller, seconds_per_axis, strength, bandwidth, excitation_seed, both_axes)
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "flight.ulg" if out is None else Path(out)
         check_survived(plan.record(path, seed))

@@ -85,6 +85,9 @@ def experiment(
     excitation_seed: Annotated[
         int | None, typer.Option(min=0, help="Inject the same torque in every run; by default each has its own.")
     ] = None,
+    both_axes: Annotated[
+        bool, typer.Option("--both-axes", help="Simulated: excite roll and pitch at once, each with its own torque.")
+    ] = False,
     mode: Annotated[
         str | None,
         typer.Option(
@@ -100,7 +103,7 @@ def experiment(
     system: SystemOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Fly with a PRBS added to the torque on roll, then on pitch, and log it.
+    """Fly with a PRBS added to the torque on roll, then on pitch (--both-axes: on both at once), and log it.
 
     Simulated in process; or with --connect on a vehicle in the air, by its own injector. The flight is then monitored:
     tilt, flight mode, a lost link and Ctrl-C end the excitation, and the vehicle's parameters are restored.
@@ -120,6 +123,7 @@ def experiment(
             gains=gains,
             runs=runs,
             excitation_seed=excitation_seed,
+            both_axes=both_axes or None,
         )
         excite_vehicle(
             LinkOptions(connect, system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json),
@@ -137,13 +141,13 @@ def experiment(
     from mimopilot.api import vehicle
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, default_amplitude
 
-    reason = "belong to --connect; a simulated flight excites both axes"
+    reason = "belong to --connect; a simulated flight excites both axes (one after the other, or --both-axes)"
     check_not_given(reason, axis=axis, mode=mode, tilt_deg=tilt_deg)
     if out is None:
         raise SitlError("--out: name the log to write, FILE.ulg")
     body, controller = vehicle(airframe or "", gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
-    plan = ExperimentPlan(body, controller, seconds_per_axis, strength, bandwidth, excitation_seed)
+    plan = ExperimentPlan(body, controller, seconds_per_axis, strength, bandwidth, excitation_seed, both_axes)
     if runs is None:
         simulate_experiment(plan, out, seed)
     else:
@@ -181,7 +185,7 @@ def simulate_experiments(plan: ExperimentPlan, out: Path, seeds: range) -> None:
     with Progress(console=progress_console(), transient=True) as bar:
         task = bar.add_task("flying", total=len(seeds))
         lost = repeat_experiment(plan, out, seeds, cores(), lambda: bar.advance(task))
-    print(f"{out}: {len(seeds)} logs of {2 * plan.seconds_per_axis:.1f} s")
+    print(f"{out}: {len(seeds)} logs of {plan.seconds:.1f} s")
     if lost:
         names = ", ".join(f"{seed} at {when:.2f} s" for seed, when in list(lost.items())[:NAMED])
         raise SitlError(

@@ -16,6 +16,8 @@ PIXELS_PER_INCH = 160
 def svg(figure: Figure, name: str) -> str:
     """The figure as SVG text; the same data give the same bytes. `name` makes the ids unique within a page."""
     buffer = io.StringIO()
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")  # once is enough: savefig would compute the layout again
     with matplotlib.rc_context({"svg.hashsalt": f"mimopilot {name}"}):
         figure.savefig(buffer, format="svg", dpi=PIXELS_PER_INCH, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()

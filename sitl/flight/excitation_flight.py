@@ -40,6 +40,8 @@ class ExperimentPlan:
         See `sitl.flight.scenario.excitation_flight`.
     excitation_seed : int or None
         Seed of the injected torque; None: that of the flight, so that each flight has another excitation.
+    both_axes : bool
+        Excite roll and pitch at once, not one after the other.
     """
 
     airframe: Airframe
@@ -48,11 +50,19 @@ class ExperimentPlan:
     amplitude: float
     bandwidth: float
     excitation_seed: int | None
+    both_axes: bool = False
+
+    @property
+    def seconds(self) -> float:
+        """Length of the flight, s."""
+        return self.seconds_per_axis * (1 if self.both_axes else 2)
 
     def fly(self, seed: int) -> Flight:
         """Fly the experiment; `seed` is that of the measurement noise."""
         generator = np.random.default_rng(seed if self.excitation_seed is None else self.excitation_seed)
-        scenario = excitation_flight(self.seconds_per_axis, self.amplitude, self.bandwidth, self.gains.Ts, generator)
+        scenario = excitation_flight(
+            self.seconds_per_axis, self.amplitude, self.bandwidth, self.gains.Ts, generator, self.both_axes
+        )
         return fly(self.airframe, Autopilot(self.airframe, self.gains), scenario, seed)
 
     def record(self, path: Path, seed: int) -> Flight:

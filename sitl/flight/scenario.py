@@ -222,9 +222,14 @@ def load_scenario(path: Path, Ts: float) -> Scenario:
 
 
 def excitation_flight(
-    seconds_per_axis: float, amplitude: float, bandwidth: float, Ts: float, generator: np.random.Generator
+    seconds_per_axis: float,
+    amplitude: float,
+    bandwidth: float,
+    Ts: float,
+    generator: np.random.Generator,
+    together: bool = False,
 ) -> Scenario:
-    """Hover with a PRBS torque injected on roll, then on pitch.
+    """Hover with a PRBS torque injected on roll, then on pitch; or on both at once, each with its own.
 
     Parameters
     ----------
@@ -238,6 +243,8 @@ def excitation_flight(
         Control period.
     generator : numpy.random.Generator
         Source of the pulse lengths.
+    together : bool
+        Excite both axes at once, for `seconds_per_axis` in all.
     """
     _check_length("seconds_per_axis", seconds_per_axis, Ts)
     if not 0 < amplitude <= 1:
@@ -249,9 +256,10 @@ def excitation_flight(
             f"{seconds_per_axis:g} s on each axis; raise one of them"
         )
     samples = round(seconds_per_axis / Ts)
-    excitation = np.zeros((2 * samples, 3))
+    excitation = np.zeros((samples if together else 2 * samples, 3))
     for axis in range(2):
-        samples_of_axis = slice(axis * samples, (axis + 1) * samples)
+        start = 0 if together else axis * samples
+        samples_of_axis = slice(start, start + samples)
         excitation[samples_of_axis, axis] = prbs(samples, amplitude, hold_min, hold_max, generator)
     return Scenario("experiment", Ts, np.zeros_like(excitation), excitation, 0, (0, len(excitation)))
 

@@ -1,13 +1,22 @@
 import json
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
 
 import numpy as np
 import pytest
 
+from mimopilot.common.console import print_table
+from mimopilot.sitl.studies.benchmark_figures import spread_figure
 from mimopilot.sitl.studies.benchmark_studies import gain_spread, run_cbt, run_ift, study_lv100
 from mimopilot.sitl.studies.benchmarks import excitation, lv100
 from mimopilot.sitl.studies.reproduce import reproduce
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.cbt_ift import correlation_based_tuning, iterative_feedback_tuning
+from mimopilot.tuning.law import Filters
+from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from tests.conftest import assert_one_clear_line
 
 
@@ -83,15 +92,73 @@ def test_the_numerical_example_beside_table_5_3(tmp_path):
     assert reproduce("numerical-example", tmp_path).report.read_bytes() == first
 
 
-def test_lv100_has_every_table_and_figure_and_is_reproducible():
+def test_lv100_has_every_table_and_figure_and_is_reproducible(capsys):
     found = study_lv100(runs=4, seeds=1)
     text = " ".join([section.heading + section.text for section in found.sections])
     text += " ".join(cell for table in found.tables for row in [[table.caption], *table.rows] for cell in row)
-    for word in ("Table 5.1", "Table 5.2", "Figures 5.1 and 5.2", "CbT", "IFT", "469", "as printed"):
+    for word in ("Table 5.1", "Table 5.2", "Figure 5.1", "Figure 5.2", "CbT", "IFT", "469", "as printed"):
         assert word in text
-    assert sum(figure.startswith("<svg") for section in found.sections for figure in section.figures) == 2
+    assert sum(figure.startswith("<svg") for section in found.sections for figure in section.figures) == 4
     assert json.dumps(found.figures)
     assert study_lv100(runs=4, seeds=1).sections == found.sections
+    for table in found.tables:
+        print_table(table.caption, table.columns, table.rows)
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+    # Nothing is cut: each row of a matrix on its own line, with the cost and the runs beside the first.
+    first, second = found.tables[0].rows[-2:]
+    assert first == ["VRFT, (2,1) corrected", "0.3552 z - 0.07165", "0.3997 z - 0.2918", "0.0562", ""]
+    assert second == ["Table 5.1 as printed", "19.8 z - 19.2", "-3.151 z + 2.215", "", ""]
+
+
+def test_figure_5_2_shows_every_run_and_their_mean():
+    task = lv100()
+    gains = gain_spread(task, 1000, 3, 0)
+    figure = spread_figure(task, gains, 40, "steps")
+    panel = figure.axes[1]  # output 1, setpoint 2
+    runs, (wanted, mean) = panel.lines[:3], panel.lines[3:]
+    steps = np.array([line.get_ydata() for line in runs])
+    assert mean.get_ydata() == pytest.approx(steps.mean(axis=0))
+    assert not np.any(wanted.get_ydata())
+    inputs = np.zeros((40, 6))
+    inputs[:, 1] = 1.0
+    loop = LoopController({"P": gains[1, 0], "I": gains[1, 1]}, Filters(0.1))
+    assert steps[1] == pytest.approx(closed_loop(task.plant, loop).simulate(inputs)[:, 2])
+
+
+def test_a_study_goes_on_where_it_was_and_ends_at_once_on_ctrl_c(mimopilot, tmp_path):
+    """Two runs are kept; the rest is killed; the report has the same bytes as without an interruption."""
+    arguments = ("reproduce", "antr-thesis", "--seeds", "4", "--workers", "2")
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    command = [sys.executable, "-m", "mimopilot", *arguments, "--out", str(tmp_path / "out")]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed)
+    deadline = time.monotonic() + 300
+    while len(list((tmp_path / "out" / "parts").glob("antr-thesis-*.part"))) < 2:
+        assert time.monotonic() < deadline
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.02)
+    begin = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    _, message = process.communicate(timeout=60)
+    assert time.monotonic() - begin < 2.0
+    assert process.returncode == 130
+    lines = message.splitlines()
+    assert lines[0] == "mimopilot reproduce antr-thesis: 0 of 5 done, 0 s"
+    assert lines[-1].startswith("mimopilot: interrupted after ")
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "parts").iterdir()}
+    assert not list((tmp_path / "out").glob("*.html"))
+    resumed = mimopilot(*arguments, "--out", "out")
+    assert resumed.returncode == 0, resumed.stderr
+    assert f"reproduce antr-thesis: {len(kept)} of 5 done, 0 s" in resumed.stderr
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    whole = mimopilot(*arguments, "--out", "whole", "--json")
+    assert (tmp_path / "out" / "antr-thesis.html").read_bytes() == (
+        tmp_path / "whole" / "antr-thesis.html"
+    ).read_bytes()
+    # Fewer seeds: their runs are there already.
+    fewer = mimopilot("reproduce", "antr-thesis", "--seeds", "2", "--out", "out", "--json")
+    assert "2 of 3 done, 0 s" in fewer.stderr
+    assert json.loads(fewer.stdout)["antr-thesis"]["seeds"] == 2
+    assert json.loads(whole.stdout)["antr-thesis"]["comparison"][0]["name"] == "SISO Kp_o(1,1)"
 
 
 def test_the_command_prints_one_json_object_and_refuses_an_unknown_study(mimopilot):
