@@ -18,7 +18,7 @@ from mimopilot.sitl.physics.linear_model import control_effectiveness, linear_mo
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.sitl.physics.state_estimate import low_pass
 from mimopilot.tuning.analysis.closed_loop import singular_values
-from mimopilot.tuning.design.response_design import Design, ResponseDesign, flown_noise
+from mimopilot.tuning.design.response_design import Design, ResponseDesign
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import cascade_response, rate_matrices, state_space
@@ -113,6 +113,7 @@ def true_response(airframe: Airframe, Ts: float, gusts: float = 0.0) -> WideResp
         error_o=np.zeros((count, 2, 6), complex),
         reach=known.reach,
         noise=hermitian_root(spectrum),
+        noise_deviation=np.zeros(count),
         body=body,
         response=known,
         shape=(delay, airframe.motors.time_constant, airframe.rate_damping),
@@ -146,7 +147,7 @@ class TruePlant:
     def sensitivity_peak(self, gains: Gains) -> float:
         """Ms: largest singular value of the sensitivity, cut at the torques. Says nothing about stability."""
         omega, G = self._fine
-        C_o, C_y = cascade_response(gains, omega)
+        _, C_o, C_y = cascade_response(gains, omega)
         return float(1 / singular_values(np.eye(2) + C_y @ G[:, :2] + C_o @ G[:, 2:])[1].min())
 
     def spectral_radius(self, gains: Gains) -> float:
@@ -210,13 +211,7 @@ def optimum_on_true_plant(
     """
     spec = TuningSpec()
     plant, flight = true_response(airframe, flown.Ts, gusts), flight_of(airframe, flown, amplitude)
-    bench = ResponseDesign(
-        plants=[plant],
-        experiments=[flight],
-        limits=limits or spec.design,
-        noise=[flown_noise(flight, plant)],
-        limited=[np.zeros(len(plant.omega), bool)],
-    )
+    bench = ResponseDesign.around([plant], [flight], limits or spec.design)
     decoupled = START_RATE * np.linalg.inv(plant.body.B).astype(np.float64)
     rigid = replace(flown, Kp_o=START_ATTITUDE * np.eye(2), Kp_i=decoupled, Ki_i=decoupled)
     return bench.design([flown, rigid, *starts], spec.structure, spec.method == "mimo", bandwidth)

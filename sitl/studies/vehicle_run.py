@@ -256,7 +256,7 @@ def _tuned_figures(
             name: {"follow_deg": list(one.follow_deg), "offaxis_deg": list(one.offaxis_deg)}
             for name, one in zip(sets, (ours, before), strict=True)
         },
-        "true_reasons": reasons_to_keep([ours], [before], limits.Ms, limits.noise),
+        "true_reasons": reasons_to_keep([ours], [before], limits, slower=1.0),
         "flights": {name: doublet_figures(vehicle, one, model, size, seed, 0.0) for name, one in sets.items()},
         "flights_in_gusts": {
             name: doublet_figures(vehicle, one, model, size, seed, vehicle.gusts) for name, one in sets.items()
@@ -275,7 +275,7 @@ def _optimum_figures(vehicle: DrawnVehicle, truth: TruePlant, best: Design, limi
     ours, before = _predictions(
         vehicle, best.model.discretise(vehicle.gains.Ts), vehicle.gusts, best.gains, vehicle.gains
     )
-    reasons = reasons_to_keep([ours], [before], limits.Ms, limits.noise) if best.feasible else ["no feasible gains"]
+    reasons = reasons_to_keep([ours], [before], limits, slower=1.0) if best.feasible else ["no feasible gains"]
     return {
         "feasible": best.feasible,
         "bandwidth": best.model.omega,

@@ -44,8 +44,8 @@ from mimopilot.tuning.spec import DesignLimits
 
 #: Bandwidths of the attitude model, rad/s: ten a factor of 3.16 (ISO 3, R20), from a heavy lifter to a small racer. No
 #: position controller or pilot uses a faster attitude.
-BANDWIDTHS = (2.8, 3.2, 3.6, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.2, 12.5, 14.0, 16.0, 18.0, 20.0, 22.4)
-BANDWIDTHS += (25.0,)
+_DECADE = (2.8, 3.2, 3.6, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.2, 12.5, 14.0, 16.0, 18.0, 20.0)
+BANDWIDTHS: tuple[float, ...] = (*_DECADE, 22.4, 25.0)
 #: Where the search begins, rad/s, and its first step along the table.
 FIRST_BANDWIDTH, FIRST_STRIDE = 10.0, 2
 #: Damping of the attitude model: 5 % overshoot, the usual choice.
@@ -153,8 +153,13 @@ class ResponseDesign:
         TuningError
             When a response is known at too few frequencies.
         """
-        plants = [wide_response(one) for one in measured]
-        experiments = [one.experiment for one in measured]
+        return cls.around([wide_response(one) for one in measured], [one.experiment for one in measured], limits)
+
+    @classmethod
+    def around(
+        cls, plants: Sequence[WideResponse], experiments: Sequence[Experiment], limits: DesignLimits
+    ) -> ResponseDesign:
+        """Designs on given responses; of the experiments only the flown gains, motors and attitudes are used."""
         noise = [flown_noise(one, plant) for one, plant in zip(experiments, plants, strict=True)]
         limited = [np.zeros(len(one.response.omega), bool) for one in plants]
         flown = [one.flown for one in experiments]

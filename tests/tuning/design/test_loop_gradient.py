@@ -28,8 +28,10 @@ def gains(request):
     """Full matrices everywhere, so that no derivative vanishes."""
     generator = np.random.default_rng(3)
     base = load_airframe("adam0_boom").default_gains()
-    moved = {name: getattr(base, name) + 0.2 * generator.standard_normal((2, 2)) * abs(base.Kp_i[0, 0]) for name in
-             ("Kp_i", "Ki_i", "Kff_i")}
+    moved = {
+        name: getattr(base, name) + 0.2 * generator.standard_normal((2, 2)) * abs(base.Kp_i[0, 0])
+        for name in ("Kp_i", "Ki_i", "Kff_i")
+    }
     moved |= {
         "Kp_o": base.Kp_o + generator.standard_normal((2, 2)),
         "Kd_i": base.Kd_i + 1e-3 * generator.standard_normal((2, 2)),
@@ -52,7 +54,12 @@ def test_the_responses_are_those_of_the_law(plant, gains):
         Ts=plant.Ts,
     )
     expected = cascade_loop(gains, response)
-    for ours, theirs in ((loop.L_i, expected.L_i), (loop.L_u, expected.L_u), (loop.T, expected.T_o), (loop.U, expected.U_o)):
+    for ours, theirs in (
+        (loop.L_i, expected.L_i),
+        (loop.L_u, expected.L_u),
+        (loop.T, expected.T_o),
+        (loop.U, expected.U_o),
+    ):
         assert ours == pytest.approx(theirs, rel=1e-9, abs=1e-12)
 
 
@@ -73,7 +80,10 @@ def test_the_derivatives_are_those_of_finite_differences(plant, gains):
 def test_the_noise_of_the_torque_is_the_integral_of_its_spectrum(plant, gains):
     """White noise of 0.01 rad/s on the rates alone, through a controller without feedback of the angles or plant."""
     silent = dataclasses.replace(
-        plant, G_i=0 * plant.G_i, G_o=0 * plant.G_o, noise=np.diag([0.01, 0.01, 0, 0]) * np.ones((len(plant.omega), 1, 1))
+        plant,
+        G_i=0 * plant.G_i,
+        G_o=0 * plant.G_o,
+        noise=np.diag([0.01, 0.01, 0, 0]) * np.ones((len(plant.omega), 1, 1)),
     )
     plain = dataclasses.replace(gains, Kp_i=0.15 * np.eye(2), Ki_i=np.zeros((2, 2)), Kd_i=np.zeros((2, 2)))
     free = free_gains(plain, plant.body)
