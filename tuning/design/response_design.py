@@ -208,7 +208,7 @@ class ResponseDesign:
         """
         free = free_gains(starts[0], self.plants[0].body, structure, full)
         first = self.flown_bandwidth or FIRST_BANDWIDTH
-        task = self._task(free, starts, first if bandwidth is None else bandwidth)
+        task = self.task(free, starts, first if bandwidth is None else bandwidth)
         stable = [start for start in starts if self.is_stable(start)]
         ends = [descend(task, _scaled(task, start), ROUGHLY) for start in stable or starts]
         vector = min(ends, key=task.merit)
@@ -274,7 +274,7 @@ class ResponseDesign:
             plants.append(replace(one, plant=plant, constraints=limits))
         return replace(task, plants=plants)
 
-    def _task(self, free: FreeGains, starts: Sequence[Gains], bandwidth: float) -> DesignTask:
+    def task(self, free: FreeGains, starts: Sequence[Gains], bandwidth: float) -> DesignTask:
         """Cost and constraints around every plant."""
         model = SecondOrder(bandwidth, DAMPING).discretise(free.base.Ts)
         return DesignTask(
