@@ -76,7 +76,8 @@ struct State {
 // Resets the controller. Returns false if the gains are refused; the torque then stays 0.
 bool initialise(State &state, const Gains &gains);
 
-// Replaces the gains. Sets the integrators, within their limits, so that the output does not jump.
+// Replaces the gains. Sets the integrators, within their limits, so that the output does not jump: the next one is as
+// with the old gains. If that switches on model following, the model starts with the next step.
 // Returns false and changes nothing if a value is not finite, too large, or out of its range.
 bool set_gains(State &state, const Gains &gains);
 

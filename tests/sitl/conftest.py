@@ -50,5 +50,5 @@ def new(gains):
 def old(gains, new):
     """Every gain on the vehicle differs from the new one; the period and the unit of torque do not."""
     identity = dict(zip((p.name for p in IDENTITY), gains.moment_scale, strict=True))
-    values = {name: value * 0.875 for name, value in new.items()} | {"MIMO_TS": gains.Ts} | identity
+    values = {name: value * 0.875 or 0.125 for name, value in new.items()} | {"MIMO_TS": gains.Ts} | identity
     return {name: float32(value) for name, value in values.items()}

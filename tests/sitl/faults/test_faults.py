@@ -422,7 +422,7 @@ def test_one_period_at_a_time_gives_the_same_link_as_long_segments(seed, blocks)
 
 
 def test_corrupted_gains_are_written_into_the_controller_and_then_restored(vehicle, library):
-    gains = vehicle.default_gains()
+    gains = replace(vehicle.default_gains(), Kff_o=np.eye(2), Kaff_i=0.006 * np.eye(2))
     controller = NativeController(library, gains)
     autopilot = Autopilot(vehicle.airframe, gains, controller)
     before = controller.state["gains"][0].copy()
@@ -433,8 +433,8 @@ def test_corrupted_gains_are_written_into_the_controller_and_then_restored(vehic
     factors = np.ones((5, len(before)), np.float32)
     Kp_i = slice(4, 8)
     factors[1, Kp_i] = 0.5
-    factors[2, :20], factors[2, Kp_i] = 2, 1  # both at once
-    factors[3, :20] = 2  # five matrices of four; neither yaw nor a limit
+    factors[2, :28], factors[2, Kp_i] = 2, 1  # both at once
+    factors[3, :28] = 2  # seven matrices of four; neither yaw nor a limit
     assert (held == factors * before).all()
 
 

@@ -10,12 +10,14 @@ from mimopilot.sitl.mavlink.ground_station.events import ParameterValue
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.mavlink.wire.signing import read_key
 from mimopilot.tuning.certificate import Certificate, Verdict
-from mimopilot.tuning.parameters import PARAMETERS
+from mimopilot.tuning.parameters import PARAMETERS, ROWS
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.running import wait_for
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, UdpVehicle, float32
 
 WRITTEN = sum(parameter.writable for parameter in PARAMETERS)
+#: Those without a default; the last two of the table have one.
+REQUIRED = sum(len(row.codes) for row in ROWS if row.writable and row.default is None)
 
 
 KEY = bytes(range(32))
@@ -183,7 +185,7 @@ def test_an_incomplete_or_out_of_range_snapshot_is_refused_before_contacting_the
             ("".join(lines[:-5]), (f"holds {WRITTEN - 5} parameters, but its first line says {WRITTEN}",)),
             (text[:-4], ("it was cut short",)),
             (text.replace("0.13125", "0.13126"), ("damaged or edited",)),
-            ("".join(lines[1:-5]), (f"holds {WRITTEN - 5} of our {WRITTEN} gains", "lacks")),
+            ("".join(lines[1:-5]), (f"holds {REQUIRED - 3} of our {REQUIRED} gains", "lacks")),
             (unsealed.replace("\t0.13125001\t", "\t99\t"), ("MIMO_RP_RR: got 99, expected",)),
         ]:
             (tmp_path / "bad.params").write_text(content)
