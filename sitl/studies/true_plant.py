@@ -24,8 +24,8 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import cascade_response, rate_matrices, state_space
 from mimopilot.tuning.motors import Motors
 from mimopilot.tuning.plant.frequency_response import PlantResponse, hermitian_root
-from mimopilot.tuning.plant.rigid_body_fit import RigidBody
-from mimopilot.tuning.plant.wide_response import LOWEST, STEP, TOP, WideResponse
+from mimopilot.tuning.plant.rigid_body_fit import LOWEST, RigidBody
+from mimopilot.tuning.plant.wide_response import STEP, TOP, WideResponse
 from mimopilot.tuning.spec import DesignLimits, TuningSpec
 from mimopilot.tuning.statespace import StateSpace
 

@@ -14,8 +14,9 @@ from mimopilot.tuning.plant.frequency_response import COHERENT, PlantResponse
 
 #: Largest gain of the rate loop above the band: 6 dB below instability, if the plant falls like an integrator there.
 MAX_GAIN_ABOVE_BAND = 0.5
-#: Largest sensitivity at the band's lower end: below it nothing is measured, so the loop must be closed there.
-MAX_SENSITIVITY_BELOW_BAND = 0.5
+#: Largest sensitivity at the band's lower end: all frequencies at which the loop amplifies must be measured. Below,
+#: where it attenuates, the vehicle is the fitted rigid body.
+MAX_SENSITIVITY_BELOW_BAND = 1.0
 #: Above the frequency where the loop first falls below the limit, noise may exceed it up to this ratio of frequencies.
 CROSSOVER_NOISE_RATIO = 1.25
 #: A gain whose error is below this share of it counts as measured, whatever the coherence.

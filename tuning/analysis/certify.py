@@ -29,7 +29,7 @@ from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Certificate, Thresh
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import DRAWS, MIN_FREQUENCIES, PlantResponse
-from mimopilot.tuning.plant.rigid_body_fit import RigidBody, rigid_body
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody, continued_below, rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
 
@@ -83,13 +83,13 @@ def certify(
         return verdict(Verdict.NOT_CERTIFIED, reason, {}, (0.0, 0.0))
     band = (float(known.omega[0]), float(known.omega[-1]))
     gain_above = float(loop_gain_above(gains, known)[-1])
-    dense, nominal, draws = nominal_and_drawn_loops(gains, known)
+    dense, nominal, draws = nominal_and_drawn_loops(gains, continued_below(known, body))
     count = NyquistCount(inner, outer, dense.omega, gains.Ki_i)
     unstable = [any(count.encirclements(loop)) for loop in draws].count(True)
     figures = stability_figures(gain_above, dense, nominal, draws, inner)
     figures["Ms"] = max(figures["Ms"], sensitivity_peak_above(gains, plant, band[1]))
     beyond = reason_beyond_band(gains, known, gain_above)
-    # The count holds where the loop is below 1 above the band and closed below it: else it may encircle 0 there.
+    # The count holds where the loop is below 1 above the band and its amplification is measured.
     countable = gain_above + attitude_gain_above(gains, known) < 1 and sensitivity_at_band_start(gains, known) < 1
     if beyond and not countable:
         return verdict(Verdict.NOT_CERTIFIED, beyond, figures, band)
@@ -107,7 +107,7 @@ def certify(
         return verdict(Verdict.NOT_CERTIFIED, reason, figures, band)
     assumed = (
         f"assumed: above {band[1]:.0f} rad/s the plant falls at least like an integrator; "
-        f"below {band[0]:.1f} rad/s the integral term acts as at {band[0]:.1f} rad/s"
+        f"below {band[0]:.1f} rad/s it is the fitted rigid body"
     )
     short = _missed_thresholds(figures, thresholds.Ms, thresholds.phase_deg)
     if not short:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import doublet_spectrum
-from mimopilot.tuning.plant.wide_response import LOWEST, WideResponse, hat_weights
+from mimopilot.tuning.plant.rigid_body_fit import LOWEST
+from mimopilot.tuning.plant.wide_response import WideResponse, hat_weights
 from mimopilot.tuning.reference_model import ReferenceModel
 
 #: Whole lengths of the doublets, s: from a sharp stick input to slow flight.

@@ -10,13 +10,19 @@ from scipy.linalg import expm
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.plant.frequency_response import PlantResponse
-from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, ResponseShape, fit_shape
+from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, ResponseShape, fit_shape, shape_response
 from mimopilot.tuning.statespace import StateSpace
 
 #: rad/s. Above it frame modes and filters shape the response.
 UPPER = 60.0
 #: Known frequencies that the fit needs: as many as a log of about five seconds has.
 MIN_FREQUENCIES = 4
+#: rad/s. Below it a vehicle that holds its attitude does not move.
+LOWEST = 0.1
+#: Largest relative step between neighbouring frequencies below the band.
+STEP = 0.15
+#: Relative standard deviation of a vehicle's response from the fitted body below the band: damping and loads.
+DEVIATION = 0.1
 
 Signal = NDArray[np.float64]
 
@@ -111,3 +117,33 @@ def rigid_body(plant: PlantResponse) -> RigidBody:
     shape, B, power, misfit = fit_shape(plant.omega, plant.G_i, weight)
     scale = max(1.0, misfit / (4 * len(plant.omega)))
     return RigidBody(B, np.sqrt(scale / power), shape)
+
+
+def continued_below(plant: PlantResponse, body: RigidBody) -> PlantResponse:
+    """The response continued below its lowest frequency as the fitted rigid body, down to `LOWEST`.
+
+    Parameters
+    ----------
+    plant : PlantResponse
+    body : RigidBody
+        Fit of the same response.
+    """
+    first = float(plant.omega[0])
+    if first <= LOWEST:
+        return plant
+    omega = np.geomspace(LOWEST, first, int(np.ceil(np.log(first / LOWEST) / np.log1p(STEP))) + 1)[:-1]
+    G = body.B * shape_response(omega, body.shape)[:, None, None]
+    s = 1j * omega[:, None, None]
+    spread = DEVIATION * np.linalg.norm(G, axis=(1, 2)) / 2  # of an element
+    root = np.zeros((len(omega), 6, 6), complex)
+    root[:, 2:4, 2:4] = spread[:, None, None] * np.eye(2)
+    root[:, 4:, 2:4] = root[:, 2:4, 2:4] / s
+    return PlantResponse(
+        omega=np.concatenate([omega, plant.omega]),
+        G_i=np.concatenate([G, plant.G_i]),
+        G_o=np.concatenate([G / s, plant.G_o]),
+        root=np.concatenate([root, plant.root]),
+        reach=np.concatenate([np.broadcast_to(np.eye(2, dtype=complex), (len(omega), 2, 2)), plant.reach]),
+        coherence=np.concatenate([np.ones((len(omega), 2)), plant.coherence]),
+        Ts=plant.Ts,
+    )

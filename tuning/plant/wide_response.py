@@ -14,15 +14,12 @@ from mimopilot.tuning.plant.local_polynomial import FREEDOM
 from mimopilot.tuning.plant.noise_spectrum import noise_root
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, ResponseShape, fit_shape, shape_response
-from mimopilot.tuning.plant.rigid_body_fit import RigidBody
+from mimopilot.tuning.plant.rigid_body_fit import RigidBody, continued_below
 
-#: rad/s. Below it a vehicle that holds its attitude does not move.
-LOWEST = 0.1
-#: Largest relative step between neighbouring frequencies in the band and above it, and below it, where the response is
-#: that of a rigid body.
-STEP, STEP_BELOW = 0.05, 0.15
-#: Frequencies at each end of the band whose mean ratio to the fitted shape is continued.
-END_BELOW, END_ABOVE = 9, 5
+#: Largest relative step between neighbouring frequencies.
+STEP = 0.05
+#: Frequencies at the end of the band whose mean ratio to the fitted shape is continued.
+END_ABOVE = 5
 #: Share of the Nyquist frequency at which the grid ends: the integrator's response is real there.
 TOP = 0.999
 
@@ -39,10 +36,10 @@ class WideResponse:
     omega : (K,) array, rad/s
     G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
     band : slice
-        Frequencies at which it was measured. Below and above, the fitted shape of a rigid body behind rotors and a
-        delay continues it.
+        Frequencies at which it was measured. Below, the fitted rigid body behind rotors and a delay continues it, and
+        above, its shape.
     error_i, error_o : (K, 2, 6) arrays
-        With X (6, 2) of unit complex normals, error_i X reach is as likely as the error of G_i; zero outside the band.
+        With X (6, 2) of unit complex normals, error_i X reach is as likely as the error of G_i; zero above the band.
     reach : (K, 2, 2) array
     noise : (K, 4, 4) array
         Square root of the spectrum of the noise of rates and angles, see `tuning.plant.noise_spectrum`.
@@ -104,29 +101,25 @@ def wide_response(measured: PlantEstimates) -> WideResponse:
             "record a longer or stronger excitation"
         )
     known = plant.at(run)
-    dense = known.interpolated(STEP)
-    low = _spaced(LOWEST, dense.omega[0], STEP_BELOW)[:-1] if dense.omega[0] > LOWEST else np.empty(0)
+    lower = continued_below(known, body)
+    dense = lower.interpolated(STEP)
     high = _spaced(dense.omega[-1], TOP * np.pi / plant.Ts, STEP)[1:]
     size = np.linalg.norm(known.G_i, axis=(1, 2))[:, None, None]
     shape, _, _, _ = fit_shape(known.omega, known.G_i, 1 / (known.deviation() ** 2 + (SHAPE_ERROR * size) ** 2))
-
-    def ratio(where: slice) -> Complex:
-        found: Complex = np.mean(dense.G_i[where] / _column(shape_response(dense.omega[where], shape)), axis=0)
-        return found
-
-    below = ratio(slice(0, END_BELOW)).real * _column(shape_response(low, shape))
-    above = ratio(slice(-END_ABOVE, None)) * _column(shape_response(high, shape))
-    omega = np.concatenate([low, dense.omega, high])
-    band = slice(len(low), len(low) + len(dense.omega))
+    end = slice(-END_ABOVE, None)
+    ratio = np.mean(dense.G_i[end] / _column(shape_response(dense.omega[end], shape)), axis=0)
+    above = ratio * _column(shape_response(high, shape))
+    omega = np.concatenate([dense.omega, high])
+    band = slice(int(np.searchsorted(omega, known.omega[0])), len(dense.omega))
     error_i = np.zeros((len(omega), 2, 6), complex)
     error_o, reach = np.zeros_like(error_i), np.zeros((len(omega), 2, 2), complex)
-    error_i[band] = dense.root[:, 2:4] - dense.G_i @ dense.root[:, :2]
-    error_o[band] = dense.root[:, 4:] - dense.G_o @ dense.root[:, :2]
-    reach[band] = dense.reach
+    error_i[: band.stop] = dense.root[:, 2:4] - dense.G_i @ dense.root[:, :2]
+    error_o[: band.stop] = dense.root[:, 4:] - dense.G_o @ dense.root[:, :2]
+    reach[: band.stop] = dense.reach
     return WideResponse(
         omega=omega,
-        G_i=np.concatenate([below, dense.G_i, above]),
-        G_o=np.concatenate([below / _column(1j * low), dense.G_o, above / _column(1j * high)]),
+        G_i=np.concatenate([dense.G_i, above]),
+        G_o=np.concatenate([dense.G_o, above / _column(1j * high)]),
         band=band,
         error_i=error_i,
         error_o=error_o,
