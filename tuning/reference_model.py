@@ -157,8 +157,53 @@ class SecondOrder:
         return {"type": self.type, **asdict(self)}
 
 
+@dataclass(frozen=True)
+class SecondOrderAndPoles:
+    """A second-order model and further real poles: `SecondOrder` times p/(s + p) for each.
+
+    Attributes
+    ----------
+    omega, zeta, delay
+        As in `SecondOrder`.
+    poles : tuple of float, rad/s
+        Bandwidths of the further poles, such as that of the motors.
+    """
+
+    type: ClassVar[str] = "second_order_and_poles"
+
+    omega: float
+    zeta: float
+    poles: tuple[float, ...]
+    delay: int = 0
+
+    def __post_init__(self) -> None:
+        SecondOrder(self.omega, self.zeta, self.delay)  # the same checks
+        poles = self.poles if isinstance(self.poles, list | tuple) else (self.poles,)
+        if not poles or not all(0 < pole < np.inf for pole in poles):
+            raise TuningError(f"reference model: poles: got {list(poles)} rad/s, expected one or more, all above 0")
+        for name, value in (("omega", float(self.omega)), ("zeta", float(self.zeta)), ("delay", int(self.delay))):
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "poles", tuple(float(pole) for pole in poles))
+
+    @property
+    def bandwidth(self) -> float:
+        """The lowest frequency of the model, rad/s."""
+        return min(self.omega, *self.poles)
+
+    def discretise(self, Ts: float) -> ReferenceModel:
+        """See `second_order`."""
+        return second_order(self.omega, self.zeta, self.delay, Ts, self.poles)
+
+    def as_table(self) -> dict[str, Any]:
+        """The model as plain TOML values."""
+        return {"type": self.type, **asdict(self), "poles": list(self.poles)}
+
+
 #: Type -> class of every reference model; a new model needs a class and a row here.
-CONTINUOUS_MODELS: dict[str, Callable[..., ContinuousModel]] = {SecondOrder.type: SecondOrder}
+CONTINUOUS_MODELS: dict[str, Callable[..., ContinuousModel]] = {
+    SecondOrder.type: SecondOrder,
+    SecondOrderAndPoles.type: SecondOrderAndPoles,
+}
 
 
 def model_from_table(table: Any, where: str) -> ContinuousModel:
@@ -172,7 +217,7 @@ def model_from_table(table: Any, where: str) -> ContinuousModel:
     if isinstance(table, list | tuple) and len(table) in (2, 3):
         table = {"type": SecondOrder.type, **dict(zip(("omega", "zeta", "delay"), table, strict=False))}
     kind = CONTINUOUS_MODELS.get(table.get("type", "")) if isinstance(table, Mapping) else None
-    numbers = [value for name, value in table.items() if name != "type"] if kind else []
+    numbers = [one for name, value in table.items() if name != "type" for one in _each(value)] if kind else []
     if kind is None or any(isinstance(v, bool) or not isinstance(v, int | float) for v in numbers):
         raise TuningError(
             f"{where}: got {shown(table)}, expected [omega, damping, delay], or a table with type "
@@ -186,8 +231,13 @@ def model_from_table(table: Any, where: str) -> ContinuousModel:
         raise TuningError(f"{where}: got {shown(table)}, expected the numbers of a {table['type']} model") from None
 
 
+def _each(value: Any) -> list[Any]:
+    """The items of a list, or a single value."""
+    return list(value) if isinstance(value, list | tuple) else [value]
+
+
 @lru_cache(maxsize=256)
-def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceModel:
+def second_order(omega: float, zeta: float, delay: int, Ts: float, poles: tuple[float, ...] = ()) -> ReferenceModel:
     """Zero-order-hold discretisation of omega^2/(s^2 + 2 zeta omega s + omega^2), times z^-delay.
 
     Parameters
@@ -200,6 +250,8 @@ def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceM
         Extra dead time.
     Ts : float, s
         Sampling period.
+    poles : tuple of float, rad/s
+        Further factors p/(s + p), discretised together with the rest.
 
     Raises
     ------
@@ -214,11 +266,14 @@ def second_order(omega: float, zeta: float, delay: int, Ts: float) -> ReferenceM
         )
     from scipy.signal import cont2discrete
 
-    num, den, _ = cont2discrete(([omega**2], [1, 2 * zeta * omega, omega**2]), Ts, method="zoh")
+    factors: Any = np.array([1, 2 * zeta * omega, omega**2])
+    for pole in poles:
+        factors = np.polymul(factors, [1 / pole, 1])
+    num, den, _ = cont2discrete(([omega**2], factors), Ts, method="zoh")
     return ReferenceModel(
         tuple(float(b) for b in num[0][1:]),
         tuple(float(a) for a in den),
         int(delay),
         Ts,
-        label=f"{omega:g} rad/s, {zeta:g}, {delay:d}",
+        label=f"{omega:g} rad/s, {zeta:g}, {delay:d}" + "".join(f", pole {pole:g} rad/s" for pole in poles),
     )

@@ -12,8 +12,8 @@ import typer
 AirframeArgument = Annotated[
     str,
     typer.Argument(
-        help="Airframe: adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, antr, px4_sih; or a TOML "
-        "file."
+        help="Airframe: adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, adam0_thesis, "
+        "adam0_thesis_flown, adam0_thesis_perturbed, antr, antr_thesis, px4_sih; or a TOML file."
     ),
 ]
 LogArgument = Annotated[Path, typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, CSV or MATLAB file.")]

@@ -22,6 +22,10 @@ class Study(StrEnum):
     ANTR = "antr"
     ADAM0_SMALL = "adam0-small"
     COUPLED = "coupled"
+    ADAM0_SIM_THESIS = "adam0-sim-thesis"
+    ADAM0_THESIS = "adam0-thesis"
+    ADAM0_PERTURBED_THESIS = "adam0-perturbed-thesis"
+    ANTR_THESIS = "antr-thesis"
     ALL = "all"
 
 

@@ -25,7 +25,8 @@ def cores() -> int:
 def processes(count: int) -> Iterator[Executor]:
     """Worker processes that end with this one, however it ends, and ignore Ctrl-C.
 
-    On Linux they are forked, so loaded modules and compiled code are shared.
+    On Linux they are forked, so loaded modules and compiled code are shared. If a `KeyboardInterrupt` leaves the
+    block, they are killed: the caller decides which running calls are worth waiting for.
 
     Parameters
     ----------
@@ -33,9 +34,16 @@ def processes(count: int) -> Iterator[Executor]:
         Number of processes.
     """
     context = multiprocessing.get_context("fork" if sys.platform == "linux" else "spawn")
+    others = multiprocessing.active_children()
     with ProcessPoolExecutor(count, context, initializer=_follow_parent) as executor:
-        executor.submit(int).result()  # fork now, before a progress bar starts threads
-        yield executor
+        try:
+            executor.submit(int).result()  # fork now, before a progress bar starts threads
+            yield executor
+        except KeyboardInterrupt:
+            for worker in multiprocessing.active_children():
+                if worker not in others:
+                    worker.kill()
+            raise
 
 
 def _follow_parent() -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import shutil
-import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor
 from concurrent.futures.process import BrokenProcessPool
@@ -18,15 +16,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mimopilot.common.console import progress_console
-from mimopilot.common.files import inside, unseal, write_atomically
+from mimopilot.common.files import inside
 from mimopilot.common.parallel import processes, run_all
+from mimopilot.common.part_folder import RESUME, PartFolder, UnusablePartError, folder_lock
 from mimopilot.sitl.campaign.flights import CHUNK, chunk_count, flight_runner, fly_chunk, label
 from mimopilot.sitl.campaign.plan import LOCK, PARTS, REPORT, RESULTS, SUMMARY, CampaignPlan, write_plan_files
 from mimopilot.sitl.errors import SitlError
 
 ROW_GROUP = 1 << 14  # rows of a Parquet row group: a few MB in memory at a time
-SHOWN = 3  # parts named in one message
-RESUME = "give the same command again to resume"
 
 
 def run_campaign(plan: CampaignPlan, folder: Path, workers: int, scheduler: str | None = None) -> Path:
@@ -50,98 +47,43 @@ def run_campaign(plan: CampaignPlan, folder: Path, workers: int, scheduler: str 
 
     Raises
     ------
-    SitlError
+    Error
         When the folder holds another campaign or is in use, the execution was interrupted, or workers were lost.
     OSError
         When a file would be written through a symbolic link, or cannot be written.
     """
     for name in (RESULTS, PARTS, SUMMARY, REPORT, *plan.files):
         inside(folder, name)
-    results, parts = folder / RESULTS, folder / PARTS
+    results, parts = folder / RESULTS, PartFolder(folder / PARTS, "campaign")
     if not results.is_file():  # compile before forking; find bad input before writing into the folder
         list(flight_runner(tuple(plan.files.items())).flights(0))
-    with _folder_lock(folder):
+    with folder_lock(folder, LOCK, "campaign"):
         write_plan_files(plan, folder)
         if not results.is_file():
-            missing, unusable = _find_missing_chunks(plan, parts)
-            _warn_of_unusable(parts, unusable)
+            missing = [int(name) for name in parts.missing(_label_of(plan, i) for i in range(chunk_count(plan)))]
             if missing:
                 _fly_chunks(plan, parts, missing, workers, scheduler)
             try:
                 _merge_parts(plan, parts, results)
-            except _UnusablePartError as error:  # changed since it was checked
-                raise SitlError(f"{parts}: {error}; {RESUME}", exit_code=1) from error
-        shutil.rmtree(parts, ignore_errors=True)
+            except UnusablePartError as error:  # changed since it was checked
+                raise SitlError(f"{parts.folder}: {error}; {RESUME}", exit_code=1) from error
+        shutil.rmtree(parts.folder, ignore_errors=True)
     return results
 
 
-@contextmanager
-def _folder_lock(folder: Path) -> Iterator[None]:
-    """Lock a folder against other campaigns; the lock ends with this process."""
-    path = inside(folder, LOCK)
-    folder.mkdir(parents=True, exist_ok=True)
-    with path.open("ab") as stream:
-        try:
-            fcntl.lockf(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)  # forked workers do not inherit it
-        except (BlockingIOError, PermissionError):
-            raise SitlError(
-                f"{folder}: another process writes a campaign into this folder; wait for it, or give another --out"
-            ) from None
-        yield
+def _label_of(plan: CampaignPlan, chunk: int) -> tuple[str, str]:
+    """Name of a chunk's part, and its label."""
+    return f"{chunk:07d}", label(plan, chunk)
 
 
-def _part(parts: Path, chunk: int) -> Path:
-    return inside(parts, f"{chunk:07d}.part")
-
-
-def _find_missing_chunks(plan: CampaignPlan, parts: Path) -> tuple[list[int], list[str]]:
-    """Chunks without a usable part, and why the existing ones of them are unusable."""
-    missing, unusable = [], []
-    for chunk in range(chunk_count(plan)):
-        if not _part(parts, chunk).is_file():
-            missing.append(chunk)
-            continue
-        try:
-            _checked_table(plan, parts, chunk)
-        except _UnusablePartError as error:
-            missing.append(chunk)
-            unusable.append(str(error))
-    return missing, unusable
-
-
-def _warn_of_unusable(parts: Path, unusable: list[str]) -> None:
-    if unusable:
-        more = f" and {len(unusable) - SHOWN} more" if len(unusable) > SHOWN else ""
-        named = "; ".join(unusable[:SHOWN])
-        print(f"mimopilot: warning: {parts}: unusable parts are flown again: {named}{more}", file=sys.stderr)
-
-
-class _UnusablePartError(SitlError):
-    """A part file cannot be used."""
-
-
-def _checked_table(plan: CampaignPlan, parts: Path, chunk: int) -> pa.BufferReader:
-    """The table in a part file, after checking that it is complete and of this campaign and chunk."""
-    path, wanted = _part(parts, chunk), label(plan, chunk)
-    found = unseal(path.read_bytes())
-    if found is None:
-        raise _UnusablePartError(f"{path.name} is damaged")
-    table, is_of = found
-    if is_of != wanted:
-        campaign, _, runs = is_of.partition(" ")
-        whose = f"is of {runs}" if wanted.startswith(campaign) else "is of another campaign"
-        raise _UnusablePartError(f"{path.name} {whose}")
-    return pa.BufferReader(table)
-
-
-def _fly_chunks(plan: CampaignPlan, parts: Path, missing: list[int], workers: int, scheduler: str | None) -> None:
+def _fly_chunks(plan: CampaignPlan, parts: PartFolder, missing: list[int], workers: int, scheduler: str | None) -> None:
     flights = len(plan.gains) * len(plan.scenarios)
     flown = chunk_count(plan) - len(missing)
     with _executor(workers, scheduler) as (executor, ahead), _progress(plan, flown) as advance:
 
         def keep(chunk: int, part: bytes) -> None:
             nonlocal flown
-            write_atomically(_part(parts, chunk), part)
+            parts.write(_label_of(plan, chunk)[0], part)
             flown += 1
             advance(min(CHUNK, plan.description.runs - chunk * CHUNK) * flights)
 
@@ -206,15 +148,20 @@ def _progress(plan: CampaignPlan, flown: int) -> Iterator[Callable[[int], Any]]:
         yield advance
 
 
-def _merge_parts(plan: CampaignPlan, parts: Path, results: Path) -> None:
+def _table(plan: CampaignPlan, parts: PartFolder, chunk: int) -> pa.BufferReader:
+    """The table in a chunk's part."""
+    return pa.BufferReader(parts.read(*_label_of(plan, chunk)))
+
+
+def _merge_parts(plan: CampaignPlan, parts: PartFolder, results: Path) -> None:
     """Merge all parts into one file, in order, with one row group in memory at a time."""
-    whole, count = inside(parts, RESULTS), chunk_count(plan)
-    begin = pq.read_table(_checked_table(plan, parts, 0))
+    whole, count = inside(parts.folder, RESULTS), chunk_count(plan)
+    begin = pq.read_table(_table(plan, parts, 0))
     schema, per_group = begin.schema, max(1, ROW_GROUP // begin.num_rows)
     with pq.ParquetWriter(whole, schema, compression="zstd", write_page_checksum=True) as writer:
         for first in range(0, count, per_group):
             chosen = range(first, min(first + per_group, count))
-            tables = [pq.read_table(_checked_table(plan, parts, chunk), schema=schema) for chunk in chosen]
+            tables = [pq.read_table(_table(plan, parts, chunk), schema=schema) for chunk in chosen]
             writer.write_table(pa.concat_tables(tables).unify_dictionaries().combine_chunks())
     with whole.open("rb") as stream:
         os.fsync(stream.fileno())

@@ -7,6 +7,7 @@ A scenario file names a manoeuvre and its faults:
     amplitude_deg = 15
     period_s = 0.42
     tail_s = 1.5                # level flight after a doublet
+    rate_limit_deg_s = 220      # largest rate of the setpoint; without it the setpoint jumps
 
     [[fault]]
     kind = "motor"
@@ -137,6 +138,22 @@ def hover(axis: str, period: float, Ts: float) -> Scenario:
     return Scenario("hover", Ts, setpoint, np.zeros_like(setpoint), _axis_index(axis), (0, len(setpoint)))
 
 
+def limit_rate(scenario: Scenario, rate: float) -> Scenario:
+    """The scenario with setpoints that change by at most `rate` rad/s, as a setpoint rate limiter passes them on.
+
+    Raises
+    ------
+    SitlError
+        When the rate is not above 0.
+    """
+    if not 0 < rate < np.inf:
+        raise SitlError(f"rate_limit_deg_s: got {np.degrees(rate):.6g} deg/s, expected above 0")
+    limited, most = scenario.setpoint.copy(), rate * scenario.Ts
+    for k in range(1, len(limited)):
+        limited[k] = limited[k - 1] + np.clip(scenario.setpoint[k] - limited[k - 1], -most, most)
+    return replace(scenario, setpoint=limited)
+
+
 def make_scenario(
     name: str, axis: str, amplitude_deg: float, period: float, Ts: float, tail: float = TAIL_S
 ) -> Scenario:
@@ -153,7 +170,7 @@ def make_scenario(
 
 
 class ScenarioManoeuvre(BaseModel):
-    """The manoeuvre of a scenario file: arguments of `make_scenario`."""
+    """The manoeuvre of a scenario file: arguments of `make_scenario`, and the rate of `limit_rate` in deg/s."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -162,6 +179,7 @@ class ScenarioManoeuvre(BaseModel):
     amplitude_deg: float = AMPLITUDE_DEG
     period_s: float = PERIOD_S
     tail_s: float = TAIL_S
+    rate_limit_deg_s: float | None = None
 
 
 def read_scenario(path: Path) -> tuple[ScenarioManoeuvre, tuple[Fault, ...]]:
@@ -196,6 +214,8 @@ def load_scenario(path: Path, Ts: float) -> Scenario:
     asked, faults = read_scenario(path)
     try:
         scenario = make_scenario(asked.manoeuvre, asked.axis, asked.amplitude_deg, asked.period_s, Ts, asked.tail_s)
+        if asked.rate_limit_deg_s is not None:
+            scenario = limit_rate(scenario, float(np.radians(asked.rate_limit_deg_s)))
     except SitlError as error:
         raise SitlError(f"{path}: {error}") from error
     return replace(scenario, faults=faults)

@@ -18,8 +18,9 @@ from mimopilot.sitl.studies.attitude_run import AttitudeRun
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
 from mimopilot.sitl.studies.attitude_study import MIMO, REFINED, SISO, AttitudeStudy
 
-#: Method -> (colour, line style) and marker.
-LOOK = dict(zip((SISO, MIMO, REFINED), zip(STYLES, "so^", strict=False), strict=False))
+#: Methods in the plots; method -> (colour, line style) and marker.
+TUNED = (SISO, MIMO, REFINED)
+LOOK = dict(zip(TUNED, zip(STYLES, "so^", strict=False), strict=False))
 PRINTED = {"color": "black", "marker": "x", "markersize": 7, "markeredgewidth": 1.6, "linestyle": "none"}
 MATRICES = {"Kp_o": "1/s", "Kp_i": "s", "Ki_i": "-", "Kd_i": "s^2"}
 ELEMENTS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
@@ -33,7 +34,7 @@ def tracking_figure(found: AttitudeRun, study: AttitudeStudy) -> Figure:
     """Error of angle and rate to the reference models of their setpoints, in both doublets."""
     figure = Figure(figsize=(9, 5.5), layout="constrained")
     panels: Any = figure.subplots(2, 2, sharex=True, sharey="row")
-    for method, ((colour, style), _) in LOOK.items():
+    for method, (colour, style) in _lines(found):
         for column, (axis, flight) in enumerate(zip(AXES, found.flights[method], strict=True)):
             scenario, record = flight.scenario, flight.record
             models = reference_responses(flight, *study.models(method, scenario.Ts))
@@ -53,6 +54,11 @@ def tracking_figure(found: AttitudeRun, study: AttitudeStudy) -> Figure:
     return figure
 
 
+def _lines(found: AttitudeRun) -> list[tuple[str, Any]]:
+    """The plotted methods of a run, with their colour and line style."""
+    return [(method, line) for method, (line, _) in LOOK.items() if method in found.flights]
+
+
 def _time(flight: Flight) -> NDArray[np.float64]:
     """Time from the start of the doublet, s, (N,)."""
     return np.asarray((np.arange(len(flight.record)) - flight.scenario.window[0]) * flight.scenario.Ts, np.float64)
@@ -68,7 +74,7 @@ def motors_figure(found: AttitudeRun, rotors: int, title: str) -> Figure:
     """Commands of all motors in both doublets, one row of panels per motor."""
     figure = Figure(figsize=(9, 1.5 + 1.5 * rotors), layout="constrained")
     panels: Any = figure.subplots(rotors, 2, sharex=True, sharey=True)
-    for method, ((colour, style), _) in LOOK.items():
+    for method, (colour, style) in _lines(found):
         for column, flight in enumerate(found.flights[method]):
             shown = _shown(flight)
             for motor in range(rotors):
@@ -88,20 +94,43 @@ def motors_figure(found: AttitudeRun, rotors: int, title: str) -> Figure:
     return figure
 
 
+def experiment_motors_figure(flight: Flight, rotors: int, title: str) -> Figure:
+    """Commands of all motors in the experiment, with the mean of each; a detail where roll ends and pitch begins."""
+    figure = Figure(figsize=(9, 1.5 + 1.3 * rotors), layout="constrained")
+    panels: Any = figure.subplots(rotors, 2, sharex="col", sharey=True, width_ratios=[3, 2])
+    time = np.arange(len(flight.record)) * flight.scenario.Ts
+    for motor in range(rotors):
+        command = flight.record["commands"][:, motor]
+        # As in `experiment_figure`: the overview is drawn as pixels.
+        for panel, width, pixels in zip(panels[motor], (0.4, 1.2), (True, False), strict=True):
+            panel.step(time, command, where="post", color=STYLES[1][0], linewidth=width, rasterized=pixels)
+            panel.axhline(command.mean(), color="black", linewidth=0.8)
+            panel.grid(alpha=0.3)
+        panels[motor, 0].set_ylabel(f"motor {motor + 1} [-]")
+        panels[motor, 0].set_title(f"mean {command.mean():.3f}", loc="left", fontsize=9)
+    middle = time[-1] / 2
+    for column, limits in enumerate(((time[0], time[-1]), (middle - 1.0, middle + 1.0))):
+        panels[-1, column].set_xlabel("time [s]")
+        panels[-1, column].set_xlim(*limits)
+    figure.suptitle(f"{title}: motor commands in the experiment (thrust, 0 to 1)", x=0.02, ha="left")
+    return figure
+
+
 def gains_figure(found: StudyStatistics, printed: Mapping[str, Any], table: str) -> Figure:
     """Median and 5 to 95 % of every gain over the seeds; a cross marks a value printed in the thesis."""
     figure = Figure(figsize=(9, 8.5), layout="constrained")
     panels: Any = figure.subplots(4, 4)
+    shown = {method: look for method, look in LOOK.items() if method in found.study.methods()}
     for row, (name, unit) in zip(panels, MATRICES.items(), strict=True):
         for element, panel in enumerate(row):
-            for place, (method, look) in enumerate(LOOK.items()):
+            for place, (method, look) in enumerate(shown.items()):
                 values = found.gains(method, name).reshape(-1, 4)[:, element]
                 _spread(panel, place, values, look, method)
                 if method in printed:
                     value = np.ravel(printed[method][name])[element]
                     panel.plot(place + 0.25, value, label=f"{table} as printed", **PRINTED)
             panel.axhline(0, color="black", linewidth=0.6)
-            panel.set_xlim(-0.6, len(LOOK) - 0.4)
+            panel.set_xlim(-0.6, len(shown) - 0.4)
             panel.set_xticks([])
             panel.grid(alpha=0.3, axis="y")
             panel.tick_params(labelsize=8)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,14 @@ from mimopilot.sitl.studies.attitude_figures import (
     HIGH,
     LOW,
     MATRICES,
+    TUNED,
     costs_figure,
+    experiment_motors_figure,
     gains_figure,
     motors_figure,
     tracking_figure,
 )
-from mimopilot.sitl.studies.attitude_run import EFFORT_RATIO
+from mimopilot.sitl.studies.attitude_run import EFFORT_RATIO, AttitudeRun
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
 from mimopilot.sitl.studies.attitude_study import (
     AUTOTUNE,
@@ -30,11 +33,14 @@ from mimopilot.sitl.studies.attitude_study import (
     BOUND,
     DEFAULT,
     MIMO,
+    MIMO_PRINTED,
     REFINED,
     SISO,
     SISO_OWN,
+    SISO_PRINTED,
     AttitudeStudy,
 )
+from mimopilot.sitl.studies.printed_figures import printed_figures, printed_table
 
 COMPARABILITY = (
     "Only trends can be compared with the thesis' real flights: the inertias, motors and winds there are not known, "
@@ -48,51 +54,59 @@ METHODS = (
     f"{REFINED} there (median of the first seeds). Its margins are the certificate's, Ms less the error of Ms from a "
     f"log. {BOUND}: the same with any effort. Effort: RMS of both torques together."
 )
+FITTED_METHODS = (
+    f"The airframe is fitted to the printed gains. {DEFAULT}: the gains during the experiment. {SISO} and {MIMO}: VRFT "
+    f"with the thesis' reference models. {SISO_PRINTED} and {MIMO_PRINTED}: the gains of the thesis, flown here. "
+    "Effort: RMS of both torques together."
+)
 SPREAD_COLUMNS = ("gain", *ELEMENTS)
 COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].removesuffix(", RMS of u") for text in COSTS.values()))
 CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms", "lost flights")
 
 
-def study_sections(found: StudyStatistics) -> list[Section]:
-    """The report sections of a study."""
-    study, name = found.study, found.study.name
-    inner, outer = study.models(MIMO, found.shown.experiment.scenario.Ts)
+def run_pictures(study: AttitudeStudy, found: AttitudeRun) -> dict[str, str]:
+    """Name -> SVG of every plot of one run, in the order of the report."""
+    inner, outer = study.models(MIMO, found.experiment.scenario.Ts)
     rotors = len(load_airframe(study.airframe).airframe.rotors)
+    plots = {"experiment": experiment_figure(found.experiment)}
+    plots |= {"experiment motors": experiment_motors_figure(found.experiment, rotors, study.title)}
+    others = (DEFAULT, SISO_PRINTED, MIMO_PRINTED) if study.fitted else (DEFAULT, AUTOTUNE, REFINED, BEST)
+    for key, methods in (("ours", TUNED), ("others", others)):
+        for axis, name in enumerate(AXES):
+            flights = {m: found.flights[m][axis] for m in methods if m in found.flights}
+            plots[f"{key} {name}"] = manoeuvre_figure(flights, inner, outer)
+    plots |= {"tracking": tracking_figure(found, study), "motors": motors_figure(found, rotors, study.title)}
+    return {name: svg(plot, f"{study.name} {name}") for name, plot in plots.items()}
 
-    def doublets(methods: Iterable[str], key: str) -> list[str]:
-        return [
-            svg(
-                manoeuvre_figure({m: found.shown.flights[m][axis] for m in methods}, inner, outer),
-                f"{name} {key} {AXES[axis]}",
-            )
-            for axis in range(2)
-        ]
 
+def study_sections(found: StudyStatistics, pictures: Mapping[str, str]) -> list[Section]:
+    """The report sections of a study; `pictures` are those of `run_pictures`."""
+    study, name = found.study, found.study.name
+    inner, outer = study.models(MIMO, load_airframe(study.airframe).default_gains().Ts)
     _, axis, costs = study.costs_table
+    limited = f", setpoint limited to {study.rate_limit_deg_s:g} degrees/s" if study.rate_limit_deg_s else ""
     return [
         Section(
             f"{name}: experiment",
             _lead(study, inner.label, outer.label),
-            figures=[svg(experiment_figure(found.shown.experiment), f"{name} experiment")],
+            figures=[picture for key, picture in pictures.items() if key.startswith("experiment")],
         ),
         Section(
             f"{name}: gains",
             f"Medians, in brackets {LOW} to {HIGH} % of {len(found.runs)} experiments with different noise and PRBS. "
             "Kp_o in 1/s, Kp_i in s, Ki_i without unit, Kd_i in s^2.",
-            [gains_table(found)],
+            [gains_table(found), *([printed_table(found)] if study.fitted else [])],
             [svg(gains_figure(found, study.gains_table[1], study.gains_table[0]), f"{name} gains")],
         ),
         Section(
             f"{name}: doublets",
-            f"Doublet of {study.amplitude_deg:g} degrees, {study.period_s:g} s. J over the doublet, against the models "
-            f"that each method was tuned for. {METHODS} {COMPARABILITY if costs else ''}",
+            f"Doublet of {study.amplitude_deg:g} degrees, {study.period_s:g} s{limited}. J over the doublet, against "
+            f"the models that each method was tuned for. {FITTED_METHODS if study.fitted else METHODS} "
+            f"{COMPARABILITY if costs else ''}",
             [costs_table(found), certificates_table(found)],
             [
                 svg(costs_figure(found, study.methods(), costs, axis), f"{name} costs"),
-                *doublets((SISO, MIMO, REFINED), "ours"),
-                *doublets((DEFAULT, AUTOTUNE, REFINED, BEST), "others"),
-                svg(tracking_figure(found.shown, study), f"{name} tracking"),
-                svg(motors_figure(found.shown, rotors, study.title), f"{name} motors"),
+                *(picture for key, picture in pictures.items() if not key.startswith("experiment")),
             ],
         ),
     ]
@@ -109,10 +123,9 @@ def _lead(study: AttitudeStudy, inner: str, outer: str) -> str:
     if study.siso_models != (study.inner, study.outer):
         text += f" SISO: {omega:g}, {zeta:g}, {delay}; {omega_o:g}, {zeta_o:g}, {delay_o}."
     if study.siso_airframe != study.airframe:
-        text += (
-            f" {SISO} is tuned on the log of {study.siso_airframe}, as in the thesis; {SISO_OWN} is tuned on "
-            "this vehicle's own log."
-        )
+        text += f" {SISO} is tuned on the log of {study.siso_airframe}, as in the thesis."
+        if SISO_OWN in study.methods():
+            text += f" {SISO_OWN} is tuned on this vehicle's own log."
     return text
 
 
@@ -183,6 +196,11 @@ def study_figures(found: StudyStatistics) -> dict[str, Any]:
             for method in study.methods()
         },
         "printed": _printed(study),
+        **(
+            {"comparison": [asdict(one) | {"sign": one.sign, "near": one.near} for one in printed_figures(found)]}
+            if study.fitted
+            else {}
+        ),
     }
 
 

@@ -22,9 +22,11 @@ from mimopilot.sitl.studies.attitude_study import (
     DEFAULT,
     LEAD_S,
     MIMO,
+    MIMO_PRINTED,
     REFINED,
     SISO,
     SISO_OWN,
+    SISO_PRINTED,
     AttitudeStudy,
 )
 from mimopilot.sitl.studies.autotune import autotune
@@ -41,6 +43,7 @@ from mimopilot.tuning.motors import fit_motors
 from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.rigid_body_fit import rigid_body
+from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import SecondOrder
 from mimopilot.tuning.spec import Manoeuvre, TuningSpec
 
@@ -113,8 +116,16 @@ def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experimen
     default = _vehicle_and_library(study.airframe)[1]
     inner, outer = (SecondOrder(*model) for model in (study.inner, study.outer))
     siso_inner, siso_outer = (SecondOrder(*model) for model in study.siso_models)
-    siso = TuningSpec(method="siso", inner=(siso_inner, siso_inner), outer=(siso_outer, siso_outer))
-    mimo = TuningSpec(inner=(inner, inner), outer=(outer, outer))
+    siso = TuningSpec(method="siso", inner=(siso_inner, siso_inner), outer=(siso_outer, siso_outer), **study.options)
+    mimo = TuningSpec(inner=(inner, inner), outer=(outer, outer), **study.options)
+    if study.fitted:
+        return {
+            DEFAULT: default,
+            SISO: tune(siso_log, siso),
+            SISO_PRINTED: printed_gains(study, SISO, default),
+            MIMO: tune(log, mimo, measured),
+            MIMO_PRINTED: printed_gains(study, MIMO, default),
+        }
     found = {DEFAULT: default, AUTOTUNE: autotune(log, default), SISO: tune(siso_log, siso)}
     if siso_log is not log:
         found[SISO_OWN] = tune(log, siso)
@@ -126,11 +137,30 @@ def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experimen
     return found
 
 
+def printed_gains(study: AttitudeStudy, method: str, default: Gains) -> Gains:
+    """A gain set as the thesis prints it, in the frame (yaw, limits, filter) of the default gains."""
+    matrices: Any = {name: np.array(values) for name, values in study.gains_table[1][method].items()}
+    return replace(default, certificate=None, provenance=Provenance(f"{method}, {study.gains_table[0]}"), **matrices)
+
+
 def logs(study: AttitudeStudy, seed: int) -> tuple[Flight, Experiment, Experiment]:
     """Fly the experiment; returns the flight, its log, and the log that SISO is tuned on."""
     flight, log = experiment(study, study.airframe, seed)
     other = log if study.siso_airframe == study.airframe else experiment(study, study.siso_airframe, seed)[1]
     return flight, log, other
+
+
+def _short_doublets(study: AttitudeStudy, gains: Gains) -> list[Scenario]:
+    """The doublets without noise: the flight after them does not count, and a balanced vehicle needs no hover before.
+
+    An unbalanced one gets its trim as injected torque: the integrators would need seconds of hover to find it.
+    """
+    short = study.doublets(gains.Ts, tail=0.1, lead=0.1)
+    if study.lead_s == LEAD_S:
+        return short
+    long = study.doublets(gains.Ts)[0]
+    trim = fly_set(study.airframe, gains, long, 0, noise=False).record["moment"][long.window[0] - 1]
+    return [replace(task, excitation=np.tile(trim.astype(np.float64), (len(task.setpoint), 1))) for task in short]
 
 
 def optimum(study: AttitudeStudy) -> dict[str, Gains]:
@@ -149,8 +179,7 @@ def optimum(study: AttitudeStudy) -> dict[str, Gains]:
         found.append(tune_all(study, measured, siso_log))
         errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
         bands.append(plant.omega[plant.coherent_run()[[0, -1]]])
-    # Without noise a balanced vehicle needs no hover before, and the flight after the doublet does not count.
-    doublets = study.doublets(log.Ts, tail=0.1, **({"lead": 0.1} if study.lead_s == LEAD_S else {}))
+    doublets = _short_doublets(study, found[0][REFINED])
     spent = [
         [flown_effort(fly_set(study.airframe, gains[REFINED], task, 0, noise=False)) for task in doublets]
         for gains in found

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet
+from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet, limit_rate
 from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.tuning.reference_model import ReferenceModel, second_order
 
 DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, perturbed log"
 MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same with any effort"
+#: The thesis' printed gains, flown here.
+SISO_PRINTED, MIMO_PRINTED = "SISO as printed", "MIMO as printed"
 #: s of hover before a doublet; with a mass at one motor the integrators need longer to trim.
 LEAD_S, TRIM_S = 1.0, 6.0
 
@@ -47,6 +49,13 @@ class AttitudeStudy:
         The same for the costs J.
     offaxis : float or None
         Largest off-axis peak of MIMO over SISO's; None: the axes are not coupled.
+    fitted : bool
+        The airframe is fitted to the printed gains. It flies the thesis' methods, tuned in the thesis' way, and the
+        printed gains themselves; there are no expectations of ours.
+    options : dict
+        Entries of the tuning specification with which the airframe was fitted.
+    rate_limit_deg_s : float or None
+        Largest rate of the setpoint in the doublet, deg/s.
     """
 
     name: str
@@ -63,25 +72,36 @@ class AttitudeStudy:
     gains_table: tuple[str, dict[str, Any]]
     costs_table: tuple[str, str, dict[str, Any]]
     offaxis: float | None
+    fitted: bool = False
+    options: dict[str, Any] = field(default_factory=dict)
+    rate_limit_deg_s: float | None = None
 
     def models(self, method: str, Ts: float) -> tuple[ReferenceModel, ReferenceModel]:
         """Reference models of rate and attitude loop for the costs of a method: those it was tuned for."""
-        inner, outer = self.siso_models if method in (SISO, SISO_OWN) else (self.inner, self.outer)
+        inner, outer = self.siso_models if method in (SISO, SISO_OWN, SISO_PRINTED) else (self.inner, self.outer)
         return second_order(*inner, Ts), second_order(*outer, Ts)
 
     def doublets(self, Ts: float, **lengths: float) -> list[Scenario]:
         """The roll and the pitch doublet; `lengths` are passed to `doublet`."""
         height = float(np.radians(self.amplitude_deg))
-        return [doublet(axis, height, self.period_s, Ts, **({"lead": self.lead_s} | lengths)) for axis in AXES]
+        tasks = [doublet(axis, height, self.period_s, Ts, **({"lead": self.lead_s} | lengths)) for axis in AXES]
+        if self.rate_limit_deg_s is None:
+            return tasks
+        return [limit_rate(task, float(np.radians(self.rate_limit_deg_s))) for task in tasks]
 
     def methods(self) -> list[str]:
         """Names of all methods, in the order of the tables."""
+        if self.fitted:
+            return [DEFAULT, SISO, SISO_PRINTED, MIMO, MIMO_PRINTED]
         own = [SISO_OWN] if self.siso_airframe != self.airframe else []
         return [DEFAULT, AUTOTUNE, SISO, *own, MIMO, REFINED, BEST, BOUND]
 
 
 def studies() -> dict[str, AttitudeStudy]:
-    """The studies by name. All are from the thesis' tables but adam0-small and coupled."""
+    """The studies by name. All are from the thesis' tables but adam0-small and coupled.
+
+    Those of the thesis are flown twice: on our class values, and on airframes that are fitted to the printed gains.
+    """
     printed = json.loads(TABLES.read_text())
 
     def model(entry: dict[str, Any]) -> Model:
@@ -120,40 +140,60 @@ def studies() -> dict[str, AttitudeStudy]:
         return AttitudeStudy(**(entry | changes))
 
     simulation = made("adam0-sim", "ADAM-0, 10 % coupling", "adam0", "adam0_simulation", "5.4", "", 1 / 3)
-    return {
-        study.name: study
-        for study in (
-            simulation,
-            made("adam0", "ADAM-0, nominal", "adam0_nominal", "adam0_flight_nominal", "6.2", "6.3 roll", None),
-            made(
-                "adam0-perturbed",
-                "ADAM-0, 160 g at motor 3",
-                "adam0_perturbed",
-                "adam0_flight_perturbed",
-                "6.4",
-                "6.5 pitch",
-                1 / 3,
-                siso_airframe="adam0_nominal",
-                lead_s=TRIM_S,
-            ),
-            # The thesis does not print the length of ANT-R's doublet.
-            made("antr", "ANT-R", "antr", "antr_flight", "6.7", "6.8 roll", None, period_s=0.4),
-            replace(
-                simulation,
-                name="adam0-small",
-                title="ADAM-0, 10 % coupling, small doublet",
-                amplitude_deg=8.0,  # no motor saturates: the vehicle is linear
-                gains_table=("", {}),
-            ),
-            replace(
-                simulation,
-                name="coupled",
-                title="ADAM-0 with a boom, 40 % coupling",
-                airframe="adam0_boom",
-                siso_airframe="adam0_boom",
-                amplitude_deg=15.0,  # at 22.5 the motors saturate
-                gains_table=("", {}),
-                offaxis=1 / 5,
-            ),
+    nominal = made("adam0", "ADAM-0, nominal", "adam0_nominal", "adam0_flight_nominal", "6.2", "6.3 roll", None)
+    perturbed = made(
+        "adam0-perturbed",
+        "ADAM-0, 160 g at motor 3",
+        "adam0_perturbed",
+        "adam0_flight_perturbed",
+        "6.4",
+        "6.5 pitch",
+        1 / 3,
+        siso_airframe="adam0_nominal",
+        lead_s=TRIM_S,
+    )
+    # The thesis does not print the length of ANT-R's doublet.
+    racer = made("antr", "ANT-R", "antr", "antr_flight", "6.7", "6.8 roll", None, period_s=0.4)
+    small = replace(
+        simulation,
+        name="adam0-small",
+        title="ADAM-0, 10 % coupling, small doublet",
+        amplitude_deg=8.0,  # no motor saturates: the vehicle is linear
+        gains_table=("", {}),
+    )
+    coupled = replace(
+        simulation,
+        name="coupled",
+        title="ADAM-0 with a boom, 40 % coupling",
+        airframe="adam0_boom",
+        siso_airframe="adam0_boom",
+        amplitude_deg=15.0,  # at 22.5 the motors saturate
+        gains_table=("", {}),
+        offaxis=1 / 5,
+    )
+    own: dict[str, Any] = {"instrument": "u", "weight": "identity"}  # the thesis' own estimator
+    # Name, study, airframe, airframe of SISO's log, options, rate limit of the setpoint. The thesis' flights had a rate
+    # limiter and it does not print the rate: it is chosen so that the printed gains of MIMO give the printed J_r,o
+    # (0.161 and 0.016 rad^2). Without one J_r,o would be 0.71, more than without any response, and 0.067. 220 deg/s is
+    # also PX4's default MC_ROLLRATE_MAX. ANT-R's printed J_r,o needs none.
+    fits: tuple[tuple[str, AttitudeStudy, str, str, dict[str, Any], float | None], ...] = (
+        ("adam0-sim-thesis", simulation, "adam0_thesis", "adam0_thesis", {}, None),
+        ("adam0-thesis", nominal, "adam0_thesis_flown", "adam0_thesis_flown", own, 220.0),
+        ("adam0-perturbed-thesis", perturbed, "adam0_thesis_perturbed", "adam0_thesis_flown", own, 50.0),
+        ("antr-thesis", racer, "antr_thesis", "antr_thesis", own, None),
+    )
+    fitted = [
+        replace(
+            study,
+            name=name,
+            title=f"{study.title}, fitted to {study.gains_table[0]}",
+            airframe=airframe,
+            siso_airframe=siso,
+            fitted=True,
+            options=options,
+            rate_limit_deg_s=rate,
         )
-    }
+        for name, study, airframe, siso, options, rate in fits
+    ]
+    every = (simulation, nominal, perturbed, racer, small, coupled, *fitted)
+    return {study.name: study for study in every}

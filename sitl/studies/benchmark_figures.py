@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from mimopilot.sitl.flight.figures import MODEL, STYLES
 from mimopilot.sitl.studies.benchmarks import Benchmark
+from mimopilot.tuning.law import Filters
 from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 
 #: (colour, line style) of each controller: Okabe and Ito's palette for colour blindness.
@@ -54,6 +56,38 @@ def sensitivity_figure(task: Benchmark, controllers: Mapping[str, LoopController
             panels[i, j].set_ylim(1e-3, 3)
             panels[i, j].set_ylabel(f"|T({i + 1},{j + 1})| [-]")
         panels[1, i].set_xlabel("frequency [rad/s]")
+    panels[0, 0].legend(fontsize=8)
+    return figure
+
+
+def spread_figure(task: Benchmark, gains: NDArray[np.float64], samples: int, title: str) -> Figure:
+    """Figure 5.2: steps of the setpoints with the gains of every run, in grey, and their mean.
+
+    Parameters
+    ----------
+    task : Benchmark
+    gains : (runs, 2, 2, 2) array
+        See `sitl.studies.benchmark_studies.gain_spread`.
+    samples : int
+        Length of the steps.
+    title : str
+    """
+    figure, panels = _panels(title)
+    time = np.arange(samples) * task.plant.Ts
+    for j in range(2):
+        inputs = np.zeros((samples, 6))
+        inputs[:, j] = 1.0
+        loops = (LoopController(dict(zip("PI", run, strict=True)), Filters(task.plant.Ts)) for run in gains)
+        steps = np.array([closed_loop(task.plant, loop).simulate(inputs)[:, 2:] for loop in loops])
+        for i in range(2):
+            # Drawn as pixels: so many lines would be most of the size of a report.
+            panels[i, j].plot(time, steps[:, :, i].T, color="#999999", linewidth=0.4, rasterized=True)
+            wanted = task.model.response(inputs[:, j]) if i == j else np.zeros(samples)
+            panels[i, j].plot(time, wanted, label="reference model", color="black", linewidth=1.2, linestyle=":")
+            panels[i, j].plot(time, steps[:, :, i].mean(axis=0), label="mean", color=STYLES[1][0], linewidth=1.6)
+        panels[0, j].set_title(f"step of setpoint {j + 1}", fontsize=10)
+        panels[1, j].set_xlabel("time [s]")
+        panels[j, 0].set_ylabel(f"output {j + 1} [-]")
     panels[0, 0].legend(fontsize=8)
     return figure
 

@@ -13,6 +13,7 @@ from scipy.signal import cont2discrete
 
 from mimopilot.tuning.design.refine_on_model import model_reference_cost
 from mimopilot.tuning.loop_controller import LoopController, closed_loop
+from mimopilot.tuning.reference_matrix import Wanted
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
 
@@ -52,11 +53,22 @@ class Benchmark:
         """The reference model of each output."""
         return [self.model] * 2
 
-    def cost(self, controller: LoopController) -> float:
-        """J_MR, (3.1) of the thesis, on the true plant; infinite when the loop is not stable."""
+    def cost(
+        self, controller: LoopController, models: Wanted | None = None, emphasis: ReferenceModel | None = None
+    ) -> float:
+        """J_MR, (3.1) of the thesis, on the true plant; infinite when the loop is not stable.
+
+        Parameters
+        ----------
+        controller : LoopController
+        models : sequence of ReferenceModel, or ReferenceMatrix, optional
+            M; that of the thesis by default.
+        emphasis : ReferenceModel, optional
+            W(z); 1 by default, as in the thesis' benchmarks.
+        """
         if not closed_loop(self.plant, controller).stable:
             return float("inf")
-        return model_reference_cost(self.plant, controller, self.models, GRID)
+        return model_reference_cost(self.plant, controller, models or self.models, GRID, emphasis)
 
     def run(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from mimopilot.common.html_report import ReportTable, Section
@@ -30,3 +30,16 @@ class ReportPart:
     def tables(self) -> list[ReportTable]:
         """The tables of all sections, in order."""
         return [table for section in self.sections for table in section.tables]
+
+    def as_json(self) -> dict[str, Any]:
+        """The part as a JSON value, see `from_json`."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, value: dict[str, Any]) -> ReportPart:
+        """The part from `as_json`."""
+        sections = [
+            Section(**(section | {"tables": [ReportTable(**table) for table in section["tables"]]}))
+            for section in value["sections"]
+        ]
+        return cls(value["lead"], sections, value["figures"])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -10,11 +10,15 @@ from typing import Any
 from mimopilot.common.console import print_table
 from mimopilot.common.files import inside
 from mimopilot.common.html_report import ReportTable, Section, write_report
-from mimopilot.sitl.studies.attitude_report import COMPARABILITY, study_figures, study_sections
-from mimopilot.sitl.studies.attitude_statistics import StudyStatistics, run_studies
+from mimopilot.common.long_work import Piece, run_pieces
+from mimopilot.common.parallel import cores
+from mimopilot.sitl.studies.attitude_pieces import run_name, statistics, study_pieces
+from mimopilot.sitl.studies.attitude_report import COMPARABILITY
+from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
 from mimopilot.sitl.studies.attitude_study import studies
 from mimopilot.sitl.studies.benchmark_studies import study_lv100, study_numerical_example
 from mimopilot.sitl.studies.expectations import expectations, expectations_table
+from mimopilot.sitl.studies.printed_figures import summary_table
 from mimopilot.sitl.studies.report_part import ReportPart
 
 #: Noise seeds of the attitude studies; the expectations apply to the medians over them.
@@ -28,6 +32,14 @@ UNMET = (
     "speed, and thrust is proportional to its square. So near the limits torque builds up faster than in the small "
     "motions of the log. A model from that log overestimates the effort of high gains, and the refinement uses less "
     "effort than allowed. adam0-small is the same vehicle with a doublet that does not saturate the motors."
+)
+
+
+PRINTED = (
+    "On airframes that are fitted to the printed gains: how many of the printed gains have the printed sign, and how "
+    "many are within 15 % or equal when rounded (medians over the seeds), and the main result of the real flights, "
+    "J_M,o of MIMO over SISO's: printed, with the gains tuned here, and with the printed gains flown here. Each method "
+    "is compared with the reference model that it was tuned for."
 )
 
 
@@ -47,6 +59,9 @@ class Reproduction:
 def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = None) -> Reproduction:
     """Run one study, or all, and write one report.
 
+    Each finished run is kept in the folder, and each finished study gets its own report at once: the same call goes on
+    where it was interrupted.
+
     Parameters
     ----------
     name : str
@@ -57,32 +72,77 @@ def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = No
         Experiments per attitude study.
     workers : int, optional
         Processes; by default one per core. The result does not depend on it.
+
+    Raises
+    ------
+    Error
+        When the folder is in use, or a vehicle was lost; exit code 130 after Ctrl-C.
     """
-    report = inside(out, f"{name}.html")
     chosen = STUDIES if name == ALL else (name,)
-    parts = {study: BENCHMARKS[study]() for study in chosen if study in BENCHMARKS}
+    for study in {name, *chosen}:
+        inside(out, f"{study}.html")
     known = studies()
-    flown = [known[study] for study in chosen if study in known]
-    if flown:
-        parts |= _attitude_parts(run_studies(flown, seeds, workers), seeds)
+    pieces = []
+    for study in chosen:
+        pieces += [Piece(study, _benchmark, study, study)] if study in BENCHMARKS else study_pieces(known[study], seeds)
+    results: dict[str, Any] = {}
+
+    def kept(piece: str, result: Any) -> None:
+        results[piece] = result
+        if name == ALL and piece in STUDIES:
+            _write(out, piece, _parts([piece], results, seeds))
+
+    run_pieces(pieces, out, workers or cores(), f"mimopilot reproduce {name}", kept)
+    return _write(out, name, _parts(chosen, results, seeds))
+
+
+def _benchmark(name: str) -> dict[str, Any]:
+    return BENCHMARKS[name]().as_json()
+
+
+def _parts(chosen: Sequence[str], results: Mapping[str, Any], seeds: int) -> dict[str, ReportPart]:
+    """The parts of a report: benchmarks, the expectations of the attitude studies, and these studies."""
+    known = studies()
+    own = {study: ReportPart.from_json(results[study]) for study in chosen}
+    found = [
+        statistics(known[study], [results[run_name(known[study], seed)] for seed in range(seeds)])
+        for study in chosen
+        if study in known
+    ]
+    before = {"expectations": _overview(found, seeds)} if found else {}
+    return {
+        **{study: part for study, part in own.items() if study not in known},
+        **before,
+        **{study: part for study, part in own.items() if study in known},
+    }
+
+
+def _overview(found: Sequence[StudyStatistics], seeds: int) -> ReportPart:
+    """The expectations, and how the printed figures come out."""
+    rows = expectations([one for one in found if not one.study.fitted])
+    fitted = [one for one in found if one.study.fitted]
+    sections = []
+    if rows:
+        text = f"Ratios of medians over {seeds} seeds. {UNMET}"
+        sections.append(Section("Expectations", text, [expectations_table(rows)]))
+    if fitted:
+        sections.append(Section("Printed figures", PRINTED, [summary_table(fitted)]))
+    lead = (
+        "Each vehicle flies an experiment in simulation, is tuned from it by every method, and flies doublets. Its "
+        f"constants are class values, or fitted to the printed gains. {COMPARABILITY}"
+    )
+    table = [{**asdict(row), "met": {method: row.met(method) for method in row.ratios}} for row in rows]
+    return ReportPart(lead, sections, {"seeds": seeds, "rows": table})
+
+
+def _write(out: Path, name: str, parts: Mapping[str, ReportPart]) -> Reproduction:
+    """Write the report of some parts."""
+    report = inside(out, f"{name}.html")
     lead = " ".join(part.lead for part in parts.values() if part.lead)
     sections = [section for part in parts.values() for section in part.sections]
     write_report(report, f"mimopilot reproduce {name}", lead, sections)
     tables = tuple(table for section in sections for table in section.tables)
     return Reproduction({study: part.figures for study, part in parts.items()}, tables, report)
-
-
-def _attitude_parts(found: Sequence[StudyStatistics], seeds: int) -> dict[str, ReportPart]:
-    """The expectations of all studies, then every study."""
-    rows = expectations(found)
-    section = Section("Expectations", f"Ratios of medians over {seeds} seeds. {UNMET}", [expectations_table(rows)])
-    lead = (
-        "Each vehicle flies an experiment in simulation, is tuned from it by every method, and flies doublets. Its "
-        f"constants are class values. {COMPARABILITY}"
-    )
-    table = [{**asdict(row), "met": {method: row.met(method) for method in row.ratios}} for row in rows]
-    studied = {one.study.name: ReportPart("", study_sections(one), study_figures(one)) for one in found}
-    return {"expectations": ReportPart(lead, [section], {"seeds": seeds, "rows": table}), **studied}
 
 
 def print_reproduction(found: Reproduction) -> None:

@@ -8,7 +8,6 @@ Levenberg-Marquardt iteration goes from VRFT's gains to the minimum.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.optimize import least_squares
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
+from mimopilot.tuning.reference_matrix import ReferenceMatrix, Wanted, wanted_response
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Response, Signal, StateSpace
 
@@ -46,25 +46,34 @@ def frequency_grid(Ts: float, count: int) -> Signal:
 
 
 def model_reference_cost(
-    plant: StateSpace, controller: LoopController, models: Sequence[ReferenceModel], count: int = FREQUENCIES
+    plant: StateSpace,
+    controller: LoopController,
+    models: Wanted,
+    count: int = FREQUENCIES,
+    emphasis: ReferenceModel | None = None,
 ) -> float:
-    """J_MR (3.1): mean over (0, pi) of the squared Frobenius norm of M - T.
+    """J_MR (3.1): mean over (0, pi) of the squared Frobenius norm of W (M - T).
 
     Parameters
     ----------
     plant : StateSpace
     controller : LoopController
         Of a stable loop; the cost of an unstable one is meaningless.
-    models : sequence of n_y ReferenceModel
+    models : sequence of n_y ReferenceModel, or ReferenceMatrix
     count : int
         Number of frequencies.
+    emphasis : ReferenceModel, optional
+        W(z); 1 by default.
     """
     omega = frequency_grid(plant.Ts, count)
     T = complementary_sensitivity(plant.frequency_response(omega), controller, omega)
-    return float(np.mean(np.sum(np.abs(_wanted(models, omega) - T) ** 2, axis=(1, 2))))
+    error = np.sum(np.abs(wanted_response(models, omega) - T) ** 2, axis=(1, 2))
+    return float(np.mean(error if emphasis is None else np.abs(emphasis.frequency_response(omega)) ** 2 * error))
 
 
-def refine_on_model(controller: LoopController, plant: StateSpace, models: Sequence[ReferenceModel]) -> Refinement:
+def refine_on_model(
+    controller: LoopController, plant: StateSpace, models: Wanted, emphasis: ReferenceModel | None = None
+) -> Refinement:
     """Gains of the same structure that minimise J_MR (3.1) on an identified plant.
 
     Levenberg-Marquardt with the exact derivative: T = (I + G B Phi_y)^-1 G B Phi_r gives
@@ -77,8 +86,10 @@ def refine_on_model(controller: LoopController, plant: StateSpace, models: Seque
         Initial controller, such as VRFT's; its loop must be stable.
     plant : StateSpace
         Identified plant, such as `tuning.plant.pbsid.pbsid` gives.
-    models : sequence of n_y ReferenceModel
-        Wanted complementary sensitivity of each output.
+    models : sequence of n_y ReferenceModel, or ReferenceMatrix
+        Wanted complementary sensitivity of each output, or the whole matrix.
+    emphasis : ReferenceModel, optional
+        W(z) of (3.1); 1 by default.
 
     Returns
     -------
@@ -89,17 +100,19 @@ def refine_on_model(controller: LoopController, plant: StateSpace, models: Seque
     TuningError
         When the loop around the identified plant is not stable, before or after.
     """
-    if {controller.filters.Ts, *(model.Ts for model in models)} != {plant.Ts} or len(models) != len(plant.C):
+    periods = {models.Ts} if isinstance(models, ReferenceMatrix) else {model.Ts for model in models}
+    if {controller.filters.Ts, *periods} != {plant.Ts} or len(models) != len(plant.C):
         raise TuningError(
             "refinement: expected one reference model for each output, and one period for plant, controller and models"
         )
     _check_stable(plant, controller, "the initial gains")
     omega = frequency_grid(plant.Ts, FREQUENCIES)
-    G, M = plant.frequency_response(omega), _wanted(models, omega)
+    G, M = plant.frequency_response(omega), wanted_response(models, omega)
     of_r, of_y = controller.shapes(omega)
     start = controller.matrix
     scale = np.where(start == 0, np.abs(start).max(), np.abs(start))
     eye = np.eye(len(models))
+    W = np.ones(FREQUENCIES) if emphasis is None else np.abs(emphasis.frequency_response(omega))
 
     def closed(parameters: Signal) -> tuple[Response, Response]:
         open_loop = G @ (parameters.reshape(start.shape) * scale)
@@ -107,25 +120,19 @@ def refine_on_model(controller: LoopController, plant: StateSpace, models: Seque
         return S, S @ open_loop @ of_r
 
     def residual(parameters: Signal) -> Signal:
-        return _real(M - closed(parameters)[1]).ravel()
+        return _real(W[:, None, None] * (M - closed(parameters)[1])).ravel()
 
     def derivative(parameters: Signal) -> Signal:
         S, T = closed(parameters)
-        left, right = S @ G, of_r - of_y @ T
+        left, right = W[:, None, None] * (S @ G), of_r - of_y @ T
         columns = -np.einsum("fai,fjb->fabij", left, right) * scale
         return _real(columns).reshape(-1, start.size)
 
     found = least_squares(residual, (start / scale).ravel(), derivative, method="lm")
     refined = controller.with_matrix(found.x.reshape(start.shape) * scale)
     _check_stable(plant, refined, "the refined gains")
-    return Refinement(refined, *(model_reference_cost(plant, c, models) for c in (controller, refined)))
-
-
-def _wanted(models: Sequence[ReferenceModel], omega: Signal) -> Response:
-    """M on the grid, (F, n_y, n_y), diagonal."""
-    diagonal = np.stack([model.frequency_response(omega) for model in models], axis=1)
-    wanted: Response = diagonal[:, :, None] * np.eye(len(models))
-    return wanted
+    costs = (model_reference_cost(plant, c, models, emphasis=emphasis) for c in (controller, refined))
+    return Refinement(refined, *costs)
 
 
 def _real(values: Response) -> Signal:

@@ -1,8 +1,8 @@
 """Multivariable Virtual Reference Feedback Tuning of one loop, with extended instrumental variables.
 
-Given one experiment {u, y} and a diagonal reference model M, the controller C(B) whose closed loop equals M turns the
-virtual error e_V = (M^-1 - I) y into u. All signals pass one scalar filter l, so that every filter is proper. The
-controller is linear in its gains, and the instrument is an external signal of the experiment at 2 l + 1 lags.
+Given one experiment {u, y} and a reference model M, diagonal or full, the controller C(B) whose closed loop equals M
+turns the virtual error e_V = (M^-1 - I) y into u. All signals pass one scalar filter l, so that every filter is proper.
+The controller is linear in its gains, and the instrument is an external signal of the experiment at 2 l + 1 lags.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.regression import Regression, Solution, solve
 from mimopilot.tuning.law import TERMS, Filters, regressors
+from mimopilot.tuning.reference_matrix import ReferenceMatrix, Wanted
 from mimopilot.tuning.reference_model import ReferenceModel
 
 Signal = NDArray[np.float64]
@@ -60,13 +61,15 @@ class LoopEstimate:
         return self.gains.get(term, np.zeros_like(first))
 
 
-def default_window(models: Sequence[ReferenceModel]) -> int:
+def default_window(models: Wanted) -> int:
     """Lags of the instrument: until the slowest reference model has decayed to `DECAY`."""
+    if isinstance(models, ReferenceMatrix):
+        return models.settling_samples(DECAY)
     return max(model.settling_samples(DECAY) for model in models)
 
 
-def virtual_signals(y: Signal, models: Sequence[ReferenceModel]) -> tuple[Signal, Signal, Signal, list[ReferenceModel]]:
-    """e_l, r_l and y_l for the filter l = product of the distinct models.
+def virtual_signals(y: Signal, models: Wanted) -> tuple[Signal, Signal, Signal, list[ReferenceModel]]:
+    """e_l, r_l and y_l for the filter l = product of the distinct models; for a full matrix l = det M.
 
     Returns
     -------
@@ -75,6 +78,9 @@ def virtual_signals(y: Signal, models: Sequence[ReferenceModel]) -> tuple[Signal
     factors : list of ReferenceModel
         The models whose product is l.
     """
+    if isinstance(models, ReferenceMatrix):
+        virtual, filtered = models.adjugate_response(y), models.determinant.response(y)
+        return virtual - filtered, virtual, filtered, [models.determinant]
     factors: list[ReferenceModel] = []
     for model in models:
         if model not in factors:
@@ -122,7 +128,7 @@ def vrft(
     u: Signal,
     y: Signal,
     instrument: Signal,
-    models: Sequence[ReferenceModel],
+    models: Wanted,
     terms: str,
     *,
     segments: Segments | None = None,
@@ -134,6 +140,7 @@ def vrft(
     external: Signal | None = None,
     repeated: Signal | None = None,
     prefilter: Callable[[Signal], Signal] | None = None,
+    emphasis: ReferenceModel | None = None,
     inverse: Sequence[ReferenceModel] | None = None,
     prior: Mapping[str, Signal] | None = None,
     pull: float = 0.0,
@@ -149,8 +156,8 @@ def vrft(
     instrument : (N, n_w) array
         Signal whose lags are the instruments: an external one (the injected excitation, or the setpoint), or `u`
         itself, the thesis' choice, which in closed loop contains fed-back noise.
-    models : sequence of n_y ReferenceModel
-        Complementary sensitivity asked of each output.
+    models : sequence of n_y ReferenceModel, or ReferenceMatrix
+        Complementary sensitivity asked of each output, or the whole matrix.
     terms : str
         Structure of the controller: ``P``, ``PI``, ``PID``, ``PIDF``...
     segments : sequence of (start, stop), optional
@@ -173,6 +180,9 @@ def vrft(
         are then the instruments instead of lags, and `instrument` is the external signal.
     prefilter : callable, optional
         Filter of every signal before l, such as `tuning.estimation.siso.prefilter`.
+    emphasis : ReferenceModel, optional
+        W(z) of the criterion (3.1), ||W (M - T)||: where it is large the loop follows M more closely, if the structure
+        cannot reach M. It filters every signal.
     inverse : sequence of n_u ReferenceModel, optional
         M_i of an inner loop: `u` then holds that loop's outputs, and M_i^-1 u is used.
     prior : mapping, optional
@@ -198,11 +208,19 @@ def vrft(
     if len(models) != y.shape[1]:
         raise TuningError(f"got {len(models)} reference models for {y.shape[1]} outputs, expected one for each")
     lags = default_window(models) if window is None else window
-    Ts = models[0].Ts
+    if isinstance(models, ReferenceMatrix):
+        Ts, transient = models.Ts, models.settling_samples()
+    else:
+        Ts, transient = models[0].Ts, sum(model.settling_samples() for model in dict.fromkeys(models))
     flown = filters or Filters(Ts)
-    drop = settling + sum(model.settling_samples() for model in dict.fromkeys(models))
+    drop = settling + transient + (emphasis.settling_samples() if emphasis else 0)
     needed = drop + 4 * lags
-    shaped = prefilter or (lambda signal: signal)
+    filters_before = [f for f in (emphasis.response if emphasis else None, prefilter) if f]
+
+    def shaped(signal: Signal) -> Signal:
+        for before in filters_before:
+            signal = before(signal)
+        return signal
 
     def regressor(output: Signal) -> tuple[Signal, list[ReferenceModel]]:
         e_l, r_l, y_l, factors = virtual_signals(shaped(output), models)

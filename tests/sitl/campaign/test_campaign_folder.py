@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from mimopilot.common.errors import Error
+from mimopilot.common.part_folder import PartFolder
 from mimopilot.sitl.campaign.execution import run_campaign
 from mimopilot.sitl.campaign.flights import CHUNK, fly_chunk
 from mimopilot.sitl.campaign.plan import LOCK, PARTS, RESULTS, make_plan, write_plan_files
@@ -48,7 +50,7 @@ def test_a_damaged_a_duplicate_and_a_foreign_part_are_flown_again_with_a_warning
     assert run_campaign(plan, folder, 1).read_bytes() == results
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith(
-        "parts: unusable parts are flown again: 0000001.part is damaged; 0000002.part is of runs 0 to 63; "
+        "parts: unusable parts are computed again: 0000001.part is damaged; 0000002.part is of runs 0 to 63; "
         "0000003.part is of another campaign"
     )
 
@@ -79,8 +81,8 @@ def test_undamaged_parts_are_not_flown_again(flown, tmp_path, capsys, monkeypatc
 HOLDER = """
 import sys
 from pathlib import Path
-from mimopilot.sitl.campaign.execution import _folder_lock
-with _folder_lock(Path(sys.argv[1])):
+from mimopilot.common.part_folder import folder_lock
+with folder_lock(Path(sys.argv[1]), "campaign.lock", "campaign"):
     print("alone", flush=True)
     sys.stdin.read()
 """
@@ -92,7 +94,7 @@ def test_a_second_campaign_in_a_folder_is_refused_until_the_first_ends_or_is_kil
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as first:
         assert first.stdout.readline() == "alone\n"
         with pytest.raises(
-            SitlError,
+            Error,
             match="c: another process writes a campaign into this folder; wait for it, or give another --out",
         ):
             run_campaign(plan, tmp_path / "c", 1)
@@ -105,7 +107,7 @@ def test_damage_between_flight_and_merge_is_reported(flown, tmp_path, monkeypatc
     plan, _, parts = flown
     folder = begin(plan, tmp_path, dict(enumerate(parts)))
     (folder / PARTS / "0000002.part").write_bytes(parts[2][:-1])
-    monkeypatch.setattr("mimopilot.sitl.campaign.execution._find_missing_chunks", lambda *_: ([], []))
+    monkeypatch.setattr(PartFolder, "missing", lambda *_: [])
     with pytest.raises(SitlError, match=r"0000002\.part is damaged; give the same command again"):
         run_campaign(plan, folder, 1)
 
