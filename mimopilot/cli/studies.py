@@ -12,7 +12,7 @@ from mimopilot.cli.options import AirframeArgument, AxisOption, FaultOption, Jso
 
 
 class Study(StrEnum):
-    """What can be reproduced: Chapter 5's benchmarks, Chapter 6's vehicles, and ours."""
+    """What can be reproduced: Chapter 5's benchmarks, Chapter 6's vehicles, ours, and random ones (not part of all)."""
 
     NUMERICAL_EXAMPLE = "numerical-example"
     LV100 = "lv100"
@@ -27,6 +27,7 @@ class Study(StrEnum):
     ADAM0_PERTURBED_THESIS = "adam0-perturbed-thesis"
     ANTR_THESIS = "antr-thesis"
     ALL = "all"
+    VEHICLES = "vehicles"
 
 
 def register(app: typer.Typer) -> None:
@@ -104,15 +105,27 @@ def reproduce(
     seeds: Annotated[
         int | None, typer.Option(min=1, help="Experiments of each vehicle, with other noise; 50 by default.")
     ] = None,
+    runs: Annotated[int | None, typer.Option(min=1, max=1_000_000, help="vehicles: how many; 500 by default.")] = None,
+    first: Annotated[int | None, typer.Option(min=0, help="vehicles: seed of the first one; 0 by default.")] = None,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the thesis' tables and figures again, beside its own figures."""
+    """Compute the thesis' tables and figures again, beside its own figures; vehicles: tune many random vehicles."""
     from mimopilot.common.console import print_json
-    from mimopilot.sitl.studies.reproduce import SEEDS, print_reproduction
-    from mimopilot.sitl.studies.reproduce import reproduce as compute
+    from mimopilot.common.errors import check_not_given
+    from mimopilot.sitl.studies.reproduction import print_reproduction
 
-    found = compute(study.value, out, seeds or SEEDS, workers)
+    if study is Study.VEHICLES:
+        from mimopilot.sitl.studies.vehicles import RUNS, reproduce_vehicles
+
+        check_not_given("only for experiments of the same vehicle; give --runs", seeds=seeds)
+        found = reproduce_vehicles(out, runs or RUNS, first or 0, workers)
+    else:
+        from mimopilot.sitl.studies.reproduce import SEEDS
+        from mimopilot.sitl.studies.reproduce import reproduce as compute
+
+        check_not_given("only for the study vehicles", runs=runs, first=first)
+        found = compute(study.value, out, seeds or SEEDS, workers)
     if as_json:
         print_json(found.as_json())
     else:

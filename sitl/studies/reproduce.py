@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mimopilot.common.console import print_table
 from mimopilot.common.files import inside
-from mimopilot.common.html_report import ReportTable, Section, write_report
+from mimopilot.common.html_report import Section, write_report
 from mimopilot.common.long_work import Piece, run_pieces
 from mimopilot.common.parallel import cores
 from mimopilot.sitl.studies.attitude_pieces import run_name, statistics, study_pieces
@@ -20,6 +19,7 @@ from mimopilot.sitl.studies.benchmark_studies import study_lv100, study_numerica
 from mimopilot.sitl.studies.expectations import expectations, expectations_table
 from mimopilot.sitl.studies.printed_figures import summary_table
 from mimopilot.sitl.studies.report_part import ReportPart
+from mimopilot.sitl.studies.reproduction import Reproduction
 
 #: Noise seeds of the attitude studies; the expectations apply to the medians over them.
 SEEDS = 50
@@ -41,19 +41,6 @@ PRINTED = (
     "J_M,o of MIMO over SISO's: printed, with the gains tuned here, and with the printed gains flown here. Each method "
     "is compared with the reference model that it was tuned for."
 )
-
-
-@dataclass(frozen=True)
-class Reproduction:
-    """Result of `reproduce`: figures for ``--json``, tables, and the path of the report."""
-
-    figures: dict[str, Any]
-    tables: tuple[ReportTable, ...]
-    report: Path
-
-    def as_json(self) -> dict[str, Any]:
-        """The object that ``--json`` prints."""
-        return {**self.figures, "report": str(self.report)}
 
 
 def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = None) -> Reproduction:
@@ -143,10 +130,3 @@ def _write(out: Path, name: str, parts: Mapping[str, ReportPart]) -> Reproductio
     write_report(report, f"mimopilot reproduce {name}", lead, sections)
     tables = tuple(table for section in sections for table in section.tables)
     return Reproduction({study: part.figures for study, part in parts.items()}, tables, report)
-
-
-def print_reproduction(found: Reproduction) -> None:
-    """Print the tables and the path of the report."""
-    for table in found.tables:
-        print_table(table.caption, table.columns, table.rows)
-    print(f"report  {found.report}")
