@@ -121,10 +121,10 @@ def reproduce(
         check_not_given("only for experiments of the same vehicle; give --runs", seeds=seeds)
         found = reproduce_vehicles(out, runs or RUNS, first or 0, workers)
     else:
+        check_not_given("only for the study vehicles", runs=runs, first=first)
         from mimopilot.sitl.studies.reproduce import SEEDS
         from mimopilot.sitl.studies.reproduce import reproduce as compute
 
-        check_not_given("only for the study vehicles", runs=runs, first=first)
         found = compute(study.value, out, seeds or SEEDS, workers)
     if as_json:
         print_json(found.as_json())

@@ -28,10 +28,10 @@ MODE_WITHIN = 0.10
 MODE = "mode of the frame"
 #: Beginning of each reason to keep the flown gains -> name of its kind.
 KEEP = {
-    "it follows": "keep: follows no better",
-    "it moves the other axis": "keep: moves the other axis more",
-    "its margin is thinner": "keep: thinner margin",
-    "it drives the motors": "keep: more noise",
+    "it follows": "follows no better",
+    "it moves the other axis": "moves the other axis more",
+    "its margin is thinner": "thinner margin",
+    "it drives the motors": "more noise",
 }
 #: Text in a refusal -> name of its kind; the first that fits.
 REFUSALS = {
@@ -47,6 +47,9 @@ REFUSALS = {
     "encircles": "unstable",
     "not positive in every direction": "integral not positive",
 }
+
+#: Outcomes of a run, see `sitl.studies.vehicle_run.run_vehicle`.
+OUTCOMES = ("certified", "keep", "refused")
 
 Run = Mapping[str, Any]
 
@@ -92,7 +95,7 @@ def kinds(run: Run) -> list[str]:
 
 
 def _keep_kind(reason: str) -> str:
-    return next((name for begin, name in KEEP.items() if reason.startswith(begin)), "keep: other")
+    return next((name for begin, name in KEEP.items() if reason.startswith(begin)), "other")
 
 
 def can_improve(run: Run) -> bool:
@@ -215,16 +218,17 @@ def bars_table(found: Sequence[Bar]) -> ReportTable:
 
 
 def outcomes_table(runs: Sequence[Run]) -> ReportTable:
-    """How often each outcome and each kind of reason occurs; of those, how many could be improved."""
-    counts: Counter[str] = Counter()
-    improvable: Counter[str] = Counter()
-    for run in runs:
-        reasons = [] if run["outcome"] == "certified" else [f"- {name}" for name in kinds(run)]
-        for name in (run["outcome"], *reasons):
-            counts[name] += 1
-            improvable[name] += can_improve(run)
-    order = sorted(counts, key=lambda name: (-counts[name], name))
-    rows = [[name, str(counts[name]), str(improvable[name])] for name in order]
+    """How often each outcome and each kind of reason occurs; of those, how many could be improved.
+
+    A run may have several reasons to keep the flown gains.
+    """
+    rows = []
+    for outcome in OUTCOMES:
+        those = [run for run in runs if run["outcome"] == outcome]
+        rows.append([outcome, str(len(those)), str(sum(map(can_improve, those)))])
+        named = [(name, can_improve(run)) for run in those if outcome != OUTCOMES[0] for name in kinds(run)]
+        for name, count in sorted(Counter(name for name, _ in named).items(), key=lambda item: (-item[1], item[0])):
+            rows.append([f"- {name}", str(count), str(named.count((name, True)))])
     return ReportTable("Outcomes and reasons", ("outcome", "runs", "of these improvable"), rows)
 
 
