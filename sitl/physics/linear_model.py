@@ -42,8 +42,7 @@ def linear_model(airframe: Airframe, Ts: float) -> StateSpace:
 
 def _on_both_axes(matrix: Signal) -> Signal:
     """A matrix of one axis for roll and pitch, signal by signal."""
-    both: Signal = np.kron(matrix, np.eye(2))
-    return both
+    return np.kron(matrix, np.eye(2)).astype(np.float64)
 
 
 def control_effectiveness(airframe: Airframe) -> Signal:
