@@ -36,16 +36,19 @@ def linear_model(airframe: Airframe, Ts: float) -> StateSpace:
     sensors = _gyro(airframe.gyro_cutoff_hz, Ts)
     if airframe.frame is not None:
         sensors = _series(_frame(airframe.frame, Ts), sensors)
-    A, B, C, D = (
-        np.kron(matrix, np.eye(2)).astype(np.float64) for matrix in (sensors.A, sensors.B, sensors.C, sensors.D)
-    )
+    A, B, C, D = map(_on_both_axes, (sensors.A, sensors.B, sensors.C, sensors.D))
     return _series(body, StateSpace(A, B, C, D, Ts))
+
+
+def _on_both_axes(matrix: Signal) -> Signal:
+    """A matrix of one axis for roll and pitch, signal by signal."""
+    return np.kron(matrix, np.eye(2)).astype(np.float64)
 
 
 def control_effectiveness(airframe: Airframe) -> Signal:
     """Angular acceleration about roll and pitch per unit of torque, (2, 2), rad/s^2."""
-    effect: Signal = airframe.plant().inertia_inverse[:2, :2] * np.array(airframe.moment_scale()[:2])
-    return effect
+    B: Signal = airframe.plant().inertia_inverse[:2, :2] * np.array(airframe.moment_scale()[:2])
+    return B
 
 
 def _body(airframe: Airframe, Ts: float) -> StateSpace:

@@ -24,8 +24,8 @@ REFUSED_OF_ALL, REFUSED_OF_CALM, CALM, LONG = 0.40, 0.15, 0.02, 30.0
 MS_WITHIN, MS_SHARE = 0.10, 0.95
 #: Relative difference of the frequency that a refusal names to that of the frame mode.
 MODE_WITHIN = 0.10
-#: What stands in a refusal because of a frame mode.
-MODE = "mode of the frame"
+#: What stands in a refusal because of a frame mode; what a refusal's reason ends with.
+MODE, LIMITS = "mode of the frame", "; the design is limited by"
 #: Beginning of each reason to keep the flown gains -> name of its kind.
 KEEP = {
     "it follows": "follows no better",
@@ -89,7 +89,7 @@ class Bar:
 def kinds(run: Run) -> list[str]:
     """Kinds of the reasons of a run that was not certified as better."""
     if run["outcome"] == "refused":
-        text = run["reasons"][0]
+        text = run["reasons"][0].partition(LIMITS)[0]
         return [next((name for part, name in REFUSALS.items() if part in text), "other")]
     return [_keep_kind(reason) for reason in run["reasons"]]
 
@@ -111,8 +111,8 @@ def false_reason(run: Run) -> str:
     has one at that frequency. The others are about the log, not the vehicle: they count as true.
     """
     if run["outcome"] == "refused":
-        text = run["reasons"][0]
-        return _wrong_mode(run, text) if MODE in text and _named_hz(text) else ""
+        text = run["reasons"][0].partition(LIMITS)[0]
+        return _wrong_mode(run, text) if MODE in text else ""
     true = {_keep_kind(reason) for reason in run["tuned"]["true_reasons"]}
     return "" if true & set(kinds(run)) else f"on the true plant not so: {'; '.join(run['reasons'])}"
 
@@ -125,9 +125,9 @@ def _wrong_mode(run: Run, text: str) -> str:
     """Why a refusal because of a frame mode is wrong about its frequency; empty when it is right."""
     frame, named = run["vehicle"]["frame"], _named_hz(text)
     if frame is None:
-        return f"names a frame mode at {named}, and the vehicle has none"
-    if not named:
-        return "names no frequency"
+        return "names a frame mode, and the vehicle has none"
+    if "notch" not in text or not named:
+        return "names no notch, or no frequency"
     true = frame["frequency_hz"]
     right = any(abs(hz / true - 1) <= MODE_WITHIN for hz in named)
     return "" if right else f"names {', '.join(f'{hz:g}' for hz in named)} Hz, the mode is at {true:.1f} Hz"
@@ -179,8 +179,7 @@ def bars(runs: Sequence[Run]) -> list[Bar]:
         return "; ".join(shortfalls(run)) if run["outcome"] == "certified" else false_reason(run)
 
     def notch(run: Run) -> str:
-        texts = [text for text in run["reasons"] if "notch" in text]
-        return _wrong_mode(run, texts[0]) if texts else "names no notch"
+        return _wrong_mode(run, "; ".join(text.partition(LIMITS)[0] for text in run["reasons"]))
 
     def unstable(run: Run) -> str:
         radius = run["tuned"]["spectral_radius"]

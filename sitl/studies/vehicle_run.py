@@ -243,6 +243,7 @@ def _tuned_figures(
         "verdict": str(tuned.certificate.verdict),
         "certified_Ms": tuned.certificate.figures["Ms"],
         "certified_Ms_error": tuned.certificate.figures["Ms_error"],
+        "band": list(tuned.certificate.band),
         "Ms": truth.sensitivity_peak(tuned),
         "spectral_radius": truth.spectral_radius(tuned),
         "noise_ratio": _noise_ratio(ours, before),
