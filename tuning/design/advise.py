@@ -137,9 +137,7 @@ def advise(
         limits = spec.design.model_copy(update={"noise": one.noise})
         start = replace(best, filters=replace(best.filters, derivative_cutoff_hz=one.cutoff_hz))
         try:
-            design = ResponseDesign.of([measured], limits).design(
-                [start], spec.structure, one.full, one.bandwidth, deviations=False
-            )
+            design = ResponseDesign.of([measured], limits).design([start], spec.structure, one.full, one.bandwidth)
         except TuningError as error:
             refused[one.name] = str(error)
             continue

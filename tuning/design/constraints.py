@@ -133,18 +133,21 @@ class NoiseLimit:
     ----------
     limit : (2,) array
         RMS (normalised).
+    above : float, rad/s
+        Only the noise at higher frequencies counts.
     """
 
     limit: Signal
+    above: float = 0.0
     name: str = "noise of the torque"
 
     def margin(self, loop: LoopGradient) -> float:
         """See `Constraint`."""
-        return float(1 - np.max(loop.noise_rms / self.limit))
+        return float(1 - np.max(loop.noise_rms(self.above) / self.limit))
 
     def add(self, problem: ConicProblem, loop: LoopGradient) -> None:
         """See `Constraint`."""
-        weight = np.sqrt(loop.plant.noise_weight)[:, None]
+        weight = np.sqrt(np.where(loop.plant.omega > self.above, loop.plant.noise_weight, 0.0))[:, None]
         n, d = problem.size, loop.dnoise
         for axis, limit in enumerate(self.limit):
             value = (weight * loop.noise[:, axis]).ravel() / limit
@@ -240,8 +243,11 @@ def structural_modes(plant: WideResponse, others: NDArray[np.bool_] | None = Non
     rises = rises[response.omega[rises] > RIGID]
     near = np.abs(np.log(response.omega[:, None] / response.omega[rises])).min(axis=1, initial=np.inf) < AROUND
     which = seen & near if others is None else seen & near | others
+    hertz = response.omega[rises[np.argmax(gain[rises])]] / (2 * np.pi) if len(rises) else 0.0
     return GainLimit(
-        "a mode of the frame",
+        f"a mode of the frame at {hertz:.0f} Hz: set a notch there (PX4: IMU_GYRO_NF0_FRQ, ArduPilot: INS_HNTCH_FREQ)"
+        if len(rises)
+        else "the error of the response above the crossover",
         response.omega[which],
         response.G_i[which],
         deviation[which],

@@ -154,10 +154,10 @@ class LoopGradient:
         N = self.plant.noise
         return self.S @ (self.C_y @ N[:, :2] + self.C_o @ N[:, 2:])
 
-    @cached_property
-    def noise_rms(self) -> Signal:
-        """RMS of u at hover (normalised) that noise causes, (2,)."""
-        rms: Signal = np.sqrt(self.plant.noise_weight @ np.sum(np.abs(self.noise) ** 2, axis=2))
+    def noise_rms(self, above: float = 0.0) -> Signal:
+        """RMS of u at hover (normalised) that noise causes at frequencies above one (rad/s), (2,)."""
+        weight = np.where(self.plant.omega > above, self.plant.noise_weight, 0.0)
+        rms: Signal = np.sqrt(weight @ np.sum(np.abs(self.noise) ** 2, axis=2))
         return rms
 
     def loop_error(self, whole: bool) -> Signal:

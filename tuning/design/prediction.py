@@ -23,6 +23,8 @@ DECOUPLED = 0.1
 
 #: Least bandwidth over that of flown gains which keep the limit of Ms: a pilot feels a fifth.
 SLOWEST = 0.8
+#: rad/s. Noise above it is that of sensors and vibration: gusts are slower.
+FAST = 30.0
 #: Share of a limit within which a design keeps it.
 ROUNDING = 0.01
 
@@ -41,6 +43,8 @@ class Prediction:
         RMS of the angles over 1 s after a step of torque that accelerates by 1.5 rad/s^2.
     noise : tuple of 2 float
         RMS of the torque (normalised) at hover that the log's noise causes.
+    fast_noise : tuple of 2 float
+        Its part above 30 rad/s, from sensors and vibration: gusts cause the rest.
     Ms : float
         Largest singular value of the sensitivity, cut at the torques.
     """
@@ -49,6 +53,7 @@ class Prediction:
     offaxis_deg: Pair
     disturbance_deg: Pair
     noise: Pair
+    fast_noise: Pair
     Ms: float
 
 
@@ -66,12 +71,14 @@ def predict(gains: Gains, plant: WideResponse, task: Manoeuvres) -> Prediction:
     loop = LoopGradient(plant, free, free.vector(gains))
     follow = [_rms(np.abs(loop.T[:, i, i] - task.target) ** 2, task) for i in range(2)]
     offaxis = [_rms(np.abs(loop.T[:, 1 - i, i]) ** 2, task) for i in range(2)]
+    noise, fast = loop.noise_rms(), loop.noise_rms(FAST)
     disturbance = np.degrees(np.sqrt(np.einsum("ki,kji->i", task.step, np.abs(loop.D) ** 2) / TAIL))
     return Prediction(
         follow_deg=(follow[0], follow[1]),
         offaxis_deg=(offaxis[0], offaxis[1]),
         disturbance_deg=(float(disturbance[0]), float(disturbance[1])),
-        noise=(float(loop.noise_rms[0]), float(loop.noise_rms[1])),
+        noise=(float(noise[0]), float(noise[1])),
+        fast_noise=(float(fast[0]), float(fast[1])),
         Ms=_peak(loop),
     )
 
@@ -131,7 +138,8 @@ def reasons_to_keep(
             reasons.append(f"it moves the other axis more ({offaxis:.2f} degrees, flown {before:.2f})")
         if ours.Ms > max(Ms, theirs.Ms) * (1 + ROUNDING):
             reasons.append(f"its margin is thinner (Ms {ours.Ms:.2f}, flown {theirs.Ms:.2f})")
-        ratio = max(a / b for a, b in zip(ours.noise, theirs.noise, strict=True))
+        pairs = [*zip(ours.noise, theirs.noise, strict=True), *zip(ours.fast_noise, theirs.fast_noise, strict=True)]
+        ratio = max(a / b for a, b in pairs)
         if ratio > noise * (1 + ROUNDING):
             reasons.append(f"it drives the motors with {ratio:.2f} times the noise of the flown gains")
     return list(dict.fromkeys(reasons))

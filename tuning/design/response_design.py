@@ -31,7 +31,7 @@ from mimopilot.tuning.design.constraints import (
 from mimopilot.tuning.design.descent import INFEASIBLE, LARGEST_RADIUS, DesignTask, PlantTask, descend
 from mimopilot.tuning.design.free_gains import FreeGains, free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
-from mimopilot.tuning.design.prediction import SLOWEST, bandwidth, sensitivity_peak
+from mimopilot.tuning.design.prediction import FAST, SLOWEST, bandwidth, sensitivity_peak
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS
@@ -95,9 +95,8 @@ class Design:
         Sum of the relative violations of the constraints, 0 if all hold.
     active : list of str
         What limits the design, the tightest first.
-    deviations : mapping
-        Matrix -> (2, 2) standard deviations in its unit: the spread to expect if the flight were repeated. Empty if
-        they were not asked for.
+    task, vector : DesignTask and (n,) array
+        What was solved, and its solution.
     vehicle_damps : bool
         Whether a negative derivative gain would follow better.
     """
@@ -107,8 +106,9 @@ class Design:
     cost: float
     violation: float
     active: list[str]
-    deviations: dict[str, Signal]
     vehicle_damps: bool
+    task: DesignTask
+    vector: Signal
 
     @property
     def feasible(self) -> bool:
@@ -126,8 +126,8 @@ class ResponseDesign:
         One for each log.
     experiments : sequence of Experiment
     limits : DesignLimits
-    noise : sequence of (2,) array
-        RMS of the torque at hover under the flown gains, for each log.
+    noise : sequence of (2, 2) array
+        RMS of the torque at hover under the flown gains, for each log: all of it, and its part above `FAST`.
     limited : sequence of (K,) bool array
         Frequencies of each measured response at which the rate loop's gain is limited, whatever the fitted body says.
     flown_bandwidth : float or None, rad/s
@@ -188,7 +188,6 @@ class ResponseDesign:
         structure: str,
         full: bool,
         bandwidth: float | None = None,
-        deviations: bool = True,
     ) -> Design:
         """The best gains for the best bandwidth.
 
@@ -203,8 +202,6 @@ class ResponseDesign:
             False: the diagonals only (SISO).
         bandwidth : float, rad/s, optional
             Of the attitude model; by default it is found.
-        deviations : bool
-            Compute the standard deviations: as many steps as `DRAWS`.
         """
         free = free_gains(starts[0], self.plants[0].body, structure, full)
         first = self.flown_bandwidth or FIRST_BANDWIDTH
@@ -221,7 +218,8 @@ class ResponseDesign:
             cost=task.cost(vector),
             violation=task.violation(vector),
             active=task.active(vector, ACTIVE),
-            deviations=self._deviations(task, vector) if deviations else {},
+            task=task,
+            vector=vector,
             vehicle_damps=_vehicle_damps(task, vector),
         )
 
@@ -253,8 +251,12 @@ class ResponseDesign:
             best += 1
         return BANDWIDTHS[best], *found[best][1:]
 
-    def _deviations(self, task: DesignTask, vector: Signal) -> dict[str, Signal]:
-        """Standard deviation of each free matrix: of the steps that plants drawn from the response's errors ask for."""
+    def deviations(self, design: Design) -> dict[str, Signal]:
+        """Matrix -> (2, 2) standard deviations in its unit: the spread to expect if the flight were repeated.
+
+        Of the steps that plants drawn from the errors of the response ask for.
+        """
+        task, vector = design.task, design.vector
         generator = np.random.default_rng(0)
         around = task.step(vector, LARGEST_RADIUS)
         steps = [self._drawn(task, generator).step(vector, LARGEST_RADIUS) - around for _ in range(DRAWS)]
@@ -269,8 +271,11 @@ class ResponseDesign:
         plants = []
         for one, experiment in zip(task.plants, self.experiments, strict=True):
             plant = one.plant.draw(generator)
-            noise = NoiseLimit(self.limits.noise * flown_noise(experiment, plant))
-            limits = [noise if isinstance(limit, NoiseLimit) else limit for limit in one.constraints]
+            parts = iter(self.limits.noise * flown_noise(experiment, plant))
+            limits = [
+                replace(limit, limit=next(parts)) if isinstance(limit, NoiseLimit) else limit
+                for limit in one.constraints
+            ]
             plants.append(replace(one, plant=plant, constraints=limits))
         return replace(task, plants=plants)
 
@@ -294,7 +299,7 @@ class ResponseDesign:
         found: list[Constraint] = [
             *(Distance(cut, slice(0, plant.band.stop), floor) for cut in Cut),
             Distance(Cut.TORQUE, begin, 1 / (SHARE * MAX_SENSITIVITY_BELOW_BAND)),
-            NoiseLimit(self.limits.noise * noise),
+            *(NoiseLimit(self.limits.noise * part, above) for part, above in zip(noise, (0.0, FAST), strict=True)),
             gain_above_band(plant),
             structural_modes(plant, self.limited[place]),
             Definite(ATTITUDE.matrix, np.eye(2), 0.0),
@@ -310,11 +315,16 @@ class ResponseDesign:
 
 
 def flown_noise(experiment: Experiment, plant: WideResponse) -> Signal:
-    """RMS of the torque at hover (normalised) under the flown gains, (2,); as recorded where they are not known."""
+    """RMS of the torque at hover (normalised) under the flown gains, all of it and its part above `FAST`, (2, 2).
+
+    As recorded where the flown gains are not known.
+    """
     if experiment.flown is None:
-        return flown_torque_noise(experiment, plant.response, plant.omega)
-    free = free_gains(replace(experiment.flown, filters=replace(experiment.flown.filters, Ts=plant.Ts)), plant.body)
-    return LoopGradient(plant, free, free.vector(experiment.flown)).noise_rms
+        return np.array([flown_torque_noise(experiment, plant.response, plant.omega, above) for above in (0.0, FAST)])
+    filters = replace(experiment.flown.filters, Ts=plant.Ts)
+    free = free_gains(replace(experiment.flown, filters=filters), plant.body)
+    loop = LoopGradient(plant, free, free.vector(experiment.flown))
+    return np.array([loop.noise_rms(above) for above in (0.0, FAST)])
 
 
 def flown_amplitude(experiment: Experiment) -> float:

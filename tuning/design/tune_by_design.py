@@ -70,7 +70,7 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
         method=spec.method,
         inner_model=(inner, inner),
         outer_model=(found.model, found.model),
-        standard_deviation={name: value.tolist() for name, value in found.deviations.items()},
+        standard_deviation={name: value.tolist() for name, value in bench.deviations(found).items()},
         warnings=tuple(warnings),
         details={
             "structure": spec.structure,
@@ -175,7 +175,7 @@ def comparison(
     new = [predict(found.gains, *task) for task in tasks]
     shown = {"tuned": new}
     if spec.method == "mimo":
-        siso = bench.design([found.gains], spec.structure, full=False, bandwidth=found.model.omega, deviations=False)
+        siso = bench.design([found.gains], spec.structure, full=False, bandwidth=found.model.omega)
         shown["siso"] = [predict(siso.gains, *task) for task in tasks]
     result: dict[str, Any] = {}
     flown = [one.experiment.flown for one in measured]

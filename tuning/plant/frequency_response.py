@@ -59,6 +59,9 @@ class PlantResponse:
         Multiple coherence of each rate with the excitation.
     Ts : float, s
         Sampling period.
+    angle_noise : (K, 2, 6) array or None
+        Rows of the noise's root for the angles as measured; None: those of `root`. They differ where G_o is the
+        integrated rate response, whose error is not that of the angles.
     """
 
     omega: Signal
@@ -68,6 +71,7 @@ class PlantResponse:
     reach: Complex
     coherence: Signal
     Ts: float
+    angle_noise: Complex | None = None
 
     def deviation(self) -> Signal:
         """Standard deviation of each element of G_i, (K, 2, 2)."""
@@ -120,7 +124,7 @@ class PlantResponse:
 
     def at(self, which: NDArray[np.bool_] | NDArray[np.intp]) -> PlantResponse:
         """The response at some of the frequencies."""
-        arrays = {name: value[which] for name, value in vars(self).items() if name != "Ts"}
+        arrays = {name: value[which] for name, value in vars(self).items() if name != "Ts" and value is not None}
         return PlantResponse(Ts=self.Ts, **arrays)
 
     def extended(self) -> PlantResponse:
@@ -292,7 +296,8 @@ def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
     root = plant.root.copy()
     root[:, 4:] = np.where(better[:, None, None], change * root[:, 2:4], root[:, 4:])
     G_o = np.where(better[:, None, None], change * plant.G_i, plant.G_o)
-    return replace(plant, G_o=G_o, root=root)
+    measured = plant.root[:, 4:] - plant.G_o @ plant.root[:, :2]
+    return replace(plant, G_o=G_o, root=root, angle_noise=measured)
 
 
 def hermitian_root(matrices: Complex) -> Complex:

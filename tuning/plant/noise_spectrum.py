@@ -36,13 +36,8 @@ def noise_root(experiment: Experiment, plant: PlantResponse, omega: Signal) -> C
     (K, 4, 4) array
         R with R R^H the spectrum, rad/s and rad; a variance is Ts / pi times its integral from 0 to pi / Ts.
     """
-    residual = np.concatenate(
-        [
-            plant.root[:, 2:4] - plant.G_i @ plant.root[:, :2],
-            plant.root[:, 4:] - plant.G_o @ plant.root[:, :2],
-        ],
-        axis=1,
-    )
+    of_angles = plant.root[:, 4:] - plant.G_o @ plant.root[:, :2] if plant.angle_noise is None else plant.angle_noise
+    residual = np.concatenate([plant.root[:, 2:4] - plant.G_i @ plant.root[:, :2], of_angles], axis=1)
     inside = residual @ residual.conj().transpose(0, 2, 1)
     spectrum = inside[np.abs(plant.omega[:, None] - omega).argmin(axis=0)]
     above = omega > plant.omega[-1]
@@ -51,13 +46,15 @@ def noise_root(experiment: Experiment, plant: PlantResponse, omega: Signal) -> C
     return hermitian_root(spectrum)
 
 
-def flown_torque_noise(experiment: Experiment, plant: PlantResponse, omega: Signal) -> Signal:
+def flown_torque_noise(experiment: Experiment, plant: PlantResponse, omega: Signal, lowest: float = 0.0) -> Signal:
     """RMS of the torque (normalised) that noise caused in the flight, for each axis, (2,): its excitation is left out.
 
     Parameters
     ----------
     experiment, plant, omega
         See `noise_root`; `omega` reaches the Nyquist frequency.
+    lowest : float, rad/s
+        Only the noise at higher frequencies counts.
     """
     root = plant.root[:, :2]
     power = np.einsum("kij,kij->ki", root, root.conj()).real
@@ -67,6 +64,7 @@ def flown_torque_noise(experiment: Experiment, plant: PlantResponse, omega: Sign
         signal, name = external_signal(experiment)
         torque = experiment.u - signal if name == "u_bar" else experiment.u
         density[above] = np.einsum("kii->ki", _welch(experiment, torque, omega[above])).real
+    density[omega <= lowest] = 0.0
     return np.asarray(np.sqrt(np.trapezoid(density, omega, axis=0) * experiment.Ts / np.pi))
 
 

@@ -120,7 +120,9 @@ def rigid_body(plant: PlantResponse) -> RigidBody:
 
 
 def continued_below(plant: PlantResponse, body: RigidBody) -> PlantResponse:
-    """The response continued below its lowest frequency as the fitted rigid body, down to `LOWEST`.
+    """The response continued below its band as the fitted rigid body, down to `LOWEST`.
+
+    Where the band begins with errors above `DEVIATION` the body is the better estimate and replaces the response.
 
     Parameters
     ----------
@@ -128,6 +130,8 @@ def continued_below(plant: PlantResponse, body: RigidBody) -> PlantResponse:
     body : RigidBody
         Fit of the same response.
     """
+    sure = np.flatnonzero(plant.rate_error() < DEVIATION)
+    plant = plant.at(np.arange(sure[0] if len(sure) else 0, len(plant.omega)))
     first = float(plant.omega[0])
     if first <= LOWEST:
         return plant

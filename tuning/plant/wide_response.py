@@ -14,7 +14,7 @@ from mimopilot.tuning.plant.local_polynomial import FREEDOM
 from mimopilot.tuning.plant.noise_spectrum import noise_root
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, ResponseShape, fit_shape, shape_response
-from mimopilot.tuning.plant.rigid_body_fit import RigidBody, continued_below
+from mimopilot.tuning.plant.rigid_body_fit import DEVIATION, RigidBody, continued_below
 
 #: Largest relative step between neighbouring frequencies.
 STEP = 0.05
@@ -110,7 +110,8 @@ def wide_response(measured: PlantEstimates) -> WideResponse:
     ratio = np.mean(dense.G_i[end] / _column(shape_response(dense.omega[end], shape)), axis=0)
     above = ratio * _column(shape_response(high, shape))
     omega = np.concatenate([dense.omega, high])
-    band = slice(int(np.searchsorted(omega, known.omega[0])), len(dense.omega))
+    first = known.omega[known.rate_error() < DEVIATION][:1]
+    band = slice(int(np.searchsorted(omega, first[0] if len(first) else known.omega[0])), len(dense.omega))
     error_i = np.zeros((len(omega), 2, 6), complex)
     error_o, reach = np.zeros_like(error_i), np.zeros((len(omega), 2, 2), complex)
     error_i[: band.stop] = dense.root[:, 2:4] - dense.G_i @ dense.root[:, :2]

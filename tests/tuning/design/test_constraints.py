@@ -100,7 +100,7 @@ def test_a_step_that_keeps_the_convex_constraint_keeps_the_distance(plant, free,
 def test_margins_are_relative_distances_to_the_limits(plant, free):
     vector, limits = free.vector(free.base), constraints(plant)
     loop = LoopGradient(plant, free, vector)
-    assert limits["noise"].margin(loop) == pytest.approx(1 - loop.noise_rms.max() / 0.008)
+    assert limits["noise"].margin(loop) == pytest.approx(1 - loop.noise_rms().max() / 0.008)
     ratio = limits["integral"].margin(loop) * np.abs(plant.body.B).max() * free.units["Ki_i"] + 1.0
     product = plant.body.B @ free.base.Ki_i
     assert ratio == pytest.approx(np.linalg.eigvalsh((product + product.T) / 2)[0])

@@ -88,4 +88,4 @@ def test_the_noise_of_the_torque_is_the_integral_of_its_spectrum(plant, gains):
     plain = dataclasses.replace(gains, Kp_i=0.15 * np.eye(2), Ki_i=np.zeros((2, 2)), Kd_i=np.zeros((2, 2)))
     free = free_gains(plain, plant.body)
     # The grid begins at 0.1 rad/s and ends just below the Nyquist frequency.
-    assert LoopGradient(silent, free, free.vector(plain)).noise_rms == pytest.approx(0.15 * 0.01, rel=1e-3)
+    assert LoopGradient(silent, free, free.vector(plain)).noise_rms() == pytest.approx(0.15 * 0.01, rel=1e-3)
