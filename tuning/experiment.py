@@ -13,6 +13,9 @@ from mimopilot.tuning.motors import Motors
 
 Signal = NDArray[np.float64]
 
+#: Share of the samples that are within the size of a flight's manoeuvres.
+NEARLY_ALL = 0.999
+
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
@@ -40,6 +43,8 @@ class Experiment:
         How the allocator drove the motors. None: not logged.
     warnings : tuple of str
         Defects of a usable log: damage, parameters that changed.
+    amplitude : float or None, rad
+        Size of the manoeuvres of the whole flight, also outside of the experiment. None: not known.
 
     Raises
     ------
@@ -60,6 +65,7 @@ class Experiment:
     flown: Gains | None = None
     motors: Motors | None = None
     warnings: tuple[str, ...] = ()
+    amplitude: float | None = None
 
     def __post_init__(self) -> None:
         if not self.segments:
@@ -102,3 +108,8 @@ def external_signal(experiment: Experiment) -> tuple[Signal, str]:
         f"{experiment.source}: no excitation: neither an injected torque nor a varying attitude setpoint is logged; "
         "fly an experiment with a torque injected on roll, then on pitch"
     )
+
+
+def manoeuvre_size(angles: Signal) -> float:
+    """Size (rad) of the manoeuvres in angles (N, 2): their largest distance from the median, but for rare outliers."""
+    return float(np.quantile(np.abs(angles - np.median(angles, axis=0)), NEARLY_ALL, axis=0).max())

@@ -21,8 +21,8 @@ TAIL = 1.0
 #: Off-axis RMS of a 10 degree doublet below which sets count as equally decoupled, deg: no pilot sees it.
 DECOUPLED = 0.1
 
-#: Least bandwidth over that of flown gains which keep the limit of Ms: a pilot feels a fifth.
-SLOWEST = 0.8
+#: Least bandwidth over that of flown gains which keep the limit of Ms: nobody wants a slower vehicle.
+SLOWEST = 1.0
 #: rad/s. Noise above it is that of sensors and vibration: gusts are slower.
 FAST = 30.0
 #: Share of a limit within which a design keeps it.

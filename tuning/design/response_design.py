@@ -32,7 +32,7 @@ from mimopilot.tuning.design.descent import INFEASIBLE, LARGEST_RADIUS, DesignTa
 from mimopilot.tuning.design.free_gains import FreeGains, free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.design.prediction import FAST, SLOWEST, bandwidth, sensitivity_peak
-from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.experiment import Experiment, manoeuvre_size
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS
 from mimopilot.tuning.motors import Motors
@@ -57,8 +57,6 @@ ROUGHLY, EXACTLY = 2e-2, 1e-4
 MIN_INTEGRAL_RATIO = 0.1
 #: Range of the manoeuvres' size, rad (5 to 30 degrees): what moved in the flight, within a normal flight's attitudes.
 AMPLITUDES = (np.radians(5.0), np.radians(30.0))
-#: Share of the samples with a smaller angle than the flown amplitude.
-NEARLY_ALL = 0.999
 #: Motors of a log that does not hold their commands: a quadrotor, X, that hovers at half thrust.
 USUAL_MOTORS = Motors(np.array([[-0.5, 0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, -0.5]]), np.full(4, 0.5))
 #: Share of a motor's range that the doublets may use.
@@ -309,8 +307,17 @@ class ResponseDesign:
         if TERMS["D"].matrix in free.units:
             found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(2))]
         motors = experiment.motors or USUAL_MOTORS
-        room = RANGE * np.column_stack([motors.hover, 1 - motors.hover])
-        found.append(MotorLimit(doublet_torque(plant, flown_amplitude(experiment)), motors.mixer, room))
+        limit = MotorLimit(
+            doublet_torque(plant, flown_amplitude(experiment)),
+            motors.mixer,
+            RANGE * np.column_stack([motors.hover, 1 - motors.hover]),
+        )
+        if experiment.flown is not None:
+            # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
+            flown = free_gains(experiment.flown, plant.body)
+            used = 1 - limit.margin(LoopGradient(plant, flown, flown.vector(experiment.flown)))
+            limit = replace(limit, room=limit.room * max(1.0, used))
+        found.append(limit)
         return found
 
 
@@ -328,13 +335,12 @@ def flown_noise(experiment: Experiment, plant: WideResponse) -> Signal:
 
 
 def flown_amplitude(experiment: Experiment) -> float:
-    """Size of the flown manoeuvres, rad: of the angles and of their setpoints, within `AMPLITUDES`."""
-    sizes = []
-    for signal in (experiment.y_o, experiment.r_o):
-        if signal is not None:
-            used = np.vstack([signal[start:stop] for start, stop in experiment.segments])
-            sizes.append(float(np.quantile(np.abs(used - np.median(used, axis=0)), NEARLY_ALL, axis=0).max()))
-    return float(np.clip(max(sizes), *AMPLITUDES))
+    """Size of the flown manoeuvres, rad, within `AMPLITUDES`."""
+    size = experiment.amplitude
+    if size is None:
+        used = np.concatenate([experiment.y_o[start:stop] for start, stop in experiment.segments])
+        size = manoeuvre_size(used)
+    return float(np.clip(size, *AMPLITUDES))
 
 
 def _scaled(task: DesignTask, start: Gains) -> Signal:

@@ -10,7 +10,7 @@ import numpy as np
 
 from mimopilot.common.files import sha256
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.experiment import Experiment, manoeuvre_size
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.flight_phase import flying_parts
 from mimopilot.tuning.logs.flown_gains import flown_gains
@@ -124,9 +124,25 @@ def _experiment(recording: Recording, warnings: list[str]) -> Experiment:
         sha256=sha256(recording.path.read_bytes()),
         flown=flown_gains(parameters, grid.Ts),
         motors=motors,
+        amplitude=_amplitude(recording),
         warnings=tuple(warnings),
         **grid.signals,  # type: ignore[arg-type]  # of the names in Experiment
     )
+
+
+def _amplitude(recording: Recording) -> float:
+    """Size (rad) of the manoeuvres in the air: of the angles and of their setpoints, but for rare outliers."""
+    sizes = []
+    for name in ("y_o", "r_o"):
+        series = recording.signals.get(name)
+        if series is None:
+            continue
+        flying = np.isfinite(series.values).all(axis=1)
+        if recording.airborne:
+            flying &= np.any([(a <= series.time) & (series.time <= b) for a, b in recording.airborne], axis=0)
+        if flying.any():
+            sizes.append(manoeuvre_size(series.values[flying]))
+    return max(sizes, default=0.0)
 
 
 def _motors(recording: Recording, parts: tuple[Interval, ...], warnings: list[str]) -> Motors | None:
