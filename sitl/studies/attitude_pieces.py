@@ -16,6 +16,8 @@ from mimopilot.tuning.gains_file import gains_from_toml
 
 #: The run with this seed is shown in the report.
 SHOWN_SEED = 0
+#: With fewer seeds a study is a first look: the best gains are searched less thoroughly; chosen.
+THOROUGH_SEEDS = 10
 
 
 def study_pieces(study: AttitudeStudy, seeds: int) -> list[Piece]:
@@ -28,7 +30,9 @@ def study_pieces(study: AttitudeStudy, seeds: int) -> list[Piece]:
         Experiments.
     """
     inputs = repr(study)
-    best = [] if study.fitted else [Piece(f"{study.name}-best", best_texts, study, inputs)]
+    thorough = seeds >= THOROUGH_SEEDS
+    search = Piece(f"{study.name}-best", best_texts, (study, thorough), f"{inputs} thorough {thorough}")
+    best = [] if study.fitted else [search]
     runs = [
         Piece(run_name(study, seed), run_once, (study, seed), f"{inputs} seed {seed}", tuple(p.name for p in best))
         for seed in range(seeds)
@@ -41,9 +45,9 @@ def run_name(study: AttitudeStudy, seed: int) -> str:
     return f"{study.name}-{seed:04d}"
 
 
-def best_texts(study: AttitudeStudy) -> dict[str, str]:
-    """The best gains on the true plant: method -> text of its gains file."""
-    return {method: gains_to_toml(gains) for method, gains in optimum(study).items()}
+def best_texts(task: tuple[AttitudeStudy, bool]) -> dict[str, str]:
+    """The best gains on the true plant: method -> text of its gains file; arguments as `optimum`."""
+    return {method: gains_to_toml(gains) for method, gains in optimum(*task).items()}
 
 
 def run_once(task: tuple[AttitudeStudy, int], best: Mapping[str, str] | None = None) -> dict[str, Any]:

@@ -20,7 +20,10 @@ from tests.conftest import assert_one_clear_line
 
 TS = 0.004
 
-KNOWN = ["adam0", "adam0_boom", "adam0_flexible", "adam0_nominal", "adam0_perturbed", "antr", "px4_sih"]
+KNOWN = [
+    *("adam0", "adam0_boom", "adam0_flexible", "adam0_nominal", "adam0_perturbed", "adam0_thesis"),
+    *("adam0_thesis_flown", "adam0_thesis_perturbed", "antr", "antr_thesis", "px4_sih"),
+]
 
 
 def test_each_airframe_has_default_gains_in_its_unit_of_torque():
