@@ -141,13 +141,6 @@ def _reason_for_doubt(gains: Gains, plant: PlantResponse, known: PlantResponse, 
             "response falls; stiffen the frame, filter the rates (notch, lower cut-off), or lower the derivative's "
             "filter or gain"
         )
-    # Nyquist's count closes the curve below the band by the shortest way, which skewed integral gains do not go.
-    slow = slow_growth(gains, body.model(gains.Ts), float(known.omega[0]))
-    if slow is not None:
-        return (
-            f"below the excitation, at {slow:.2g} rad/s, the loop around the fitted rigid body is unstable: the "
-            "integral gains of roll and pitch work against each other; raise the diagonals of Ki_i and Kp_o"
-        )
     if np.any(gains.Ki_i) and body.least(gains.Ki_i) <= 0:
         return (
             "Ki_i through the measured plant is not positive in every direction (at least "
@@ -158,6 +151,13 @@ def _reason_for_doubt(gains: Gains, plant: PlantResponse, known: PlantResponse, 
         return (
             "there is no integral, and Kp_i through the measured plant is not positive in every direction (at least "
             f"{body.least(gains.Kp_i + gains.Kff_i):.3g} rad/s^2 per rad/s); raise the diagonal of Kp_i"
+        )
+    # Nyquist's count closes the curve below the band by the shortest way, which skewed integral gains do not go.
+    slow = slow_growth(gains, body.model(gains.Ts), float(known.omega[0]))
+    if slow is not None:
+        return (
+            f"below the excitation, at {slow:.2g} rad/s, the loop around the fitted rigid body is unstable: the "
+            "integral gains of roll and pitch work against each other; raise the diagonals of Ki_i and Kp_o"
         )
     if np.linalg.eigvalsh(gains.Kp_o + gains.Kp_o.T)[0] <= 0:
         return (

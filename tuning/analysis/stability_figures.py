@@ -26,19 +26,6 @@ def nominal_and_drawn_loops(gains: Gains, plant: PlantResponse) -> tuple[PlantRe
     return dense, cascade_loop(gains, dense), [cascade_loop(gains, other) for other in others]
 
 
-def sensitivity_peak(gains: Gains, plant: PlantResponse) -> tuple[float, float]:
-    """Peak of the sensitivity at u and two standard errors of it: the certificate's ``Ms`` and ``Ms_error``.
-
-    Parameters
-    ----------
-    gains : Gains
-    plant : PlantResponse
-        With at least 8 known frequencies in a row.
-    """
-    _, nominal, draws = nominal_and_drawn_loops(gains, plant.at(plant.known_run()))
-    return _peak_and_error(nominal, draws)
-
-
 def _peak_and_error(nominal: CascadeLoop, draws: list[CascadeLoop]) -> tuple[float, float]:
     peaks = [margins.peak(margins.sensitivity(loop)) for loop in (nominal, *draws)]
     return peaks[0], 2 * float(np.std(peaks[1:]))

@@ -67,15 +67,15 @@ def test_a_large_attitude_path_above_the_band_is_not_certified():
     assert "where the whole cascade's gain may still reach 1" in found.reason
 
 
-@pytest.mark.parametrize(("sensitivity", "verdict"), [(0.45, Verdict.CERTIFIED), (0.55, Verdict.NOT_CERTIFIED)])
-def test_the_sensitivity_must_be_small_where_the_excitation_begins(sensitivity, verdict):
+@pytest.mark.parametrize(("sensitivity", "verdict"), [(0.9, Verdict.CERTIFIED), (1.05, Verdict.NOT_CERTIFIED)])
+def test_the_frequencies_at_which_the_loop_amplifies_must_be_measured(sensitivity, verdict):
     """S = s^2 / (s^2 + 15 s + 60)."""
     w = np.linspace(1.0, 30.0, 20000)
     start = w[np.searchsorted(np.abs(w**2 / (60 - w**2 + 15j * w)), sensitivity)]
     found = certify(plain(), integrating(grid(60.0, start)), *MODELS)
     assert found.verdict == verdict
     if verdict == Verdict.NOT_CERTIFIED:
-        assert f"excitation begins at {start:.1f} rad/s, where the sensitivity is still 0.55" in found.reason
+        assert f"excitation begins at {start:.1f} rad/s, where the sensitivity is still 1.05" in found.reason
 
 
 @pytest.mark.parametrize(("Ki", "verdict"), [(0.2, Verdict.CERTIFIED), (-0.01, Verdict.NOT_CERTIFIED)])
@@ -101,7 +101,9 @@ def with_peak(at, size, error=0.0, coherence=(0.0, 0.0)):
     one = integrating(np.array([at]), 0.0)
     one = dataclasses.replace(one, G_i=np.full((1, 2, 2), size / 0.15) * np.eye(2), coherence=np.array([coherence]))
     one.root[:, 2, 2] = one.root[:, 3, 3] = error / 0.15
-    return PlantResponse(Ts=TS, **{k: np.concatenate([v, vars(one)[k]]) for k, v in vars(band).items() if k != "Ts"})
+    return PlantResponse(
+        Ts=TS, **{k: np.concatenate([v, vars(one)[k]]) for k, v in vars(band).items() if k not in ("Ts", "angle_noise")}
+    )
 
 
 def test_a_structural_mode_is_found_with_its_frequency_and_gain_plus_error():

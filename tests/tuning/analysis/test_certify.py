@@ -180,8 +180,8 @@ def test_each_verdict_is_given_with_its_reason(flights):
     assert "excitation ends at" in found.reason
     diverging = base.with_elements({"RI_RP": 0.3, "RI_PR": -0.05})
     assert "Ki_i through the measured plant" in certify(diverging, plant, *MODELS).reason
-    late = plant.at(plant.omega > 9)
-    assert "excitation begins at 9" in certify(base, late, *MODELS).reason
+    late = plant.at(plant.omega > 14)
+    assert "excitation begins at 15" in certify(base, late, *MODELS).reason
 
 
 def test_a_controller_without_an_integral_can_be_certified(flights):

@@ -47,12 +47,9 @@ def test_no_unstable_set_is_certified_and_well_damped_ones_are(name):
 
 
 def test_well_damped_sets_are_certified_from_stronger_and_longer_flights_too():
-    """The lowest frequencies are coherent but not linear: the band begins above them."""
     _, damped = random_sets("px4_sih", 12, 11)
     for log in (experiment("px4_sih", amplitude=0.25, bandwidth=60.0), experiment("px4_sih", seconds=40.0)):
         plant = PlantEstimates(log).response
-        assert plant.known()[0]
-        assert plant.known_run()[0] > 0
         assert sum(certify(g, plant, *MODELS).verdict == Verdict.CERTIFIED for g in damped) >= 11
 
 
@@ -114,8 +111,8 @@ def test_a_loop_that_is_unstable_below_the_excitation_is_not_certified():
     )
     assert truth("adam0_perturbed").spectral_radius(gains) > 1.0005
     certificate = certify(gains, flown("adam0_perturbed").response, *MODELS)
-    assert certificate.verdict == Verdict.NOT_CERTIFIED
-    assert "excitation begins at 1.3 rad/s, where the sensitivity is still" in certificate.reason
+    assert certificate.verdict == Verdict.UNSTABLE
+    assert "the whole cascade is unstable" in certificate.reason
 
 
 def test_each_verdict_is_given_with_its_reason():
