@@ -107,8 +107,7 @@ def lqg(plant: StateSpace, model: ReferenceModel, drift: Signal, weight: float) 
 def _companion(model: ReferenceModel) -> tuple[Signal, Signal, Signal, Signal]:
     """The model in state space, its delay included."""
     order = len(model.den) - 1 + model.delay
-    den: Signal = np.zeros(order)
-    num: Signal = np.zeros(order + 1)
+    den, num = np.zeros(order), np.zeros(order + 1)
     den[: len(model.den) - 1] = model.den[1:]
     num[: len(model.taps)] = model.taps
     A = np.eye(order, k=-1)
@@ -119,7 +118,7 @@ def _companion(model: ReferenceModel) -> tuple[Signal, Signal, Signal, Signal]:
 def _stein(left: Signal, right: Signal, constant: Signal) -> Signal:
     """X with X = constant + left' X right."""
     pencil = np.eye(constant.size) - np.kron(right.T, left.T)
-    stacked: Signal = np.linalg.solve(pencil, constant.ravel(order="F"))
+    stacked = np.asarray(np.linalg.solve(pencil, constant.ravel(order="F")), np.float64)
     return stacked.reshape(constant.shape, order="F")
 
 

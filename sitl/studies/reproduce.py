@@ -29,8 +29,8 @@ ALL = "all"
 
 SAME_MODEL = (
     "J_M,o is against the attitude model of MIMO's design for all methods: the flown gains are compared with a model "
-    "that they were not made for, on ANT-R one of twice their bandwidth. The doublets of adam0-sim and adam0 saturate "
-    "the motors; adam0-small is the vehicle of adam0-sim with one that does not."
+    "that they were not made for. The doublets of adam0-sim and adam0 saturate the motors; adam0-small is the vehicle "
+    "of adam0-sim with one that does not."
 )
 
 PRINTED = (
