@@ -29,7 +29,8 @@ from mimopilot.sitl.campaign.execution import run_campaign
 from mimopilot.sitl.campaign.flights import CHUNK, FlightRunner
 from mimopilot.sitl.campaign.plan import make_plan
 from mimopilot.sitl.campaign.replay import replay_flight
-from mimopilot.sitl.campaign.summary import CampaignResults
+from mimopilot.sitl.campaign.results import CampaignResults
+from mimopilot.sitl.campaign.summary import summarise
 from mimopilot.sitl.campaign.variation import variation_from_toml
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import doublet
@@ -203,17 +204,17 @@ def test_every_gain_set_flies_the_same_vehicles_and_an_unstable_one_never_surviv
         assert good_rows[name].equals(bad_rows[name]), name
     survived = {
         group.gains: (group.survived, group.survived_share)
-        for group in CampaignResults(plan, results).summarise().groups
+        for group in summarise(CampaignResults(plan, results)).groups
     }
     assert survived == {"good": (n, wilson(n, n)), "bad": (0, wilson(0, n))}
-    worst = CampaignResults(plan, results).summarise().groups[1].worst[0]
+    worst = summarise(CampaignResults(plan, results)).groups[1].worst[0]
     assert worst.lost_at_s == min(bad_rows["lost_at_s"].to_pylist())
 
 
 def test_the_summary_agrees_with_the_results(vehicle, tmp_path):
     plan = plan_of(vehicle, axes=["roll"])
     results = run_campaign(plan, tmp_path, 1)
-    (group,) = CampaignResults(plan, results).summarise().groups
+    (group,) = summarise(CampaignResults(plan, results)).groups
     figures = np.sort(pq.read_table(results)["J_M_o"].to_numpy())
     value, low, high = group.quantiles["J_M_o"]["0.5"]
     assert value == figures[(len(figures) - 1) // 2]
