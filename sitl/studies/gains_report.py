@@ -23,12 +23,20 @@ from mimopilot.sitl.studies.gains_run import (
     SISO_FOLLOWING,
 )
 from mimopilot.sitl.studies.linear_loop import DOMINANT
+from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.prediction import TAIL
 from mimopilot.tuning.spec import DesignLimits
 
 #: J_M is printed in this unit, rad^2.
 UNIT, UNIT_TEXT = 1e-5, "1e-5 rad^2"
 PERIODS_TEXT = ", ".join(f"{period:g}" for period in PERIODS)
+
+#: Verdict of the certificate -> as short text.
+SHORT = {
+    str(Verdict.CERTIFIED): "yes",
+    str(Verdict.THIN): "thin",
+    str(Verdict.NOT_CERTIFIED): "no",
+}
 
 Run = Mapping[str, Any]
 
@@ -45,7 +53,8 @@ LEAD = (
     "angle of the other axis in any of these doublets. Cross: RMS of the other axis over doublet and tail, in percent "
     f"of the amplitude. Damping: least damping ratio of the closed loop's poles slower than {DOMINANT:g} rad/s. Noise: "
     "of the torque at hover, over the flown gains'. Torque: the largest in a doublet of "
-    f"{AMPLITUDES_DEG[-1]:g} degrees, as if there were no limits. Medians over the seeds."
+    f"{AMPLITUDES_DEG[-1]:g} degrees, as if there were no limits. Certified: from the log; thin: a thin margin. "
+    "Medians over the seeds."
 )
 
 
@@ -152,7 +161,7 @@ def _linear_table(vehicle: str, runs: Sequence[Run]) -> ReportTable:
         found = linear_medians(runs, name)
         size = float(np.radians(AMPLITUDES_DEG[0]))
         cross = 100 * float(np.sqrt(np.mean(found["offaxis"])))
-        verdicts = sorted({one["verdict"] for one in having} - {""})
+        verdicts = sorted({SHORT.get(one["verdict"], one["verdict"]) for one in having} - {""})
         missing = len(runs) - len(having)
         rows.append(
             [
@@ -170,5 +179,5 @@ def _linear_table(vehicle: str, runs: Sequence[Run]) -> ReportTable:
         f"{vehicle}, exact on the linear plant: J [{UNIT_TEXT}] of {AMPLITUDES_DEG[0]:g} deg; cross [%]; noise over "
         "the flown"
     )
-    columns = ("set", *_columns("J"), "cross", "Ms", "damping", "noise", "torque", "certificate")
+    columns = ("set", *_columns("J"), "cross", "Ms", "damping", "noise", "torque", "certified")
     return ReportTable(caption, columns, rows)
