@@ -32,8 +32,8 @@ from mimopilot.sitl.campaign.plan import make_plan
 from mimopilot.sitl.campaign.replay import replay_flight
 from mimopilot.sitl.campaign.results import CampaignResults
 from mimopilot.sitl.campaign.summary import summarise
-from mimopilot.sitl.campaign.varied import COUPLING, summarise_varied
 from mimopilot.sitl.campaign.variation import variation_from_toml
+from mimopilot.sitl.campaign.varied import COUPLING, summarise_varied
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
