@@ -22,7 +22,6 @@ from mimopilot.sitl.studies.attitude_study import (
     SISO,
     SISO_OWN,
     SISO_PRINTED,
-    SISO_THESIS,
     studies,
 )
 from mimopilot.sitl.studies.autotune import autotune, identify_arx, minimum_variance_pid
@@ -114,7 +113,8 @@ def test_the_optimum_on_the_true_plant_is_within_the_limits_of_the_design_and_de
     assert statistics.true_median(BEST, "true_Ms") <= 1.6 * 1.01
     assert statistics.true_median(DEFAULT, "noise") == 1.0
     for axis in AXES:
-        for method in (DEFAULT, SISO_THESIS, MIMO_THESIS):
+        # On the flown axis alone diagonal gains may follow better: what the other axis does is not in J_M,o.
+        for method in (DEFAULT, MIMO_THESIS):
             assert statistics.median(BEST, axis, "J_M_o_design") < statistics.median(method, axis, "J_M_o_design")
         assert statistics.median(BEST, axis, "offaxis_peak_deg") < 0.25 * statistics.median(
             SISO, axis, "offaxis_peak_deg"
