@@ -64,18 +64,21 @@ def campaign(
     from mimopilot.common.parallel import cores
     from mimopilot.sitl.campaign.campaign_figures import parse_map
     from mimopilot.sitl.campaign.execution import run_campaign
+    from mimopilot.sitl.campaign.pairs import PAIR_COLUMNS, pair_rows
     from mimopilot.sitl.campaign.plan import SUMMARY, make_plan
-    from mimopilot.sitl.campaign.report import INTERVALS, write_campaign_report
+    from mimopilot.sitl.campaign.report import INTERVALS, PAIRS, VARIED, write_campaign_report
+    from mimopilot.sitl.campaign.results import CampaignResults
     from mimopilot.sitl.campaign.summary import (
         FIGURE_COLUMNS,
         SURVIVAL_COLUMNS,
         WORST_COLUMNS,
-        CampaignResults,
         figure_rows,
+        summarise,
         survival_rows,
         worst_rows,
     )
     from mimopilot.sitl.campaign.variation import read_variation
+    from mimopilot.sitl.campaign.varied import VARIED_COLUMNS, varied_rows
     from mimopilot.sitl.physics.airframe import load_airframe
 
     vehicle = load_airframe(airframe)
@@ -89,7 +92,7 @@ def campaign(
     )
     over = parse_map(plan, survival_map) if survival_map else None
     results = CampaignResults(plan, run_campaign(plan, out, workers or cores(), scheduler))
-    summary = results.summarise()
+    summary = summarise(results)
     write_atomically(inside(out, SUMMARY), json_text(summary.as_json(".")))
     report = write_campaign_report(results, summary, over)
     if as_json:
@@ -98,8 +101,12 @@ def campaign(
     print(INTERVALS)
     if summary.rejected:
         print(f"{summary.rejected} impossible draws were repeated")
+    if summary.varied:
+        print_table(VARIED, VARIED_COLUMNS, varied_rows(summary.varied))
     print_table("Survived", SURVIVAL_COLUMNS, survival_rows(summary))
     print_table("Figures", FIGURE_COLUMNS, figure_rows(summary))
+    if summary.pairs:
+        print_table(PAIRS, PAIR_COLUMNS, pair_rows(summary.pairs))
     print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))
     print(f"results {results.path}\nreport  {report}")
 

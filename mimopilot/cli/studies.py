@@ -12,7 +12,7 @@ from mimopilot.cli.options import AirframeArgument, AxisOption, FaultOption, Jso
 
 
 class Study(StrEnum):
-    """What can be reproduced: Chapter 5's benchmarks, Chapter 6's vehicles, ours, and random ones (not part of all)."""
+    """What can be reproduced: the benchmarks of chapter 5, the vehicles of chapter 6, ours; two are not part of all."""
 
     NUMERICAL_EXAMPLE = "numerical-example"
     LV100 = "lv100"
@@ -28,6 +28,7 @@ class Study(StrEnum):
     ANTR_THESIS = "antr-thesis"
     ALL = "all"
     VEHICLES = "vehicles"
+    GAINS = "gains"
 
 
 def register(app: typer.Typer) -> None:
@@ -103,14 +104,17 @@ def reproduce(
     study: Annotated[Study, typer.Argument(help="Which study, or all of them.")],
     out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("reproduction"),
     seeds: Annotated[
-        int | None, typer.Option(min=1, help="Experiments of each vehicle, with other noise; 50 by default.")
+        int | None, typer.Option(min=1, help="Experiments of each vehicle, with other noise; 50 by default, gains: 5.")
     ] = None,
     runs: Annotated[int | None, typer.Option(min=1, max=1_000_000, help="vehicles: how many; 500 by default.")] = None,
     first: Annotated[int | None, typer.Option(min=0, help="vehicles: seed of the first one; 0 by default.")] = None,
     workers: WorkersOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the thesis' tables and figures again, beside its own figures; vehicles: tune many random vehicles."""
+    """Compute the thesis' tables and figures again, beside its own figures.
+
+    vehicles: tune many random vehicles. gains: all gain sets of four vehicles, from the flown ones to the optimum.
+    """
     from mimopilot.common.console import print_json
     from mimopilot.common.errors import check_not_given
     from mimopilot.sitl.studies.reproduction import print_reproduction
@@ -122,10 +126,16 @@ def reproduce(
         found = reproduce_vehicles(out, runs or RUNS, first or 0, workers)
     else:
         check_not_given("only for the study vehicles", runs=runs, first=first)
-        from mimopilot.sitl.studies.reproduce import SEEDS
-        from mimopilot.sitl.studies.reproduce import reproduce as compute
+        if study is Study.GAINS:
+            from mimopilot.sitl.studies.gains_study import SEEDS as GAINS_SEEDS
+            from mimopilot.sitl.studies.gains_study import reproduce_gains
 
-        found = compute(study.value, out, seeds or SEEDS, workers)
+            found = reproduce_gains(out, seeds or GAINS_SEEDS, workers)
+        else:
+            from mimopilot.sitl.studies.reproduce import SEEDS
+            from mimopilot.sitl.studies.reproduce import reproduce as compute
+
+            found = compute(study.value, out, seeds or SEEDS, workers)
     if as_json:
         print_json(found.as_json())
     else:

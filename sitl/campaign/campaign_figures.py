@@ -11,13 +11,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from mimopilot.sitl.campaign.draws import RunSampler
 from mimopilot.sitl.campaign.flights import FlightRunner
 from mimopilot.sitl.campaign.plan import CampaignPlan
-from mimopilot.sitl.campaign.summary import CampaignResults
-from mimopilot.sitl.campaign.variation import VARIED_UNITS
+from mimopilot.sitl.campaign.results import CampaignResults
+from mimopilot.sitl.campaign.varied import label, varied
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.faults.kinds import KINDS
 from mimopilot.sitl.flight.figures import SETPOINT, STYLES
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from mimopilot.sitl.flight.scenario import AXES
@@ -137,12 +135,6 @@ def distribution_figure(results: CampaignResults, axis: str) -> Figure:
     return figure
 
 
-def varied(plan: CampaignPlan) -> list[str]:
-    """Columns of the results that vary, in the order in which they are drawn."""
-    sampler = RunSampler(plan.airframe, plan.description.vary, plan.scenarios[0])
-    return [quantity.name for quantity in sampler.quantities]
-
-
 def parse_map(plan: CampaignPlan, text: str) -> tuple[str, str]:
     """The two quantities of a survival map, from NAME,NAME.
 
@@ -224,13 +216,3 @@ def _edges(value: NDArray[Any], cells: int) -> NDArray[np.float64]:
         step = np.diff(few).min() if len(few) > 1 else 1.0
         return np.concatenate([[few[0] - step / 2], middle, [few[-1] + step / 2]])
     return np.linspace(value.min(), value.max(), cells + 1)
-
-
-def label(plan: CampaignPlan, name: str) -> str:
-    """Label of a varied quantity, with its unit."""
-    if name.startswith("fault."):
-        _, number, field = name.split(".")
-        kind = plan.description.vary.fault[int(number) - 1].kind
-        unit = {"size": KINDS[kind].unit, "motor": "-"}.get(field, "s")
-        return f"{kind}: {field} [{unit}]"
-    return f"{name} [{next(unit for start, unit in VARIED_UNITS.items() if name.startswith(start))}]"

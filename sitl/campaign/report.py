@@ -8,23 +8,28 @@ from mimopilot.common.files import inside
 from mimopilot.common.html_report import ReportTable, Section, write_report
 from mimopilot.sitl.campaign import campaign_figures
 from mimopilot.sitl.campaign.flights import flight_runner
+from mimopilot.sitl.campaign.pairs import PAIR_COLUMNS, pair_rows
 from mimopilot.sitl.campaign.plan import REPORT, SPEC
+from mimopilot.sitl.campaign.results import CampaignResults
 from mimopilot.sitl.campaign.summary import (
     FIGURE_COLUMNS,
     SURVIVAL_COLUMNS,
     WORST_COLUMNS,
-    CampaignResults,
     CampaignSummary,
     figure_rows,
     survival_rows,
     worst_rows,
 )
+from mimopilot.sitl.campaign.varied import VARIED_COLUMNS, varied_rows
 from mimopilot.sitl.flight.figures import svg
 
 INTERVALS = (
     "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "
-    "counts as worse than any surviving one."
+    "counts as worse than any surviving one. Pairs: differences in the same run, over the runs that both sets survive."
 )
+
+#: Captions of tables.
+VARIED, PAIRS = "What varied", "Pairs of gain sets, run by run"
 
 
 def write_campaign_report(
@@ -50,10 +55,13 @@ def write_campaign_report(
         f"{summary.rejected} impossible draws were repeated."
     )
     tables = [
+        ReportTable(VARIED, VARIED_COLUMNS, varied_rows(summary.varied)),
         ReportTable("Survived", SURVIVAL_COLUMNS, survival_rows(summary)),
         ReportTable("Figures", FIGURE_COLUMNS, figure_rows(summary)),
+        ReportTable(PAIRS, PAIR_COLUMNS, pair_rows(summary.pairs)),
         ReportTable("Worst flights; run the commands in this folder", WORST_COLUMNS, worst_rows(summary, ".")),
     ]
+    tables = [table for table in tables if table.rows]
     sample = campaign_figures.fly_sample(runner)
     envelopes = [
         svg(campaign_figures.envelope_figure(runner, sample, results, index), f"envelope {axis}")

@@ -1,34 +1,23 @@
-"""Summary of a campaign: survival and figures with confidence intervals, and the worst flights."""
+"""Summary of a campaign: what varied, survival and figures with intervals, pairs of gain sets, the worst flights."""
 
 from __future__ import annotations
 
 import shlex
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
 from mimopilot.common.intervals import quantile, wilson
-from mimopilot.sitl.campaign.plan import CampaignPlan, reading_results
+from mimopilot.sitl.campaign.pairs import PairComparison, compare_pairs
+from mimopilot.sitl.campaign.results import CampaignResults, WorstFlight
+from mimopilot.sitl.campaign.varied import VariedSummary, summarise_varied
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 
 #: Figures in the summary.
 SHOWN = ("J_M_o", "peak_deg", "offaxis_peak_deg", "effort_rms", "saturated")
 QUANTILES = (0.5, 0.95)
 WORST = 3  # worst flights listed per group
-BATCH = 1 << 14  # rows read at a time
-
-
-@dataclass(frozen=True)
-class WorstFlight:
-    """One of the worst flights: when the vehicle was lost (s; None: never), and its J_M,o (rad^2)."""
-
-    run: int
-    lost_at_s: float | None
-    J_M_o: float
 
 
 @dataclass(frozen=True)
@@ -59,11 +48,23 @@ class GroupSummary:
 
 @dataclass(frozen=True)
 class CampaignSummary:
-    """Summary of a whole campaign; `rejected` is the number of repeated draws."""
+    """Summary of a whole campaign.
+
+    Attributes
+    ----------
+    runs : int
+    rejected : int
+        Repeated draws.
+    varied : tuple of VariedSummary
+    groups : tuple of GroupSummary
+    pairs : tuple of PairComparison
+    """
 
     runs: int
     rejected: int
+    varied: tuple[VariedSummary, ...]
     groups: tuple[GroupSummary, ...]
+    pairs: tuple[PairComparison, ...]
 
     def as_json(self, folder: str) -> dict[str, Any]:
         """The object that ``--json`` prints and `summary.json` holds; replay commands refer to `folder`."""
@@ -79,54 +80,22 @@ def replay_command(folder: str, run: int, gains: str, axis: str) -> str:
     return shlex.join(["mimopilot", "replay", folder, "--run", str(run), "--gains", gains, "--axis", axis])
 
 
-class CampaignResults:
-    """The results of a campaign, read column by column: 8 bytes per flight are in memory at a time.
+def summarise(results: CampaignResults) -> CampaignSummary:
+    """Summarise a campaign."""
+    d = results.plan.description
+    groups = tuple(_group(results, gains, axis) for gains in d.gains for axis in d.axes)
+    rejected = int(results.column("rejected_draws", d.gains[0], d.axes[0]).sum())
+    return CampaignSummary(d.runs, rejected, summarise_varied(results), groups, compare_pairs(results))
 
-    Parameters
-    ----------
-    plan : CampaignPlan
-        The campaign. Rows are ordered by run, gain set and axis.
-    path : Path
-        Parquet file.
-    """
 
-    def __init__(self, plan: CampaignPlan, path: Path) -> None:
-        self.plan, self.path = plan, path
-
-    def column(self, name: str, gains: str, axis: str) -> NDArray[Any]:
-        """One column for the flights of a gain set on an axis, (runs,)."""
-        axes = self.plan.description.axes
-        stride = len(self.plan.gains) * len(axes)
-        offset = list(self.plan.gains).index(gains) * len(axes) + axes.index(axis)
-        parts, start = [], 0
-        with reading_results(self.path), pq.ParquetFile(self.path, page_checksum_verification=True) as table:
-            for batch in table.iter_batches(BATCH, columns=[name]):
-                values = batch.column(0).to_numpy(zero_copy_only=False)
-                parts.append(values[(offset - start) % stride :: stride].copy())
-                start += len(values)
-        return np.concatenate(parts)
-
-    def worst(self, gains: str, axis: str, count: int) -> list[WorstFlight]:
-        """The worst flights of a group: lost flights first, by time; then by J_M,o."""
-        badness, lost_at = self.column("J_M_o", gains, axis), self.column("lost_at_s", gains, axis)
-        lost = np.isfinite(lost_at)
-        order = np.lexsort((-np.where(lost, 0.0, badness), np.where(lost, lost_at, np.inf)))[:count]
-        return [WorstFlight(int(i), float(lost_at[i]) if lost[i] else None, float(badness[i])) for i in order]
-
-    def summarise(self) -> CampaignSummary:
-        """Summarise all groups."""
-        d = self.plan.description
-        groups = tuple(self._group(gains, axis) for gains in d.gains for axis in d.axes)
-        return CampaignSummary(d.runs, int(self.column("rejected_draws", d.gains[0], d.axes[0]).sum()), groups)
-
-    def _group(self, gains: str, axis: str) -> GroupSummary:
-        survived = self.column("survived", gains, axis)
-        n, k = len(survived), int(survived.sum())
-        quantiles = {}
-        for name in SHOWN:
-            ordered = np.sort(np.where(survived, self.column(name, gains, axis), np.inf))
-            quantiles[name] = {f"{p:g}": quantile(ordered, p) for p in QUANTILES}
-        return GroupSummary(gains, axis, n, k, wilson(k, n), quantiles, tuple(self.worst(gains, axis, WORST)))
+def _group(results: CampaignResults, gains: str, axis: str) -> GroupSummary:
+    survived = results.column("survived", gains, axis)
+    n, k = len(survived), int(survived.sum())
+    quantiles = {}
+    for name in SHOWN:
+        ordered = np.sort(np.where(survived, results.column(name, gains, axis), np.inf))
+        quantiles[name] = {f"{p:g}": quantile(ordered, p) for p in QUANTILES}
+    return GroupSummary(gains, axis, n, k, wilson(k, n), quantiles, tuple(results.worst(gains, axis, WORST)))
 
 
 SURVIVAL_COLUMNS = ("gains, axis", "survived", "95 % interval")

@@ -32,23 +32,38 @@ def linear_model(airframe: Airframe, Ts: float) -> StateSpace:
     StateSpace
         Two inputs: roll, pitch. Four outputs: rates (rad/s), then angles (rad).
     """
-    body = _series(_delay(airframe.computing_delay, Ts), _body(airframe, Ts))
-    sensors = _gyro(airframe.gyro_cutoff_hz, Ts)
+    model = linear_model_with_noise(airframe, Ts)
+    return StateSpace(model.A, model.B[:, :2], model.C, model.D[:, :2], Ts)
+
+
+def linear_model_with_noise(airframe: Airframe, Ts: float) -> StateSpace:
+    """The same with four more inputs: white noise of variance 1 that makes the noise of the rates and of the angles."""
+    signals = _series(_delay(airframe.computing_delay, Ts), _body(airframe, Ts))
     if airframe.frame is not None:
-        sensors = _series(_frame(airframe.frame, Ts), sensors)
-    A, B, C, D = map(_on_both_axes, (sensors.A, sensors.B, sensors.C, sensors.D))
-    return _series(body, StateSpace(A, B, C, D, Ts))
+        signals = _series(signals, _on_both_axes(_frame(airframe.frame, Ts)))
+    noise = np.diag(np.repeat([airframe.noise.rate, airframe.noise.angle], 2))
+    noisy = StateSpace(
+        signals.A,
+        np.hstack([signals.B, np.zeros((len(signals.A), 4))]),
+        signals.C,
+        np.hstack([signals.D, noise]),
+        Ts,
+    )
+    return _series(noisy, _on_both_axes(_gyro(airframe.gyro_cutoff_hz, Ts)))
 
 
-def _on_both_axes(matrix: Signal) -> Signal:
-    """A matrix of one axis for roll and pitch, signal by signal."""
-    return np.kron(matrix, np.eye(2)).astype(np.float64)
+def _on_both_axes(system: StateSpace) -> StateSpace:
+    """A system of one axis on roll and on pitch: each signal is a pair."""
+
+    def both(matrix: Signal) -> Signal:
+        return np.asarray(np.kron(matrix, np.eye(2)), np.float64)
+
+    return StateSpace(both(system.A), both(system.B), both(system.C), both(system.D), system.Ts)
 
 
 def control_effectiveness(airframe: Airframe) -> Signal:
     """Angular acceleration about roll and pitch per unit of torque, (2, 2), rad/s^2."""
-    B: Signal = airframe.plant().inertia_inverse[:2, :2] * np.array(airframe.moment_scale()[:2])
-    return B
+    return np.asarray(airframe.plant().inertia_inverse[:2, :2] * np.array(airframe.moment_scale()[:2]), np.float64)
 
 
 def _body(airframe: Airframe, Ts: float) -> StateSpace:

@@ -16,16 +16,25 @@ from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.sitl.studies.attitude_run import AttitudeRun
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
-from mimopilot.sitl.studies.attitude_study import MIMO, REFINED, SISO, AttitudeStudy
+from mimopilot.sitl.studies.attitude_study import (
+    MIMO,
+    MIMO_THESIS,
+    PRINTED_KEYS,
+    SISO,
+    SISO_THESIS,
+    AttitudeStudy,
+)
 
 #: Methods in the plots; method -> (colour, line style) and marker.
-TUNED = (SISO, MIMO, REFINED)
-LOOK = dict(zip(TUNED, zip(STYLES, "so^", strict=False), strict=False))
+TUNED = (SISO_THESIS, MIMO_THESIS, SISO, MIMO)
+LOOK = dict(zip(TUNED, zip(STYLES, "so^v", strict=False), strict=False))
 PRINTED = {"color": "black", "marker": "x", "markersize": 7, "markeredgewidth": 1.6, "linestyle": "none"}
 MATRICES = {"Kp_o": "1/s", "Kp_i": "s", "Ki_i": "-", "Kd_i": "s^2"}
 ELEMENTS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
 #: Figure -> label.
 COSTS = {name: FIGURE_LABELS[name] for name in ("J_M_o", "J_M_i", "J_r_o", "J_r_i", "offaxis_peak_deg", "effort_rms")}
+#: J_M,o against the attitude model of MIMO's design, for all methods alike.
+SAME_MODEL, SAME_MODEL_LABEL = "J_M_o_design", "J_M,o, MIMO's model"
 #: Percentiles at the ends of the bars.
 LOW, HIGH = 5, 95
 
@@ -126,8 +135,8 @@ def gains_figure(found: StudyStatistics, printed: Mapping[str, Any], table: str)
             for place, (method, look) in enumerate(shown.items()):
                 values = found.gains(method, name).reshape(-1, 4)[:, element]
                 _spread(panel, place, values, look, method)
-                if method in printed:
-                    value = np.ravel(printed[method][name])[element]
+                if (key := PRINTED_KEYS.get(method, "")) in printed:
+                    value = np.ravel(printed[key][name])[element]
                     panel.plot(place + 0.25, value, label=f"{table} as printed", **PRINTED)
             panel.axhline(0, color="black", linewidth=0.6)
             panel.set_xlim(-0.6, len(shown) - 0.4)
@@ -166,8 +175,9 @@ def costs_figure(
                     markersize=6,
                     label=f"{axis} doublet",
                 )
-                if axis == axis_printed and name in printed.get(method, {}):
-                    panel.plot(printed[method][name], place + shift, label="printed, real flight", **PRINTED)
+                flown = printed.get(PRINTED_KEYS.get(method, ""), {})
+                if axis == axis_printed and name in flown:
+                    panel.plot(flown[name], place + shift, label="printed, real flight", **PRINTED)
         low, high = panel.dataLim.x0, panel.dataLim.x1
         panel.set_xscale("log" if high > 10 * low else "linear")
         panel.xaxis.set_minor_formatter(NullFormatter())

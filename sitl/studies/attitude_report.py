@@ -18,6 +18,8 @@ from mimopilot.sitl.studies.attitude_figures import (
     HIGH,
     LOW,
     MATRICES,
+    SAME_MODEL,
+    SAME_MODEL_LABEL,
     TUNED,
     costs_figure,
     experiment_motors_figure,
@@ -25,19 +27,20 @@ from mimopilot.sitl.studies.attitude_figures import (
     motors_figure,
     tracking_figure,
 )
-from mimopilot.sitl.studies.attitude_run import EFFORT_RATIO, AttitudeRun
+from mimopilot.sitl.studies.attitude_run import AttitudeRun
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
 from mimopilot.sitl.studies.attitude_study import (
     AUTOTUNE,
     BEST,
-    BOUND,
     DEFAULT,
     MIMO,
     MIMO_PRINTED,
-    REFINED,
+    MIMO_THESIS,
+    PRINTED_KEYS,
     SISO,
     SISO_OWN,
     SISO_PRINTED,
+    SISO_THESIS,
     AttitudeStudy,
 )
 from mimopilot.sitl.studies.printed_figures import printed_figures, printed_table
@@ -47,21 +50,21 @@ COMPARABILITY = (
     "and those of the simulation are class values."
 )
 METHODS = (
-    f"{DEFAULT}: the gains during the experiment. {AUTOTUNE}: one axis at a time by the rule of PX4's autotune, "
-    f"from the same log. {SISO} and {MIMO}: VRFT with the thesis' reference models. {REFINED}: {MIMO} refined on a "
-    f"model from the same log, for this doublet, with a predicted effort {EFFORT_RATIO - 1:.0%} above {SISO}'s. "
-    f"{BEST}: all gains by direct optimisation on the true plant, which no method knows. Its effort is that of "
-    f"{REFINED} there (median of the first seeds). Its margins are the certificate's, Ms less the error of Ms from a "
-    f"log. {BOUND}: the same with any effort. Effort: RMS of both torques together."
+    f"{DEFAULT}: the gains that flew during the experiment. {AUTOTUNE}: one axis at a time by the rule of PX4's "
+    f"autotune, from the same log. {SISO_THESIS} and {MIMO_THESIS}: VRFT for them. {SISO} and {MIMO}: what mimopilot "
+    f"tune designs on the measured response without a model, axis by axis and with full matrices. {BEST}: the same "
+    f"cost and constraints on the true plant, which no method knows, for the attitude model of {MIMO}. J is against "
+    "the thesis' models (the designs are not made for them); the last column is J_M,o against the attitude model of "
+    f"{MIMO}, which its design finds, for all methods alike. Effort: RMS of both torques together."
 )
 FITTED_METHODS = (
-    f"The airframe is fitted to the printed gains. {DEFAULT}: the gains during the experiment. {SISO} and {MIMO}: VRFT "
-    f"with the thesis' reference models. {SISO_PRINTED} and {MIMO_PRINTED}: the gains of the thesis, flown here. "
-    "Effort: RMS of both torques together."
+    f"The airframe is fitted to the printed gains. {DEFAULT}: the gains that flew during the experiment. {SISO_THESIS} "
+    f"and {MIMO_THESIS}: VRFT for them. {SISO_PRINTED} and {MIMO_PRINTED}: the gains of the thesis, flown here. J is "
+    "against the models that each was tuned for. Effort: RMS of both torques together."
 )
 SPREAD_COLUMNS = ("gain", *ELEMENTS)
 COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].removesuffix(", RMS of u") for text in COSTS.values()))
-CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms", "lost flights")
+CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms", "true Ms", "noise", "lost flights")
 
 
 def run_pictures(study: AttitudeStudy, found: AttitudeRun) -> dict[str, str]:
@@ -70,7 +73,7 @@ def run_pictures(study: AttitudeStudy, found: AttitudeRun) -> dict[str, str]:
     rotors = len(load_airframe(study.airframe).airframe.rotors)
     plots = {"experiment": experiment_figure(found.experiment)}
     plots |= {"experiment motors": experiment_motors_figure(found.experiment, rotors, study.title)}
-    others = (DEFAULT, SISO_PRINTED, MIMO_PRINTED) if study.fitted else (DEFAULT, AUTOTUNE, REFINED, BEST)
+    others = (DEFAULT, SISO_PRINTED, MIMO_PRINTED) if study.fitted else (DEFAULT, AUTOTUNE, MIMO, BEST)
     for key, methods in (("ours", TUNED), ("others", others)):
         for axis, name in enumerate(AXES):
             flights = {m: found.flights[m][axis] for m in methods if m in found.flights}
@@ -100,8 +103,8 @@ def study_sections(found: StudyStatistics, pictures: Mapping[str, str]) -> list[
         ),
         Section(
             f"{name}: doublets",
-            f"Doublet of {study.amplitude_deg:g} degrees, {study.period_s:g} s{limited}. J over the doublet, against "
-            f"the models that each method was tuned for. {FITTED_METHODS if study.fitted else METHODS} "
+            f"Doublet of {study.amplitude_deg:g} degrees, {study.period_s:g} s{limited}; J over the doublet. "
+            f"{FITTED_METHODS if study.fitted else METHODS} "
             f"{COMPARABILITY if costs else ''}",
             [costs_table(found), certificates_table(found)],
             [
@@ -116,14 +119,14 @@ def _lead(study: AttitudeStudy, inner: str, outer: str) -> str:
     seconds, amplitude, bandwidth = study.excitation
     text = (
         f"{load_airframe(study.airframe).airframe.description}. PRBS of amplitude {amplitude:g} and {bandwidth:g} "
-        f"rad/s for {seconds:g} s on each axis under the default gains. Reference models (rad/s, damping, delay "
-        f"in samples): rate loop {inner}; attitude loop {outer}."
+        f"rad/s for {seconds:g} s on each axis under the default gains. The thesis' models (rad/s, damping, delay in "
+        f"samples): rate loop {inner}; attitude loop {outer}."
     )
     (omega, zeta, delay), (omega_o, zeta_o, delay_o) = study.siso_models
     if study.siso_models != (study.inner, study.outer):
-        text += f" SISO: {omega:g}, {zeta:g}, {delay}; {omega_o:g}, {zeta_o:g}, {delay_o}."
+        text += f" {SISO_THESIS}: {omega:g}, {zeta:g}, {delay}; {omega_o:g}, {zeta_o:g}, {delay_o}."
     if study.siso_airframe != study.airframe:
-        text += f" {SISO} is tuned on the log of {study.siso_airframe}, as in the thesis."
+        text += f" {SISO_THESIS}: tuned on the log of {study.siso_airframe}, as in the thesis."
         if SISO_OWN in study.methods():
             text += f" {SISO_OWN} is tuned on this vehicle's own log."
     return text
@@ -142,24 +145,25 @@ def gains_table(found: StudyStatistics) -> ReportTable:
                 for a, m, b in zip(low, middle, high, strict=True)
             ]
             rows.append([f"{matrix}  {method}", *cells])
-            if method in printed:
-                rows.append([f"{matrix}  {method}, {number}", *(f"{v:.4f}" for v in np.ravel(printed[method][matrix]))])
+            if (key := PRINTED_KEYS.get(method, "")) in printed:
+                rows.append([f"{matrix}  {key}, {number}", *(f"{v:.4f}" for v in np.ravel(printed[key][matrix]))])
     return ReportTable(f"{found.study.name}: gains, output <- error", SPREAD_COLUMNS, rows)
 
 
 def costs_table(found: StudyStatistics) -> ReportTable:
     """Medians of every figure by axis and method, beside the thesis' real flights."""
     number, axis_printed, printed = found.study.costs_table
+    last = [] if found.study.fitted else [SAME_MODEL]
     rows = []
     for axis in AXES:
         for method in found.study.methods():
-            medians = [_figure(name, found.median(method, axis, name)) for name in COSTS]
+            medians = [_figure(name, found.median(method, axis, name)) for name in (*COSTS, *last)]
             rows.append([f"{axis}, {method}", *medians])
-            if axis == axis_printed and method in printed:
-                flown = [_figure(name, printed[method][name]) if name in printed[method] else "" for name in COSTS]
-                rows.append([f"{axis}, {method}, {number} (real flight)", *flown])
+            if axis == axis_printed and (key := PRINTED_KEYS.get(method, "")) in printed:
+                flown = [_figure(name, printed[key][name]) if name in printed[key] else "" for name in COSTS]
+                rows.append([f"{axis}, {key}, {number} (real flight)", *flown, *("" for _ in last)])
     caption = f"{found.study.name}: medians of {len(found.runs)} seeds; J in rad^2 and rad^2/s^2, peak in deg"
-    return ReportTable(caption, COST_COLUMNS, rows)
+    return ReportTable(caption, (*COST_COLUMNS, *(SAME_MODEL_LABEL for _ in last)), rows)
 
 
 def certificates_table(found: StudyStatistics) -> ReportTable:
@@ -169,9 +173,10 @@ def certificates_table(found: StudyStatistics) -> ReportTable:
         verdicts = ", ".join(f"{count}: {verdict}" for verdict, count in found.verdicts(method).items())
         peaks = [run[method]["Ms"] for run in found.runs if run[method]["Ms"] is not None]
         lost = sum(np.isinf(found.values(method, axis, "effort_rms")).sum() for axis in AXES)
-        rows.append([method, verdicts, f"{np.median(peaks):.2f}" if peaks else "", str(lost)])
+        true = (f"{found.true_median(method, name):.2f}" for name in ("true_Ms", "noise"))
+        rows.append([method, verdicts, f"{np.median(peaks):.2f}" if peaks else "", *true, str(lost)])
     return ReportTable(
-        f"{found.study.name}: certificates, median peak of the sensitivity, lost flights",
+        f"{found.study.name}: certificates; medians of Ms, of the true Ms, and of the torque's noise over the flown",
         CERTIFICATE_COLUMNS,
         rows,
     )
@@ -185,13 +190,15 @@ def study_figures(found: StudyStatistics) -> dict[str, Any]:
         low, middle, high = np.percentile(values, [LOW, 50, HIGH], axis=0)
         return {"median": middle.tolist(), f"p{LOW}": low.tolist(), f"p{HIGH}": high.tolist()}
 
+    figures = [*COSTS, *([] if study.fitted else [SAME_MODEL])]
     return {
         "seeds": len(found.runs),
         "methods": {
             method: {
                 "verdicts": found.verdicts(method),
                 "gains": {matrix: spread(found.gains(method, matrix)) for matrix in MATRICES},
-                **{axis: {name: spread(found.values(method, axis, name)) for name in COSTS} for axis in AXES},
+                **{name: found.true_median(method, name) for name in ("true_Ms", "noise")},
+                **{axis: {name: spread(found.values(method, axis, name)) for name in figures} for axis in AXES},
             }
             for method in study.methods()
         },

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from typing import Any
@@ -9,49 +10,42 @@ from typing import Any
 import numpy as np
 
 from mimopilot.codegen.native import NativeController, NativeLibrary, load_native
+from mimopilot.common.blas import reproducible
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.metrics import Performance, performance
 from mimopilot.sitl.flight.scenario import AXES, Scenario, excitation_flight
 from mimopilot.sitl.flight.simulator import Flight, fly
-from mimopilot.sitl.physics.airframe import AirframeFile, load_airframe
+from mimopilot.sitl.physics.airframe import Airframe, AirframeFile, load_airframe
 from mimopilot.sitl.studies.attitude_study import (
     AUTOTUNE,
     BEST,
-    BOUND,
     DEFAULT,
-    LEAD_S,
     MIMO,
     MIMO_PRINTED,
-    REFINED,
+    MIMO_THESIS,
+    PRINTED_KEYS,
     SISO,
     SISO_OWN,
     SISO_PRINTED,
+    SISO_THESIS,
     AttitudeStudy,
 )
 from mimopilot.sitl.studies.autotune import autotune
-from mimopilot.sitl.studies.optimum import OptimumTask, best_gains, flown_effort
+from mimopilot.sitl.studies.true_plant import TruePlant, optimum_on_true_plant, true_response
 from mimopilot.tuning.analysis.certify import certify
-from mimopilot.tuning.analysis.doublet_prediction import doublet_effort, doublet_model
-from mimopilot.tuning.analysis.stability_figures import GRID_STEP, sensitivity_peak
-from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS
+from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.design.cascade import tune
-from mimopilot.tuning.design.constrained_least_squares import INFEASIBLE
-from mimopilot.tuning.design.refine_for_manoeuvre import INTEGRAL_SHARE
+from mimopilot.tuning.design.prediction import Prediction, predict
+from mimopilot.tuning.design.response_design import flown_amplitude
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.motors import fit_motors
-from mimopilot.tuning.plant.frequency_response import measured_plant
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
-from mimopilot.tuning.plant.rigid_body_fit import rigid_body
 from mimopilot.tuning.provenance import Provenance
-from mimopilot.tuning.reference_model import SecondOrder
-from mimopilot.tuning.spec import Manoeuvre, TuningSpec
+from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
+from mimopilot.tuning.spec import TuningSpec
 
-#: Predicted effort of the refined gains over SISO's. The expectation allows 1.10; the rest is for prediction error.
-EFFORT_RATIO = 1.04
-#: Seeds whose logs give the typical effort of the refined gains and the typical error of Ms.
-TYPICAL = (0, 1, 2)
 #: Figures of a lost flight.
 LOST = Performance(**dict.fromkeys((field.name for field in fields(Performance)), np.inf))  # type: ignore[arg-type]
 
@@ -68,13 +62,20 @@ class AttitudeRun:
     flights : dict
         Method -> flights of the roll and the pitch doublet.
     figures : dict
-        Method -> `Performance` of both flights.
+        Method -> `Performance` of both flights against the thesis' models.
+    designed : dict
+        Method -> J_M,o (rad^2) of both flights against the attitude model of MIMO's design. Empty without a design.
+    truth : dict
+        Method -> exact figures on the true plant: ``true_Ms``, and ``noise``, the largest ratio over the axes of the
+        torque's noise at hover to that of the flown gains.
     """
 
     experiment: Flight
     gains: dict[str, Gains]
     flights: dict[str, list[Flight]]
     figures: dict[str, list[Performance]]
+    designed: dict[str, list[float]]
+    truth: dict[str, dict[str, float]]
 
 
 @cache
@@ -122,25 +123,26 @@ def tune_all(study: AttitudeStudy, measured: PlantEstimates, siso_log: Experimen
     if study.fitted:
         return {
             DEFAULT: default,
-            SISO: tune(siso_log, siso),
-            SISO_PRINTED: printed_gains(study, SISO, default),
-            MIMO: tune(log, mimo, measured),
-            MIMO_PRINTED: printed_gains(study, MIMO, default),
+            SISO_THESIS: tune(siso_log, siso),
+            SISO_PRINTED: printed_gains(study, SISO_PRINTED, PRINTED_KEYS[SISO_THESIS], default),
+            MIMO_THESIS: tune(log, mimo, measured),
+            MIMO_PRINTED: printed_gains(study, MIMO_PRINTED, PRINTED_KEYS[MIMO_THESIS], default),
         }
-    found = {DEFAULT: default, AUTOTUNE: autotune(log, default), SISO: tune(siso_log, siso)}
-    if siso_log is not log:
-        found[SISO_OWN] = tune(log, siso)
-    task = Manoeuvre(amplitude_deg=study.amplitude_deg, period_s=study.period_s)
-    roll, pitch = doublet_effort(found[SISO], doublet_model(measured, task))
-    task = task.model_copy(update={"effort": (EFFORT_RATIO * roll, EFFORT_RATIO * pitch)})
-    found[MIMO] = tune(log, mimo, measured)
-    found[REFINED] = tune(log, mimo.model_copy(update={"manoeuvre": task}), measured)
-    return found
+    own = {SISO_OWN: tune(log, siso)} if siso_log is not log else {}
+    return {
+        DEFAULT: default,
+        AUTOTUNE: autotune(log, default),
+        SISO_THESIS: tune(siso_log, siso),
+        **own,
+        MIMO_THESIS: tune(log, mimo, measured),
+        SISO: tune(log, TuningSpec(method="siso"), measured),
+        MIMO: tune(log, TuningSpec(), measured),
+    }
 
 
-def printed_gains(study: AttitudeStudy, method: str, default: Gains) -> Gains:
+def printed_gains(study: AttitudeStudy, method: str, key: str, default: Gains) -> Gains:
     """A gain set as the thesis prints it, in the frame (yaw, limits, filter) of the default gains."""
-    matrices: Any = {name: np.array(values) for name, values in study.gains_table[1][method].items()}
+    matrices: Any = {name: np.array(values) for name, values in study.gains_table[1][key].items()}
     return replace(default, certificate=None, provenance=Provenance(f"{method}, {study.gains_table[0]}"), **matrices)
 
 
@@ -151,110 +153,95 @@ def logs(study: AttitudeStudy, seed: int) -> tuple[Flight, Experiment, Experimen
     return flight, log, other
 
 
-def _short_doublets(study: AttitudeStudy, gains: Gains) -> list[Scenario]:
-    """The doublets without noise: the flight after them does not count, and a balanced vehicle needs no hover before.
-
-    An unbalanced one gets its trim as injected torque: the integrators would need seconds of hover to find it.
-    """
-    short = study.doublets(gains.Ts, tail=0.1, lead=0.1)
-    if study.lead_s == LEAD_S:
-        return short
-    long = study.doublets(gains.Ts)[0]
-    trim = fly_set(study.airframe, gains, long, 0, noise=False).record["moment"][long.window[0] - 1]
-    return [replace(task, excitation=np.tile(trim.astype(np.float64), (len(task.setpoint), 1))) for task in short]
-
-
-def optimum(study: AttitudeStudy, thorough: bool = True) -> dict[str, Gains]:
-    """The best gains on the true plant, within the certificate's margins.
-
-    Parameters
-    ----------
-    study : AttitudeStudy
-    thorough : bool
-        Descend from every start, else only until a descent ends within the constraints: half of the time, and J is up
-        to 7 % larger.
-
-    Returns
-    -------
-    dict
-        BEST: with the effort of the refined gains. BOUND: with any effort.
-    """
-    found, errors, bands = [], [], []
-    for seed in TYPICAL:
-        _, log, siso_log = logs(study, seed)
-        measured = PlantEstimates(log)
-        plant = measured.response
-        found.append(tune_all(study, measured, siso_log))
-        errors.append(sensitivity_peak(found[-1][REFINED], plant)[1])
-        bands.append(plant.omega[plant.coherent_run()[[0, -1]]])
-    doublets = _short_doublets(study, found[0][REFINED])
-    spent = [
-        [flown_effort(fly_set(study.airframe, gains[REFINED], task, 0, noise=False)) for task in doublets]
-        for gains in found
-    ]
-    # Margins of the true plant: its response from a log without noise, in the band of a log with noise; the limit on Ms
-    # is reduced by the error of Ms from a log with noise.
-    plant = measured_plant(experiment(study, study.airframe, TYPICAL[0], noise=False)[1])
-    body = rigid_body(plant)
-    low, high = np.median(bands, axis=0)
-    plant = plant.at((low <= plant.omega) & (plant.omega <= high)).interpolated(GRID_STEP)
-    vehicle, _, library = _vehicle_and_library(study.airframe)
-    task = OptimumTask(
-        airframe=vehicle.airframe,
-        library=library,
-        doublets=doublets,
-        outer=study.models(BEST, log.Ts)[1],
-        plant=plant,
-        body=body,
-        peak=DEFAULT_THRESHOLDS.thin_Ms - float(np.median(errors)),
-        effort=[float(rms) for rms in np.median(spent, axis=0)],
-        integral=INTEGRAL_SHARE * float(body.least(found[0][MIMO].Ki_i)),
+def best_gains(log: Experiment, airframe: Airframe, mimo: Gains) -> Gains:
+    """The best gains on the true plant for the attitude model of a design on the log: same cost, same constraints."""
+    assert log.flown is not None
+    model = design_model(mimo)
+    found = optimum_on_true_plant(
+        airframe, log.flown, amplitude=flown_amplitude(log), bandwidth=model.omega, starts=[mimo]
     )
-    starts = [*(gains[REFINED] for gains in found), found[0][AUTOTUNE]]
-    best = best_gains(task, starts) if thorough else _first_feasible(task, starts)
-    return {BEST: best, BOUND: best_gains(replace(task, effort=None), [best])}
+    return replace(found.gains, provenance=Provenance(BEST, outer_model=(model, model)))
 
 
-def _first_feasible(task: OptimumTask, starts: list[Gains]) -> Gains:
-    """The optimum from the first start whose descent ends within the constraints, else the one nearest to them."""
-    ends: list[tuple[float, Gains]] = []
-    for start in starts:
-        found = best_gains(task, [start])
-        left = min(task.examine(found)[1])
-        if left > -INFEASIBLE:
-            return found
-        ends.append((left, found))
-    return max(ends, key=lambda end: end[0])[1]
+def design_model(gains: Gains) -> SecondOrder:
+    """Attitude model that designed gains follow."""
+    assert gains.provenance.outer_model is not None
+    model = gains.provenance.outer_model[0]
+    assert isinstance(model, SecondOrder)
+    return model
 
 
-def run(study: AttitudeStudy, seed: int, best: dict[str, Gains]) -> AttitudeRun:
+def true_figures(airframe: Airframe, gains: Mapping[str, Gains]) -> dict[str, dict[str, float]]:
+    """Exact figures of gain sets, one of which is `DEFAULT`, see `AttitudeRun.truth`."""
+    Ts = gains[DEFAULT].Ts
+    plant, truth = true_response(airframe, Ts), TruePlant(airframe, Ts)
+    task = manoeuvres(plant, SecondOrder(10.0, 0.7).discretise(Ts))  # does not matter for the noise
+    flown = predict(gains[DEFAULT], plant, task)
+    return {
+        method: {
+            "true_Ms": truth.sensitivity_peak(one),
+            "noise": noise_ratio(predict(one, plant, task), flown),
+        }
+        for method, one in gains.items()
+    }
+
+
+def noise_ratio(ours: Prediction, flown: Prediction) -> float:
+    """Largest ratio over the axes of the torque's noise at hover."""
+    return float(max(a / b for a, b in zip(ours.noise, flown.noise, strict=True)))
+
+
+@reproducible
+def run(study: AttitudeStudy, seed: int) -> AttitudeRun:
     """Fly the experiment, tune, certify, and fly both doublets with every gain set."""
     flight, log, siso_log = logs(study, seed)
     measured = PlantEstimates(log)
+    airframe = _vehicle_and_library(study.airframe)[0].airframe
+    tuned = tune_all(study, measured, siso_log)
+    if MIMO in tuned:
+        tuned[BEST] = best_gains(log, airframe, tuned[MIMO])
     inner, outer = ([model] * 2 for model in study.models(MIMO, log.Ts))
     gains = {
         method: found.with_certificate(certify(found, measured.response, inner, outer))
-        for method, found in (tune_all(study, measured, siso_log) | best).items()
+        for method, found in tuned.items()
     }
     doublets = study.doublets(log.Ts)
     flights = {m: [fly_set(study.airframe, found, task, seed) for task in doublets] for m, found in gains.items()}
     figures = {
-        method: [
-            LOST if one.crashed_at is not None else performance(one, *study.models(method, log.Ts)) for one in both
-        ]
+        method: [performance_or_lost(one, *study.models(method, log.Ts)) for one in both]
         for method, both in flights.items()
     }
-    return AttitudeRun(flight, gains, flights, figures)
+    designed = {}
+    if MIMO in gains:
+        model = design_model(tuned[MIMO]).discretise(log.Ts)
+        designed = {
+            method: [performance_or_lost(one, study.models(method, log.Ts)[0], model).J_M_o for one in both]
+            for method, both in flights.items()
+        }
+    return AttitudeRun(flight, gains, flights, figures, designed, true_figures(airframe, gains))
+
+
+def performance_or_lost(flight: Flight, inner: ReferenceModel, outer: ReferenceModel) -> Performance:
+    """Performance of a flight; all figures are infinite when the vehicle was lost."""
+    return LOST if flight.crashed_at is not None else performance(flight, inner, outer)
 
 
 def numbers(found: AttitudeRun) -> dict[str, Any]:
-    """The part of a run that goes into the statistics: figures, verdicts and gains by method."""
+    """The part of a run that goes into the statistics: figures, verdicts and gains by method.
+
+    The figures of an axis are those of `Performance`, and ``J_M_o_design`` of `AttitudeRun.designed` if there is one.
+    """
     return {
         method: {
             "verdict": gains.verdict()[0],
             "Ms": gains.certificate.figures.get("Ms") if gains.certificate else None,
+            **found.truth[method],
             "gains": {name: np.asarray(getattr(gains, name)).tolist() for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i")},
-            **{axis: asdict(figures) for axis, figures in zip(AXES, found.figures[method], strict=True)},
+            **{
+                axis: asdict(found.figures[method][column])
+                | ({"J_M_o_design": found.designed[method][column]} if found.designed else {})
+                for column, axis in enumerate(AXES)
+            },
         }
         for method, gains in found.gains.items()
     }

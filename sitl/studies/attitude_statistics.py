@@ -26,12 +26,16 @@ class StudyStatistics:
     runs: list[dict[str, Any]]
 
     def values(self, method: str, axis: str, figure: str) -> NDArray[np.float64]:
-        """One figure of `Performance` over the seeds, (seeds,)."""
+        """One figure of the doublets on an axis over the seeds, (seeds,); see `attitude_run.numbers`."""
         return np.array([run[method][axis][figure] for run in self.runs], dtype=np.float64)
 
     def median(self, method: str, axis: str, figure: str) -> float:
         """The median of `values`."""
         return float(np.median(self.values(method, axis, figure)))
+
+    def true_median(self, method: str, figure: str) -> float:
+        """Median of an exact figure: ``true_Ms`` or ``noise``, see `attitude_run.AttitudeRun`."""
+        return float(np.median([run[method][figure] for run in self.runs]))
 
     def gains(self, method: str, matrix: str) -> NDArray[np.float64]:
         """A matrix over the seeds, (seeds, 2, 2)."""

@@ -12,10 +12,16 @@ from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet, limit_rate
 from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.tuning.reference_model import ReferenceModel, second_order
 
-DEFAULT, AUTOTUNE, SISO, SISO_OWN = "default", "autotune", "SISO", "SISO, perturbed log"
-MIMO, REFINED, BEST, BOUND = "MIMO", "MIMO for the doublet", "best on the true plant", "the same with any effort"
+#: The gains that flew, and those of the rule of PX4's autotune.
+DEFAULT, AUTOTUNE = "default", "autotune"
+#: VRFT for the thesis' reference models; SISO also on the vehicle's own log where the thesis took another one.
+SISO_THESIS, MIMO_THESIS, SISO_OWN = "SISO, thesis' models", "MIMO, thesis' models", "SISO, thesis' models, own log"
+#: Designed on the measured response, axis by axis and with full matrices, and the same on the true plant.
+SISO, MIMO, BEST = "SISO", "MIMO", "best on the true plant"
 #: The thesis' printed gains, flown here.
 SISO_PRINTED, MIMO_PRINTED = "SISO as printed", "MIMO as printed"
+#: Method -> its key in the thesis' tables.
+PRINTED_KEYS = {SISO_THESIS: "SISO", MIMO_THESIS: "MIMO"}
 #: s of hover before a doublet; with a mass at one motor the integrators need longer to trim.
 LEAD_S, TRIM_S = 1.0, 6.0
 
@@ -32,9 +38,9 @@ class AttitudeStudy:
     name, title : str
     airframe : str
     inner, outer : (rad/s, damping, delay in samples)
-        Reference models of the rate and the attitude loop.
+        The thesis' reference models of the rate and the attitude loop.
     siso_models : (inner, outer)
-        Reference models of SISO.
+        The same for SISO.
     siso_airframe : str
         Vehicle on whose log SISO is tuned.
     amplitude_deg, period_s : float
@@ -48,7 +54,7 @@ class AttitudeStudy:
     costs_table : (str, axis, mapping)
         The same for the costs J.
     offaxis : float or None
-        Largest off-axis peak of MIMO over SISO's; None: the axes are not coupled.
+        Largest off-axis peak of MIMO over SISO's, both by design; None: the axes are not coupled.
     fitted : bool
         The airframe is fitted to the printed gains. It flies the thesis' methods, tuned in the thesis' way, and the
         printed gains themselves; there are no expectations of ours.
@@ -77,8 +83,9 @@ class AttitudeStudy:
     rate_limit_deg_s: float | None = None
 
     def models(self, method: str, Ts: float) -> tuple[ReferenceModel, ReferenceModel]:
-        """Reference models of rate and attitude loop for the costs of a method: those it was tuned for."""
-        inner, outer = self.siso_models if method in (SISO, SISO_OWN, SISO_PRINTED) else (self.inner, self.outer)
+        """The thesis' reference models of rate and attitude loop for the costs of a method: MIMO's, or SISO's own."""
+        own = method in (SISO_THESIS, SISO_OWN, SISO_PRINTED)
+        inner, outer = self.siso_models if own else (self.inner, self.outer)
         return second_order(*inner, Ts), second_order(*outer, Ts)
 
     def doublets(self, Ts: float, **lengths: float) -> list[Scenario]:
@@ -92,9 +99,9 @@ class AttitudeStudy:
     def methods(self) -> list[str]:
         """Names of all methods, in the order of the tables."""
         if self.fitted:
-            return [DEFAULT, SISO, SISO_PRINTED, MIMO, MIMO_PRINTED]
+            return [DEFAULT, SISO_THESIS, SISO_PRINTED, MIMO_THESIS, MIMO_PRINTED]
         own = [SISO_OWN] if self.siso_airframe != self.airframe else []
-        return [DEFAULT, AUTOTUNE, SISO, *own, MIMO, REFINED, BEST, BOUND]
+        return [DEFAULT, AUTOTUNE, SISO_THESIS, *own, MIMO_THESIS, SISO, MIMO, BEST]
 
 
 def studies() -> dict[str, AttitudeStudy]:

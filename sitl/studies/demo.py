@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -27,14 +26,17 @@ from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.mavlink.simulator_api import lockstep
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
-from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.spec import load_spec
 
 AIRFRAME = "adam0"
-METHODS = ("default", "siso", "mimo")
+#: Gain set -> its name in tables and plots.
+LABELS = {"default": "flown", "siso": "SISO", "mimo": "MIMO"}
+METHODS = tuple(LABELS)
+#: The same in the predicted figures of the set with full matrices.
+PREDICTED = {"flown": "flown", "siso": "SISO", "tuned": "MIMO"}
 #: PRBS of the experiment: s per axis, amplitude (normalised torque), bandwidth (rad/s).
 SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH = 20.0, 0.15, 50.0
 DOUBLET_DEG, DOUBLET_S = 22.5, 0.42  # deg, s: the thesis' simulated doublet
@@ -110,7 +112,7 @@ def run_demo(out: Path, seed: int) -> DemoSummary:
         flight = _survived(fly(airframe, autopilot, scenario, seed))
         save_flight(log, flight, airframe, gains["default"])
 
-    with _stage("tuning: SISO and MIMO VRFT from the log"):
+    with _stage("tuning: gains designed on the log's response, axis by axis (SISO) and with full matrices (MIMO)"):
         experiment = read_log(log)
         for method in ("siso", "mimo"):
             gains[method] = tune(experiment, load_spec(method=method))
@@ -189,46 +191,45 @@ def _check_over_mavlink(
 
 
 def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
-    printed = json.loads(TABLES.read_text())["adam0_simulation"]["table_5_4"]
-    sets: list[tuple[str, Any]] = [
-        ("default", gains["default"]),
-        ("SISO", gains["siso"]),
-        ("SISO, Table 5.4", printed["SISO"]),
-        ("MIMO", gains["mimo"]),
-        ("MIMO, Table 5.4", printed["MIMO"]),
-    ]
     rows = []
     for name in gains["mimo"].matrices:
         if name == "Kff_i":
             continue  # zero in every gain set
-        for label, values in sets:
-            matrix = values[name] if isinstance(values, dict) else getattr(values, name)
-            found = {} if isinstance(values, dict) else values.provenance.standard_deviation
+        for method, label in LABELS.items():
+            found = gains[method].provenance.standard_deviation
             spread = [f" ({v:.4f})" for v in np.ravel(found[name])] if name in found else [""] * 4
-            numbers = [f"{float(v):.4f}".replace("-0.0000", "0.0000") for v in np.ravel(matrix)]
+            values = np.ravel(getattr(gains[method], name))
+            numbers = [f"{float(v):.4f}".replace("-0.0000", "0.0000") for v in values]
             rows.append([f"{name}  {label}", *(number + s for number, s in zip(numbers, spread, strict=True))])
     return rows
 
 
+def _predicted_rows(gains: dict[str, Gains]) -> list[list[str]]:
+    """Predicted figures of the three sets, roll / pitch, for MIMO's attitude model."""
+    predicted = gains["mimo"].provenance.details["predicted"]
+    return [
+        [
+            label,
+            *(" / ".join(f"{value:.2f}" for value in one[name]) for name in ("follow_deg", "offaxis_deg")),
+            " / ".join(f"{value:.2f}" for value in one["disturbance_deg"]),
+            " / ".join(f"{value:.4f}" for value in one["noise"]),
+            f"{one['Ms']:.2f}",
+        ]
+        for key, label in PREDICTED.items()
+        for one in predicted[key]
+    ]
+
+
 GAIN_COLUMNS = ("gain", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
-FIGURE_COLUMNS = (
-    "doublet",
-    "J_M,o",
-    "J_M,i",
-    "J_r,o",
-    "J_r,i",
-    "off-axis peak [deg]",
-    "off-axis RMS [deg]",
-    "effort RMS",
-)
+PREDICTED_COLUMNS = ("set", "following [deg]", "off-axis [deg]", "after a torque [deg]", "noise of u", "Ms")
+FIGURE_COLUMNS = ("doublet", "J_M,o", "J_r,o", "J_r,i", "off-axis peak [deg]", "off-axis RMS [deg]", "effort RMS")
 
 
 def _figure_rows(figures: dict[str, dict[str, Performance]]) -> list[list[str]]:
     return [
         [
-            f"{axis}, {method if method == 'default' else method.upper()}",
+            f"{axis}, {LABELS[method]}",
             f"{p.J_M_o:.5f}",
-            f"{p.J_M_i:.4f}",
             f"{p.J_r_o:.4f}",
             f"{p.J_r_i:.3f}",
             f"{p.offaxis_peak_deg:.2f}",
@@ -248,35 +249,42 @@ def _write_report(
     experiment: Flight,
 ) -> None:
     inner, outer = gains["mimo"].reference_models(0)
-    labels = {"default": "default", "siso": "SISO", "mimo": "MIMO"}
     doublets = [
-        svg(manoeuvre_figure({labels[m]: f for m, f in methods.items()}, inner, outer), axis)
+        svg(manoeuvre_figure({LABELS[m]: f for m, f in methods.items()}, inner, outer), axis)
         for axis, methods in flights.items()
     ]
     lead = (
         "ADAM-0 with 10 % inertia coupling (class values: the thesis prints no inertia), tuned from one "
-        f"{2 * SECONDS_PER_AXIS:g} s closed-loop flight. Reference models (rad/s, damping, delay in samples): "
-        f"rate loop {inner.label}; attitude loop {outer.label}."
+        f"{2 * SECONDS_PER_AXIS:g} s closed-loop flight without a model of the vehicle. The design finds the attitude "
+        f"model that can be followed within its limits: {outer.label} (rad/s, damping, delay in samples). SISO: the "
+        "same design, axis by axis."
     )
+    limits = "; ".join(gains["mimo"].provenance.details["limited_by"]) or "nothing"
     sections = [
         Section(
             "Experiment",
             f"PRBS torque of amplitude {AMPLITUDE:g} and bandwidth {BANDWIDTH:g} rad/s on roll, then on pitch, "
-            "under the default gains.",
+            "under the flown gains.",
             figures=[svg(experiment_figure(experiment), "experiment")],
         ),
         Section(
             "Gains",
-            "Beside the thesis' values for its own simulator, whose inertia is not printed. In brackets: the spread to "
-            "expect if the flight were repeated with fresh noise (standard deviation). Kp_o in 1/s, Kp_i in s, Ki_i "
-            "dimensionless, Kd_i in s^2; a small negative Kd_i means that these models need no damping beyond the "
-            "vehicle's own. SISO tunes each axis by itself with the same instruments.",
+            "In brackets: the spread to expect if the flight were repeated (standard deviation). Kp_o in 1/s, Kp_i in "
+            f"s, Ki_i dimensionless, Kd_i in s^2. MIMO is limited by: {limits}.",
             tables=[ReportTable("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
         ),
         Section(
+            "Predicted from the log",
+            "Roll / pitch. RMS over doublets of 10 degrees and 0.4 to 2 s, and 1 s after: error to the attitude model "
+            "above, for all sets; angle of the other axis. RMS of the angles after a step of torque. RMS of the torque "
+            "(normalised) that noise causes at hover. Largest peak of the sensitivity, Ms.",
+            tables=[ReportTable("Predicted figures", PREDICTED_COLUMNS, _predicted_rows(gains))],
+        ),
+        Section(
             "Doublets",
-            f"{DOUBLET_DEG:g} degrees, {DOUBLET_S:g} s. J in rad^2 and rad^2/s^2, over the doublet. The flight over "
-            "MAVLink (roll, MIMO) gave the same torques bit for bit.",
+            f"{DOUBLET_DEG:g} degrees, {DOUBLET_S:g} s. J in rad^2 and rad^2/s^2, over the doublet; J_M,o against the "
+            "attitude model above, for all sets. The flight over MAVLink (roll, MIMO) gave the same torques bit for "
+            "bit.",
             tables=[ReportTable("Performance figures, (6.1)-(6.4)", FIGURE_COLUMNS, _figure_rows(figures))],
             figures=doublets,
         ),
@@ -286,8 +294,11 @@ def _write_report(
 
 def print_summary(summary: DemoSummary) -> None:
     """Print the tables and the paths of all files."""
-    print_table("Gains beside Table 5.4 of the thesis", GAIN_COLUMNS, _gain_rows(summary.gains))
-    title = f"Doublet of {DOUBLET_DEG:g} deg, {DOUBLET_S:g} s: J in rad^2 and rad^2/s^2"
+    print_table(
+        "Gains by the design on the log's response, beside those that flew", GAIN_COLUMNS, _gain_rows(summary.gains)
+    )
+    print_table("Predicted from the log, roll / pitch", PREDICTED_COLUMNS, _predicted_rows(summary.gains))
+    title = f"Flown: doublet of {DOUBLET_DEG:g} deg, {DOUBLET_S:g} s; J in rad^2 and rad^2/s^2"
     print_table(title, FIGURE_COLUMNS, _figure_rows(summary.figures))
     print(
         f"over MAVLink (roll, MIMO): {summary.mavlink_samples} torques, 0 differ from the flight in process; "

@@ -9,7 +9,13 @@ import numpy as np
 
 from mimopilot.common.html_report import ReportTable
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
-from mimopilot.sitl.studies.attitude_study import MIMO, MIMO_PRINTED, SISO, SISO_PRINTED
+from mimopilot.sitl.studies.attitude_study import (
+    MIMO_PRINTED,
+    MIMO_THESIS,
+    PRINTED_KEYS,
+    SISO_PRINTED,
+    SISO_THESIS,
+)
 
 #: Largest relative difference that counts as equal, and half a unit of the last printed digit of a gain.
 NEAR, ROUNDING = 0.15, 5e-5
@@ -53,20 +59,23 @@ def printed_figures(found: StudyStatistics) -> list[PrintedFigure]:
     """Every printed figure of a study that is not zero."""
     study = found.study
     figures = []
-    for method, matrices in study.gains_table[1].items():
+    methods = {key: method for method, key in PRINTED_KEYS.items()}
+    for key, matrices in study.gains_table[1].items():
         for matrix, printed in matrices.items():
-            ours = np.median(found.gains(method, matrix), axis=0)
+            ours = np.median(found.gains(methods[key], matrix), axis=0)
             for (i, j), value in np.ndenumerate(np.array(printed)):
                 if value:
-                    name = f"{method} {matrix}({i + 1},{j + 1})"
+                    name = f"{key} {matrix}({i + 1},{j + 1})"
                     figures.append(PrintedFigure(name, "gain", float(value), float(ours[i, j])))
     _, axis, costs = study.costs_table
-    for method, flown in costs.items():
-        for cost, value in flown.items():
-            figures.append(PrintedFigure(f"{method} {COSTS[cost]}", "cost", value, found.median(method, axis, cost)))
+    for key, entries in costs.items():
+        for cost, value in entries.items():
+            median = found.median(methods[key], axis, cost)
+            figures.append(PrintedFigure(f"{key} {COSTS[cost]}", "cost", value, median))
     for cost, symbol in COSTS.items() if costs else ():
-        printed_ratio = costs[MIMO][cost] / costs[SISO][cost]
-        for text, over, under in (("", MIMO, SISO), (", printed gains", MIMO_PRINTED, SISO_PRINTED)):
+        printed_ratio = costs["MIMO"][cost] / costs["SISO"][cost]
+        pairs = {"": (MIMO_THESIS, SISO_THESIS), ", printed gains": (MIMO_PRINTED, SISO_PRINTED)}
+        for text, (over, under) in pairs.items():
             ours_ratio = found.median(over, axis, cost) / found.median(under, axis, cost)
             figures.append(PrintedFigure(f"{symbol} MIMO/SISO{text}", "ratio", printed_ratio, ours_ratio))
     return figures

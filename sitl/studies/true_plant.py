@@ -14,14 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.sitl.physics.airframe import Airframe
-from mimopilot.sitl.physics.linear_model import control_effectiveness, linear_model
+from mimopilot.sitl.physics.linear_model import control_effectiveness, linear_model, linear_model_with_noise
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.sitl.physics.state_estimate import low_pass
-from mimopilot.tuning.analysis.closed_loop import singular_values
-from mimopilot.tuning.design.response_design import Design, ResponseDesign
+from mimopilot.sitl.studies.linear_loop import LinearLoop, controller_of
+from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import cascade_response, rate_matrices, state_space
 from mimopilot.tuning.motors import Motors
 from mimopilot.tuning.plant.frequency_response import PlantResponse, hermitian_root
 from mimopilot.tuning.plant.rigid_body_fit import LOWEST, RigidBody
@@ -38,7 +37,6 @@ GUST_SECONDS = 0.5
 #: Integral and proportional gains of a starting point from the rigid body: attitude (rad/s), rate loop (rad/s).
 START_ATTITUDE, START_RATE = 4.0, 12.0
 
-Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
 
@@ -136,32 +134,25 @@ class TruePlant:
 
     @cached_property
     def model(self) -> StateSpace:
-        """See `sitl.physics.linear_model.linear_model`."""
-        return linear_model(self.airframe, self.Ts)
+        """See `sitl.physics.linear_model.linear_model_with_noise`."""
+        return linear_model_with_noise(self.airframe, self.Ts)
 
     @cached_property
-    def _fine(self) -> tuple[Signal, Complex]:
-        omega = frequencies(self.airframe, self.Ts, FINE_STEP)
-        return omega, self.model.frequency_response(omega)
+    def fine(self) -> Signal:
+        """Frequencies (K,), rad/s, dense enough for the margin."""
+        return frequencies(self.airframe, self.Ts, FINE_STEP)
+
+    def loop(self, gains: Gains) -> LinearLoop:
+        """The loop of a gain set."""
+        return LinearLoop(self.model, controller_of(gains))
 
     def sensitivity_peak(self, gains: Gains) -> float:
         """Ms: largest singular value of the sensitivity, cut at the torques. Says nothing about stability."""
-        omega, G = self._fine
-        _, C_o, C_y = cascade_response(gains, omega)
-        return float(1 / singular_values(np.eye(2) + C_y @ G[:, :2] + C_o @ G[:, 2:])[1].min())
+        return self.loop(gains).sensitivity_peak(self.fine)
 
     def spectral_radius(self, gains: Gains) -> float:
         """Largest modulus of the closed loop's poles; the loop is stable below 1."""
-        plant, law = self.model, state_space(rate_matrices(gains), gains.filters)
-        n = len(plant.A)
-        rate, angle = plant.C[:2], plant.C[2:]
-        setpoint = -gains.Kp_o @ angle
-        signals = {"error": setpoint - rate, "rate": rate, "setpoint": setpoint}
-        of_x = sum(law.D[name] @ signal for name, signal in signals.items())
-        into_law = sum(law.B[name] @ signal for name, signal in signals.items())
-        loop = np.block([[plant.A + plant.B @ of_x, plant.B @ law.C], [into_law, law.A]])
-        assert loop.shape == (n + len(law.A),) * 2
-        return float(np.abs(np.linalg.eigvals(loop)).max())
+        return self.loop(gains).spectral_radius
 
 
 def flight_of(airframe: Airframe, flown: Gains, amplitude: float) -> Experiment:
@@ -190,6 +181,7 @@ def optimum_on_true_plant(
     bandwidth: float | None = None,
     starts: Sequence[Gains] = (),
     limits: DesignLimits | None = None,
+    follow_model: bool = False,
 ) -> Design:
     """The best gains of the structure on the true plant, within the constraints of the design.
 
@@ -208,10 +200,16 @@ def optimum_on_true_plant(
         Further starting points.
     limits : DesignLimits, optional
         By default those of `mimopilot tune`.
+    follow_model : bool
+        With model following: the attitude model runs in the controller.
     """
     spec = TuningSpec()
     plant, flight = true_response(airframe, flown.Ts, gusts), flight_of(airframe, flown, amplitude)
     bench = ResponseDesign.around([plant], [flight], limits or spec.design)
-    decoupled = START_RATE * np.linalg.inv(plant.body.B).astype(np.float64)
-    rigid = replace(flown, Kp_o=START_ATTITUDE * np.eye(2), Kp_i=decoupled, Ki_i=decoupled)
-    return bench.design([flown, rigid, *starts], spec.structure, spec.method == "mimo", bandwidth)
+    inverse = np.linalg.inv(plant.body.B).astype(np.float64)
+    first = flown
+    if follow_model:  # the bandwidth is the design's
+        filters = replace(flown.filters, model_omega=bandwidth or FIRST_BANDWIDTH)
+        first = replace(flown, filters=filters, Kff_o=np.eye(2), Kaff_i=inverse)
+    rigid = replace(first, Kp_o=START_ATTITUDE * np.eye(2), Kp_i=START_RATE * inverse, Ki_i=START_RATE * inverse)
+    return bench.design([first, rigid, *starts], spec.structure, spec.method == "mimo", bandwidth)

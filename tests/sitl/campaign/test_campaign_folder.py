@@ -10,7 +10,8 @@ from mimopilot.common.part_folder import PartFolder
 from mimopilot.sitl.campaign.execution import run_campaign
 from mimopilot.sitl.campaign.flights import CHUNK, fly_chunk
 from mimopilot.sitl.campaign.plan import LOCK, PARTS, RESULTS, make_plan, write_plan_files
-from mimopilot.sitl.campaign.summary import CampaignResults
+from mimopilot.sitl.campaign.results import CampaignResults
+from mimopilot.sitl.campaign.summary import summarise
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.airframe import load_airframe
 
@@ -116,11 +117,11 @@ def test_damaged_results_are_reported_or_read_correctly(flown, tmp_path):
     plan, results, _ = flown
     path = tmp_path / RESULTS
     path.write_bytes(results)
-    expected, refused = CampaignResults(plan, path).summarise(), 0
+    expected, refused = summarise(CampaignResults(plan, path)), 0
     for place in range(0, len(results), len(results) // 60):
         path.write_bytes(results[:place] + bytes([results[place] ^ 8]) + results[place + 1 :])
         try:
-            assert CampaignResults(plan, path).summarise() == expected
+            assert summarise(CampaignResults(plan, path)) == expected
         except SitlError as error:
             assert f"{path}: damaged; remove it" in str(error)
             refused += 1

@@ -15,10 +15,10 @@ from mimopilot.sitl.studies.attitude_run import experiment
 from mimopilot.sitl.studies.attitude_study import (
     AUTOTUNE,
     BEST,
-    BOUND,
+    DEFAULT,
     MIMO,
     MIMO_PRINTED,
-    REFINED,
+    MIMO_THESIS,
     SISO,
     SISO_OWN,
     SISO_PRINTED,
@@ -26,7 +26,7 @@ from mimopilot.sitl.studies.attitude_study import (
 )
 from mimopilot.sitl.studies.autotune import autotune, identify_arx, minimum_variance_pid
 from mimopilot.sitl.studies.benchmarks import TABLES
-from mimopilot.sitl.studies.expectations import EFFORT, expectations
+from mimopilot.sitl.studies.expectations import expectations
 from mimopilot.sitl.studies.printed_figures import printed_figures
 from mimopilot.sitl.studies.reproduce import ALL, STUDIES, reproduce
 
@@ -67,7 +67,7 @@ def fitted(tmp_path_factory):
 
 
 def test_the_command_lists_every_study():
-    assert [choice.value for choice in Choice] == [*STUDIES, ALL]
+    assert [choice.value for choice in Choice] == [*STUDIES, ALL, "vehicles", "gains"]
 
 
 def test_studies_take_their_values_from_the_printed_tables():
@@ -89,42 +89,54 @@ def test_the_boom_couples_the_axes_by_forty_per_cent_and_keeps_the_balance():
     assert plant.rotors.mean(axis=0) == pytest.approx(0, abs=1e-12)
 
 
-def test_decoupling_and_effort_are_as_expected(found):
-    rows = [row for row in expectations(list(found.values())) if row.over == SISO]
-    assert len(rows) == 2 * 3 * 2
+def test_the_design_meets_every_expectation(found):
+    rows = expectations(list(found.values()))
+    assert len(rows) == 2 * (3 * 2 + 2)
     for row in rows:
-        assert row.met(REFINED), row
+        assert row.met, row
 
 
-def test_tracking_is_near_the_best_possible(found):
-    rows = [row for row in expectations(list(found.values())) if row.over == BEST]
-    assert len(rows) == 4
-    for row in rows:
-        assert row.met(REFINED), row
+def test_an_expectation_is_a_ratio_of_medians_for_one_attitude_model(found):
+    statistics = found["coupled"]
+    row = next(
+        row for row in expectations([statistics]) if (row.figure, row.over, row.axis) == ("J_M_o_design", BEST, "pitch")
+    )
+    ours, best = ([run[method]["pitch"]["J_M_o_design"] for run in statistics.runs] for method in (MIMO, BEST))
+    assert row.value == np.median(ours) / np.median(best)
+    assert 0.9 < row.value <= row.limit == 1.15
 
 
 @pytest.mark.parametrize("name", ["adam0-perturbed", "coupled"])
-def test_the_optimum_on_the_true_plant_is_within_its_limits_and_the_best_method(found, name):
+def test_the_optimum_on_the_true_plant_is_within_the_limits_of_the_design_and_decouples(found, name):
     statistics = found[name]
+    assert statistics.true_median(BEST, "noise") <= 1.5 * 1.01
+    assert statistics.true_median(BEST, "true_Ms") <= 1.6 * 1.01
+    assert statistics.true_median(DEFAULT, "noise") == 1.0
     for axis in AXES:
-        # 5 % without noise; noise through high gains adds to it.
-        assert statistics.median(BEST, axis, "effort_rms") < EFFORT * statistics.median(SISO, axis, "effort_rms")
-        for method in (SISO, MIMO):
-            assert statistics.median(BEST, axis, "J_M_o") < statistics.median(method, axis, "J_M_o")
-        assert statistics.median(BOUND, axis, "J_M_o") < statistics.median(BEST, axis, "J_M_o")
+        # On the flown axis alone diagonal gains may follow better: what the other axis does is not in J_M,o.
+        for method in (DEFAULT, MIMO_THESIS):
+            assert statistics.median(BEST, axis, "J_M_o_design") < statistics.median(method, axis, "J_M_o_design")
+        assert statistics.median(BEST, axis, "offaxis_peak_deg") < 0.25 * statistics.median(
+            SISO, axis, "offaxis_peak_deg"
+        )
 
 
-def test_siso_gains_from_the_vehicles_own_log_do_not_decouple(found):
+def test_every_method_of_the_tables_is_flown(found):
+    for name, one in found.items():
+        assert set(one.runs[0]) == set(studies()[name].methods())
+
+
+def test_siso_gains_do_not_decouple(found):
     statistics = found["adam0-perturbed"]
     for axis in AXES:
-        assert statistics.median(SISO_OWN, axis, "J_M_o") < statistics.median(SISO, axis, "J_M_o")
         assert statistics.median(SISO_OWN, axis, "offaxis_peak_deg") > 1.5
+        assert statistics.median(SISO, axis, "offaxis_peak_deg") > 4 * statistics.median(MIMO, axis, "offaxis_peak_deg")
 
 
 def test_a_run_does_not_depend_on_its_process(results):
     study = studies()["coupled"]
     with processes(1) as pool:
-        again = pool.submit(run_once, (study, 1), results["coupled-best"]).result()
+        again = pool.submit(run_once, (study, 1)).result()
     assert json.dumps(again) == json.dumps(results["coupled-0001"])
 
 
@@ -182,7 +194,7 @@ def test_mimo_gains_of_the_rate_loop_come_out(fitted):
 
 
 def test_the_mass_turns_the_printed_off_diagonal_gains_negative(fitted):
-    ours = np.median(fitted["adam0-perturbed-thesis"].gains(MIMO, "Kp_i"), axis=0)
+    ours = np.median(fitted["adam0-perturbed-thesis"].gains(MIMO_THESIS, "Kp_i"), axis=0)
     assert ours[0, 1] == pytest.approx(-0.0065, rel=0.15)
     assert ours[1, 0] == pytest.approx(-0.0076, rel=0.15)
 
@@ -202,16 +214,16 @@ def test_the_printed_gains_of_mimo_follow_better_than_those_of_siso(fitted):
 
 def test_with_a_rate_limiter_the_costs_of_mimo_in_table_6_3_come_out(fitted):
     statistics = fitted["adam0-thesis"]
-    costs = statistics.study.costs_table[2][MIMO]
+    costs = statistics.study.costs_table[2]["MIMO"]
     for figure in ("J_M_o", "J_r_o", "J_r_i"):
-        assert statistics.median(MIMO, "roll", figure) == pytest.approx(costs[figure], rel=0.20)
+        assert statistics.median(MIMO_THESIS, "roll", figure) == pytest.approx(costs[figure], rel=0.20)
     task = statistics.study.doublets(0.004)[0]
     assert np.abs(np.diff(task.setpoint[:, 0])).max() == pytest.approx(np.radians(220.0) * 0.004)
 
 
 def test_printed_gains_are_flown_as_printed(fitted):
     statistics = fitted["adam0-thesis"]
-    for method, printed in ((SISO_PRINTED, SISO), (MIMO_PRINTED, MIMO)):
+    for method, printed in ((SISO_PRINTED, "SISO"), (MIMO_PRINTED, "MIMO")):
         wanted = PRINTED["adam0_flight_nominal"]["table_6_2"][printed]
         for matrix, value in wanted.items():
             assert (statistics.gains(method, matrix) == np.array(value)).all()
