@@ -21,6 +21,9 @@ MIN_FREQUENCIES = 4
 LOWEST = 0.1
 #: Largest relative step between neighbouring frequencies below the band.
 STEP = 0.15
+#: Least damping of the continued body, 1/s: every rotor damps, and without damping the count of encirclements would need
+#: one more integrator.
+LEAST_DAMPING = 0.3
 #: Relative error of the response above which the fitted body is the better estimate where the band begins: its own is
 #: 1 to 20 %, from the choice of lag and damping (20 random vehicles).
 DEVIATION = 0.1
@@ -137,7 +140,8 @@ def continued_below(plant: PlantResponse, body: RigidBody) -> PlantResponse:
     if first <= LOWEST:
         return plant
     omega = np.geomspace(LOWEST, first, int(np.ceil(np.log(first / LOWEST) / np.log1p(STEP))) + 1)[:-1]
-    G = body.B * shape_response(omega, body.shape)[:, None, None]
+    delay, lag, damping = body.shape
+    G = body.B * shape_response(omega, (delay, lag, max(damping, LEAST_DAMPING)))[:, None, None]
     s = 1j * omega[:, None, None]
     # Its error is real, a few percent of B, where the loop's gain is large: no phase is drawn for it.
     root = np.zeros((len(omega), 6, 6), complex)
