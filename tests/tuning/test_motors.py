@@ -72,7 +72,10 @@ def test_commands_that_the_torque_does_not_explain_give_no_motors():
 @given(roll=UNIT, pitch=UNIT, collective=st.floats(0.05, 1))
 @settings(max_examples=300, deadline=None)
 def test_commands_are_read_at_any_rate_and_with_any_thrust_curve(tmp_path):
-    """A PX4 log with four of twelve motors, logged at 10 Hz. With THR_MDL_FAC 0, PX4's default, they still say how far a motor is from its limits."""
+    """A PX4 log with four of twelve motors, logged at 10 Hz.
+
+    With THR_MDL_FAC 0, PX4's default, the commands still say how far a motor is from its limits.
+    """
     flight = make_flight()
     mixer = np.sqrt(0.5) * np.array([[-1.0, 1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, -1.0]])
     control = np.full((len(flight.t), 12), np.nan, np.float32)

@@ -14,9 +14,9 @@ from mimopilot.tuning.plant.frequency_response import COHERENT, PlantResponse
 
 #: Largest gain of the rate loop above the band: 6 dB below instability, if the plant falls like an integrator there.
 MAX_GAIN_ABOVE_BAND = 0.5
-#: Largest sensitivity at the band's lower end: all frequencies at which the loop amplifies must be measured. Below,
-#: where it attenuates, the vehicle is the fitted rigid body.
-MAX_SENSITIVITY_BELOW_BAND = 1.0
+#: Largest sensitivity at the band's lower end, below which the vehicle is the fitted rigid body: most frequencies at
+#: which the loop amplifies must be measured. Of 40 random vehicles in gusts none was unstable or above Ms 1.8 with it.
+MAX_SENSITIVITY_BELOW_BAND = 1.5
 #: Above the frequency where the loop first falls below the limit, noise may exceed it up to this ratio of frequencies.
 CROSSOVER_NOISE_RATIO = 1.25
 #: A gain whose error is below this share of it counts as measured, whatever the coherence.

@@ -21,8 +21,8 @@ MIN_FREQUENCIES = 4
 LOWEST = 0.1
 #: Largest relative step between neighbouring frequencies below the band.
 STEP = 0.15
-#: Least damping of the continued body, 1/s: every rotor damps, and without damping the count of encirclements would need
-#: one more integrator.
+#: Least damping of the continued body, 1/s: every rotor damps, and without damping the count of encirclements would
+#: need one more integrator.
 LEAST_DAMPING = 0.3
 #: Relative error of the response above which the fitted body is the better estimate where the band begins: its own is
 #: 1 to 20 %, from the choice of lag and damping (20 random vehicles).
