@@ -25,6 +25,8 @@ DECOUPLED = 0.1
 SLOWEST = 1.0
 #: rad/s. Noise above it is that of sensors and vibration: gusts are slower.
 FAST = 30.0
+#: Plants drawn for the error of a prediction.
+DRAWS = 12
 #: Share of a limit within which a design keeps it.
 ROUNDING = 0.01
 
@@ -112,8 +114,22 @@ def bandwidth(gains: Gains, plant: WideResponse, candidates: Sequence[float], da
     return min(candidates, key=error)
 
 
+def offaxis_doubt(new: Gains, flown: Gains, plant: WideResponse, task: Manoeuvres) -> float:
+    """Standard deviation (deg) of the difference of both sets' off-axis motion, from the error of the response."""
+    generator, found = np.random.default_rng(0), []
+    for _ in range(DRAWS):
+        drawn = plant.draw(generator)
+        ours, theirs = (np.hypot(*predict(gains, drawn, task).offaxis_deg) for gains in (new, flown))
+        found.append(ours - theirs)
+    return float(np.std(found))
+
+
 def reasons_to_keep(
-    new: Sequence[Prediction], flown: Sequence[Prediction], limits: DesignLimits, slower: float
+    new: Sequence[Prediction],
+    flown: Sequence[Prediction],
+    limits: DesignLimits,
+    slower: float,
+    doubts: Sequence[float] = (),
 ) -> list[str]:
     """Why a set is not better than the flown one on the same logs; empty: it is better.
 
@@ -124,18 +140,25 @@ def reasons_to_keep(
     limits : DesignLimits
     slower : float
         Bandwidth of its attitude model over that of the flown gains.
+    doubts : sequence of float, deg, optional
+        See `offaxis_doubt`, one for each log; none: the predictions are exact.
     """
     Ms, noise = limits.Ms, limits.noise
     reasons = []
     if slower < SLOWEST and all(one.Ms <= Ms for one in flown):
         reasons.append(f"its attitude is slower: {slower:.0%} of the flown bandwidth")
-    for ours, theirs in zip(new, flown, strict=True):
+    for ours, theirs, doubt in zip(new, flown, doubts or [0.0] * len(new), strict=True):
         follow, before = np.hypot(*ours.follow_deg), np.hypot(*theirs.follow_deg)
         if follow >= before:
             reasons.append(f"it follows its attitude model no better ({follow:.2f} degrees, flown {before:.2f})")
         offaxis, before = np.hypot(*ours.offaxis_deg), np.hypot(*theirs.offaxis_deg)
         if offaxis > max(before, DECOUPLED):
             reasons.append(f"it moves the other axis more ({offaxis:.2f} degrees, flown {before:.2f})")
+        elif offaxis > DECOUPLED and offaxis + doubt > before:
+            reasons.append(
+                f"the log cannot tell whether it moves the other axis less ({offaxis:.2f} degrees, flown {before:.2f}, "
+                f"error of the difference {doubt:.2f}): record longer, excite more strongly, or in less wind"
+            )
         if ours.Ms > max(Ms, theirs.Ms) * (1 + ROUNDING):
             reasons.append(f"its margin is thinner (Ms {ours.Ms:.2f}, flown {theirs.Ms:.2f})")
         pairs = [*zip(ours.noise, theirs.noise, strict=True), *zip(ours.fast_noise, theirs.fast_noise, strict=True)]

@@ -12,7 +12,7 @@ from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
-from mimopilot.tuning.design.prediction import Prediction, predict, reasons_to_keep
+from mimopilot.tuning.design.prediction import Prediction, offaxis_doubt, predict, reasons_to_keep
 from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
@@ -183,7 +183,10 @@ def comparison(
         shown["flown"] = [predict(one, *task) for one, task in zip(flown, tasks, strict=True) if one is not None]
         fastest = bench.flown_bandwidth or found.model.omega
         result["flown_bandwidth"] = fastest
-        keep = reasons_to_keep(new, shown["flown"], spec.design, found.model.omega / fastest)
+        doubts = [
+            offaxis_doubt(found.gains, one, *task) for one, task in zip(flown, tasks, strict=True) if one is not None
+        ]
+        keep = reasons_to_keep(new, shown["flown"], spec.design, found.model.omega / fastest, doubts)
         result |= {"better_than_flown": not keep, "keep_flown": keep}
     return {"predicted": {name: _plain(figures) for name, figures in shown.items()}, **result}
 
