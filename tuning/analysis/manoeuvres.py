@@ -105,20 +105,19 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
     )
 
 
-def doublet_torque(plant: WideResponse, amplitude: float) -> Complex:
-    """Weights (T, K) whose product with the response U gives, in its real part, the rotors' torque in the doublets.
+def doublet_torque(plant: WideResponse, amplitude: float, lag: float = 0.0) -> Complex:
+    """Weights (T, K) whose product with the response U gives, in its real part, the torque in the doublets.
 
-    Behind the rotors' lag: a command that is at its limit for less than the lag hardly matters (in PX4's simulator
-    doublets with 1.25 times the range in the commands' peaks flew as predicted). At the times when it is largest: after
-    the setpoint jumps.
+    At the times when it is largest: after the setpoint jumps.
 
     Parameters
     ----------
     plant : WideResponse
     amplitude : float, rad
+    lag : float, s
+        Of the rotors, for the torque behind them; 0: as commanded.
     """
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, COARSE)
-    _, lag, _ = plant.shape
     rows = []
     for period in PERIODS:
         spectrum = amplitude * doublet_spectrum(fine, period) / np.pi / (1 + 1j * fine * lag)
