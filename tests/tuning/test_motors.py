@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mimopilot.sitl.autopilot.autopilot import Autopilot
@@ -69,8 +68,6 @@ def test_commands_that_the_torque_does_not_explain_give_no_motors():
     assert fit_motors(u[:20], commands[:20]) is None
 
 
-@given(roll=UNIT, pitch=UNIT, collective=st.floats(0.05, 1))
-@settings(max_examples=300, deadline=None)
 def test_commands_are_read_at_any_rate_and_with_any_thrust_curve(tmp_path):
     """A PX4 log with four of twelve motors, logged at 10 Hz.
 

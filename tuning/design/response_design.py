@@ -48,6 +48,8 @@ _DECADE = (2.8, 3.2, 3.6, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.2, 12
 BANDWIDTHS: tuple[float, ...] = (*_DECADE, 22.4, 25.0)
 #: Where the search begins, rad/s, and its first step along the table.
 FIRST_BANDWIDTH, FIRST_STRIDE = 10.0, 2
+#: Share of the limit of noise that is used: the ratio of two predictions errs by 1 to 2 % (simulated airframes).
+NOISE = 0.98
 #: Damping of the attitude model: 5 % overshoot, the usual choice.
 DAMPING = 0.7
 #: A descent during the search ends with a step that lowers the merit by less than this share, the last one sooner than
@@ -271,7 +273,7 @@ class ResponseDesign:
         plants = []
         for one, experiment in zip(task.plants, self.experiments, strict=True):
             plant = one.plant.draw(generator)
-            parts = iter(self.limits.noise * flown_noise(experiment, plant))
+            parts = iter(NOISE * self.limits.noise * flown_noise(experiment, plant))
             limits = [
                 replace(limit, limit=next(parts)) if isinstance(limit, NoiseLimit) else limit
                 for limit in one.constraints
@@ -299,7 +301,10 @@ class ResponseDesign:
         found: list[Constraint] = [
             *(Distance(cut, slice(0, plant.band.stop), floor) for cut in Cut),
             Distance(Cut.TORQUE, begin, 1 / (SHARE * MAX_SENSITIVITY_BELOW_BAND)),
-            *(NoiseLimit(self.limits.noise * part, above) for part, above in zip(noise, (0.0, FAST), strict=True)),
+            *(
+                NoiseLimit(NOISE * self.limits.noise * part, above)
+                for part, above in zip(noise, (0.0, FAST), strict=True)
+            ),
             gain_above_band(plant),
             structural_modes(plant, self.limited[place]),
             Definite(ATTITUDE.matrix, np.eye(2), 0.0),

@@ -9,13 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import mimopilot.tuning.design.advise as advisor
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import doublet
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.certificate import Verdict
-from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.reference_model import second_order
@@ -76,14 +74,11 @@ def test_the_simulation_flies_the_flown_gains_as_px4_did(logs):
     assert offaxis == pytest.approx([1.08, 1.18], abs=0.1)
 
 
-def test_advised_gains_track_and_decouple_better_than_the_flown_ones(logs, monkeypatch):
-    monkeypatch.setattr(advisor, "BANDWIDTHS", (20.0, 22.5, 25.0))
-    monkeypatch.setattr(advisor, "DAMPINGS", (0.7,))
-    monkeypatch.setattr(advisor, "DELAYS", (0, 2))
-    best = advise(logs["coupled"], spec()).recommended
-    assert best.verdict == Verdict.CERTIFIED
+def test_tuned_gains_track_and_decouple_better_than_the_flown_ones(logs):
+    best = tune(logs["coupled"])
+    assert best.verdict()[0] == Verdict.CERTIFIED
     flown_follow, flown_offaxis = doublets(logs["coupled"].flown)
-    follow, offaxis = doublets(best.gains)
+    follow, offaxis = doublets(best)
     assert (follow < flown_follow).all()
     assert (offaxis < 0.3 * flown_offaxis).all()
     assert (follow < [1.1, 1.4]).all()

@@ -112,7 +112,7 @@ def test_a_loop_that_is_unstable_below_the_excitation_is_not_certified():
     assert truth("adam0_perturbed").spectral_radius(gains) > 1.0005
     certificate = certify(gains, flown("adam0_perturbed").response, *MODELS)
     assert certificate.verdict == Verdict.UNSTABLE
-    assert "the whole cascade is unstable" in certificate.reason
+    assert "is unstable" in certificate.reason
 
 
 def test_each_verdict_is_given_with_its_reason():

@@ -43,7 +43,7 @@ def test_a_gain_changed_during_the_excitation_gives_a_warning_and_the_old_value_
 
 
 @pytest.mark.parametrize(
-    "change", [(26.0, "MC_YAWRATE_P", 0.4), (17.0, "MC_YAWRATE_P", 0.2), (17.0, "MC_AT_START", 1.0), (17.0, "X", 1.0)]
+    "change", [(27.5, "MC_YAWRATE_P", 0.4), (17.0, "MC_YAWRATE_P", 0.2), (17.0, "MC_AT_START", 1.0), (17.0, "X", 1.0)]
 )
 def test_changes_afterwards_to_the_same_value_or_outside_the_loop_give_no_warning(tmp_path, flight, change):
     log = read_log(px4(tmp_path, flight, [change]))
