@@ -157,7 +157,8 @@ def test_motors_with_little_room_limit_the_design(logs):
     small = tune(dataclasses.replace(log, motors=Motors(mixer, np.full(4, 0.03))))
     large = tune(dataclasses.replace(log, motors=Motors(mixer, np.full(4, 0.5))))
     assert "range of the motors" in small.provenance.details["limited_by"]
-    assert small.Kp_i[0, 0] * small.Kp_o[0, 0] < 0.8 * large.Kp_i[0, 0] * large.Kp_o[0, 0]
+    # What the flown gains use is allowed, and they use more than that.
+    assert small.Kp_i[0, 0] * small.Kp_o[0, 0] < 0.9 * large.Kp_i[0, 0] * large.Kp_o[0, 0]
 
 
 def test_flown_gains_that_are_better_are_kept(logs):
