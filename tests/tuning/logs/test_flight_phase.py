@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.logs.flight_phase import bridged, intersection, intervals
-from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.logs.flight_phase import FADE, bridged, flying_parts, intersection, intervals
+from mimopilot.tuning.logs.reader import open_log, read_log
 from tests.tuning.logs.flights import make_flight, microseconds, px4_topics, table, write_csv, write_ulog
 
 
@@ -101,8 +101,10 @@ def injected(flight, begin, end):
 
 def test_injected_excitation_marks_the_experiment_within_the_flight(tmp_path, flight):
     states = landed((10, 1), (12, 0), (28, 1))
-    log = read(tmp_path, flight, vehicle_land_detected=states, debug_vect=injected(flight, 15.0, 24.0))
-    assert log.seconds == pytest.approx(9.0, abs=0.01)
+    topics = px4_topics(flight, vehicle_land_detected=states, debug_vect=injected(flight, 15.0, 24.0))
+    ((begin, end),), warnings = flying_parts(open_log(write_ulog(tmp_path / "x.ulg", topics)))
+    assert end - begin == pytest.approx(9.0 + FADE, abs=0.01)
+    assert not warnings
 
 
 def test_excitation_on_the_ground_is_refused(tmp_path, flight):
