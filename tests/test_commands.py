@@ -341,3 +341,17 @@ def test_help_and_readme_name_every_target_and_airframe(mimopilot):
     for name in known_airframes():
         assert name in flights
         assert f"`{name}`" in readme
+
+
+def test_the_design_that_readme_shows_is_what_its_commands_print(mimopilot):
+    mimopilot("experiment", "adam0", "--seed", "1", "--out", "flight.ulg")
+    printed = mimopilot("tune", "flight.ulg", "--out", "my.gains.toml").stdout
+    shown = (TOP / "README.md").read_text()
+    for name in ("flown", "SISO", "tuned"):
+        now, then = (re.search(rf"^ {name} .*/.*$", text, re.MULTILINE) for text in (printed, shown))
+        assert now and then, name
+        figures = [[float(figure) for figure in re.findall(r"\d+\.\d+", row[0])] for row in (now, then)]
+        assert len(figures[1]) == 9
+        assert figures[0] == pytest.approx(figures[1], abs=0.01)
+        noise = slice(6, 8)
+        assert figures[0][noise] == pytest.approx(figures[1][noise], rel=0.02)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from dataclasses import fields
 from functools import lru_cache
 from threading import Lock
 from typing import Any
@@ -20,11 +19,10 @@ from mimopilot.sitl.campaign.draws import Draw, RunSampler
 from mimopilot.sitl.campaign.plan import CampaignPlan, plan_from_files
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_plant import FaultInjection
-from mimopilot.sitl.flight.metrics import Performance, performance
+from mimopilot.sitl.flight.metrics import performance
 from mimopilot.sitl.flight.simulator import TRUTH, Flight, Simulator, first_loss
 
 CHUNK = 64  # runs per chunk: at most these are lost when a worker dies
-FIGURES = tuple(field.name for field in fields(Performance))
 _runner_lock = Lock()
 
 

@@ -31,6 +31,7 @@ from mimopilot.tuning.design.constraints import (
 from mimopilot.tuning.design.descent import INFEASIBLE, LARGEST_RADIUS, DesignTask, PlantTask, descend
 from mimopilot.tuning.design.free_gains import FreeGains, free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
+from mimopilot.tuning.design.positive_integral import MIN_INTEGRAL_RATIO
 from mimopilot.tuning.design.prediction import FAST, SLOWEST, bandwidth, sensitivity_peak
 from mimopilot.tuning.experiment import Experiment, manoeuvre_size
 from mimopilot.tuning.gains import Gains
@@ -55,8 +56,6 @@ DAMPING = 0.7
 #: A descent during the search ends with a step that lowers the merit by less than this share, the last one sooner than
 #: that.
 ROUGHLY, EXACTLY = 2e-2, 1e-4
-#: Least integral action over the proportional one at the start, 1/s: an offset decays within about ten seconds.
-MIN_INTEGRAL_RATIO = 0.1
 #: Range of the manoeuvres' size, rad (5 to 30 degrees): what moved in the flight, within a normal flight's attitudes.
 AMPLITUDES = (np.radians(5.0), np.radians(30.0))
 #: Motors of a log that does not hold their commands: a quadrotor, X, that hovers at half thrust.
@@ -99,8 +98,6 @@ class Design:
         What limits the design, the tightest first.
     task, vector : DesignTask and (n,) array
         What was solved, and its solution.
-    vehicle_damps : bool
-        Whether a negative derivative gain would follow better.
     """
 
     gains: Gains
@@ -108,7 +105,6 @@ class Design:
     cost: float
     violation: float
     active: list[str]
-    vehicle_damps: bool
     task: DesignTask
     vector: Signal
 
@@ -135,7 +131,7 @@ class ResponseDesign:
     flown_bandwidth : float or None, rad/s
         Of the attitude model that the flown gains follow best, the fastest of all logs. None: not known.
     slowest : float, rad/s
-        Least bandwidth of a design: the flown one, hardly less, if the flown gains keep the limit of Ms.
+        Least bandwidth of a design: the flown one, if the flown gains keep the limit of Ms.
     """
 
     plants: Sequence[WideResponse]
@@ -222,7 +218,6 @@ class ResponseDesign:
             active=task.active(vector, ACTIVE),
             task=task,
             vector=vector,
-            vehicle_damps=_vehicle_damps(task, vector),
         )
 
     def is_stable(self, gains: Gains) -> bool:
@@ -316,14 +311,12 @@ class ResponseDesign:
         motors = experiment.motors or USUAL_MOTORS
         # The rotors' torque stays within the range. Their command may exceed it for less than their lag.
         room, size = np.column_stack([motors.hover, 1 - motors.hover]), flown_amplitude(experiment)
+        flown = None if experiment.flown is None else _loop_of(experiment.flown, plant)
         for share, lag in ((RANGE, plant.shape[1]), (PEAK, 0.0)):
             limit = MotorLimit(doublet_torque(plant, size, lag), motors.mixer, share * room)
-            if experiment.flown is not None:
-                # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
-                flown = free_gains(experiment.flown, plant.body)
-                used = 1 - limit.margin(LoopGradient(plant, flown, flown.vector(experiment.flown)))
-                limit = replace(limit, room=limit.room * max(1.0, used))
-            found.append(limit)
+            # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
+            used = 1.0 if flown is None else max(1.0, 1 - limit.margin(flown))
+            found.append(replace(limit, room=used * limit.room))
         return found
 
 
@@ -334,10 +327,14 @@ def flown_noise(experiment: Experiment, plant: WideResponse) -> Signal:
     """
     if experiment.flown is None:
         return np.array([flown_torque_noise(experiment, plant.response, plant.omega, above) for above in (0.0, FAST)])
-    filters = replace(experiment.flown.filters, Ts=plant.Ts)
-    free = free_gains(replace(experiment.flown, filters=filters), plant.body)
-    loop = LoopGradient(plant, free, free.vector(experiment.flown))
+    loop = _loop_of(experiment.flown, plant)
     return np.array([loop.noise_rms(above) for above in (0.0, FAST)])
+
+
+def _loop_of(flown: Gains, plant: WideResponse) -> LoopGradient:
+    """The loop of flown gains, at the period of the log: a logger's clock differs a little from the controller's."""
+    free = free_gains(replace(flown, filters=replace(flown.filters, Ts=plant.Ts)), plant.body)
+    return LoopGradient(plant, free, free.vector(flown))
 
 
 def flown_amplitude(experiment: Experiment) -> float:
@@ -374,8 +371,9 @@ def _following(free: FreeGains, bandwidth: float) -> FreeGains:
     return replace(free, base=replace(free.base, filters=filters))
 
 
-def _vehicle_damps(task: DesignTask, vector: Signal) -> bool:
-    """Whether the bound on the derivative gain is active and costs following."""
+def vehicle_damps(design: Design) -> bool:
+    """Whether the bound on the derivative gain is active and costs following: a negative one would follow better."""
+    task, vector = design.task, design.vector
     name = Definite(TERMS["D"].matrix, np.eye(2), 0.0).name
     if name not in task.active(vector, ACTIVE):
         return False

@@ -13,7 +13,7 @@ from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
 from mimopilot.tuning.design.prediction import Prediction, offaxis_doubt, predict, reasons_to_keep
-from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign
+from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign, vehicle_damps
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS
@@ -64,7 +64,7 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
     starts, origin = starting_points(measured, spec, inner, bench)
     found, certificates = _certified_design(bench, measured, spec, starts, inner)
     warnings = [] if all(one.experiment.motors for one in measured) else [MOTORS_UNKNOWN]
-    if found.vehicle_damps:
+    if vehicle_damps(found):
         warnings.append(VEHICLE_DAMPS)
     provenance = Provenance(
         method=spec.method,

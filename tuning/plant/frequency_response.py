@@ -97,14 +97,7 @@ class PlantResponse:
         the rates are still coherent, but nonlinear effects dominate.
         """
         sure = np.logical_or.accumulate(self.rate_error() < KNOWN)
-        return self._longest(self.known() & sure)
-
-    def coherent_run(self) -> NDArray[np.intp]:
-        """Indices of the longest band with coherent rates; designs use only this band."""
-        return self._longest(np.all(self.coherence > COHERENT, axis=1))
-
-    def _longest(self, where: NDArray[np.bool_]) -> NDArray[np.intp]:
-        indices = np.flatnonzero(where)
+        indices = np.flatnonzero(self.known() & sure)
         if not len(indices):
             return indices
         far = self.omega[indices[1:]] > HOLE * self.omega[indices[:-1]] + 2 * (self.omega[1] - self.omega[0])

@@ -42,7 +42,8 @@ def test_the_vehicle_stands_still_until_its_rotors_carry_it(name, share):
     states, _ = fly(ground_state(plant), [share * hover] * len(plant.rotors), 10.0, plant)
     assert np.abs(states[:, 2:6]).max() < STILL
     assert np.abs(states[:, 7:9]).max() < STILL
-    assert np.abs(states[:, 10:13]).max() < 1e-5  # rad/s; ANT-R's small inertia trembles at 1e-6 on its legs
+    # rad/s; the small, coupled inertia of ANT-R's fit trembles at 1e-6 on its legs.
+    assert np.abs(states[:, 10:13]).max() < (1e-5 if name == "antr_thesis" else STILL)
     assert np.abs(states[:, [0, 1, 9]]).max() < 1e-5  # m, and twice that in rad: no force returns it
 
 
