@@ -9,9 +9,11 @@ from mimopilot.sitl.flight.scenario import excitation_flight
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.studies.benchmarks import excitation, lv100
-from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.tune_for_models import tune_for_models
 from mimopilot.tuning.estimation.vrft import vrft
 from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
+from tests.tuning.truth import thesis
 
 TS = 0.004
 RUNS = 200
@@ -26,7 +28,8 @@ def test_intervals_of_adam_0_cover_the_noise_free_estimate():
     def estimate(seed, noise=True):
         record = fly(vehicle.airframe, Autopilot(vehicle.airframe, gains), scenario, seed, noise).record
         u, y_i, y_o, u_bar = (record[f][:, :2].astype(float) for f in ("moment", "rates", "attitude", "excitation"))
-        return tune(Experiment(Ts=TS, u=u, y_i=y_i, y_o=y_o, u_bar=u_bar, flown=gains))
+        flight = Experiment(Ts=TS, u=u, y_i=y_i, y_o=y_o, u_bar=u_bar, flown=gains)
+        return tune_for_models(PlantEstimates(flight), thesis())
 
     exact = estimate(0, noise=False)
     hits = {name: [] for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i")}
