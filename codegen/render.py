@@ -23,7 +23,7 @@ from mimopilot.codegen.vectors import emitted_vectors
 from mimopilot.common.files import inside, read_text, sha256, write_atomically
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains, gains_to_toml
-from mimopilot.tuning.parameter_row import Row, Shape
+from mimopilot.tuning.parameter_row import POSITIVE, Row, Shape
 from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, check_names
 
 #: These and the parameter table define the C interface.
@@ -137,15 +137,19 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
 def _validity() -> Iterator[str]:
     """C++ conditions of `tuning.parameter_row.Valid`, for every element with a bound."""
     for row in ROWS:
-        for i, _ in enumerate(row.codes):
-            member = f"gains.{row.member}" + (f"[{i}]" if row.shape is Shape.AXES else "")
-            low, high = row.valid.lowest, row.valid.highest
-            if math.isfinite(low):
-                yield f"{member} {'>=' if row.valid.lowest_included else '>'} {float_literal(low)}"
-            if math.isfinite(high):
-                yield f"{member} {'<=' if row.valid.highest_included else '<'} {float_literal(high)}"
-            if math.isfinite(row.largest_in_period):
-                yield f"{member} * gains.period <= {float_literal(row.largest_in_period)}"
+        member = f"gains.{row.member}"
+        if row.shape is Shape.AXES:
+            if row.valid != POSITIVE:
+                raise CodegenError(f"{row.key}: C++ checks only limits that must be positive")
+            yield f"positive({member})"
+            continue
+        low, high = row.valid.lowest, row.valid.highest
+        if math.isfinite(low):
+            yield f"{member} {'>=' if row.valid.lowest_included else '>'} {float_literal(low)}"
+        if math.isfinite(high):
+            yield f"{member} {'<=' if row.valid.highest_included else '<'} {float_literal(high)}"
+        if math.isfinite(row.largest_in_period):
+            yield f"{member} * gains.period <= {float_literal(row.largest_in_period)}"
 
 
 def _manifest(files: dict[str, str], gains: Gains, target: str) -> str:

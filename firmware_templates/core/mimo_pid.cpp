@@ -19,8 +19,7 @@ namespace {
 
 // Code size and step time have a budget: the attributes below keep step() fast and the rest small.
 
-constexpr float kTwoPi = 6.2831855F;
-constexpr float kPi = 3.1415927F;
+constexpr float kInverted = 0.0045F;  // cosine of half the tilt below which, as in PX4, the error has no turn
 
 [[gnu::always_inline]] inline bool unlikely(bool condition)
 {
@@ -46,20 +45,13 @@ float clamp(float value, float limit)
 
 float row(const float (&gain)[2], float roll, float pitch) { return gain[0] * roll + gain[1] * pitch; }
 
-// Wraps to -pi to pi. Two angles within 4 pi differ by at most four turns.
-float wrap(float angle)
+float root(float square) { return square > 0.0F ? __builtin_sqrtf(square) : 0.0F; }
+
+float length_squared(const float (&q)[4]) { return ((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3]; }
+
+template<typename Array> [[gnu::always_inline]] inline void copy(const Array &from, Array &to)
 {
-	if (unlikely(__builtin_fabsf(angle) > kPi)) {
-		const float turn = angle > 0.0F ? -kTwoPi : kTwoPi;
-		int turns = 0;
-
-		do {
-			angle += turn;
-			turns++;
-		} while (turns < 4 && __builtin_fabsf(angle) > kPi);
-	}
-
-	return angle;
+	__builtin_memcpy(&to, &from, sizeof(to));
 }
 
 [[gnu::cold, gnu::noinline]] bool acceptable(const Gains &gains)
@@ -76,59 +68,153 @@ float wrap(float angle)
 
 bool follows(const Gains &gains) { return !within(gains.model_omega, 0.0F); }
 
-// One period of the attitude model: semi-implicit Euler.
-[[gnu::noinline]] void advance(const Gains &gains, const State &state, Model &model)
+// Heading of the setpoint: cosine and sine of half the angle.
+struct Heading {
+	float cosine;
+	float sine;
+};
+
+[[gnu::always_inline]] inline Heading heading_of(const float (&q)[4])
 {
-	const float omega = gains.model_omega;
-	const float stiffness = omega * omega;
-	const float friction = (2.0F * gains.model_damping) * omega;
+	const float cosine = root(q[0] * q[0] + q[3] * q[3]);
 
-	for (int j = 0; j < kModelAxes; j++) {
-		float angle = state.attitude[j];
-		float rate = 0.0F;
-		float acceleration = 0.0F;
+	if (unlikely(cosine < kInverted)) { return {1.0F, 0.0F}; }
 
-		if (model.running != 0) {
-			angle = model.angle[j];
-			rate = model.rate[j];
-			acceleration = stiffness * (state.setpoint[j] - angle) - friction * rate;
-			rate += gains.period * acceleration;
-			angle += gains.period * rate;
-		}
-
-		model.angle[j] = angle;
-		model.rate[j] = rate;
-		model.acceleration[j] = acceleration;
-	}
+	const float inverse = 1.0F / cosine;
+	return {q[0] * inverse, q[3] * inverse};
 }
 
-// Attitude controller: rate setpoint r.
-[[gnu::always_inline]] inline void outer_loop(const Gains &gains, const State &state, const Model &model,
-					      float (&r)[kAxes])
+// The model at rest, with the measured direction of body z.
+[[gnu::cold, gnu::noinline]] void start(const Heading &heading, const float (&q)[4], Model &model)
 {
-	const bool following = follows(gains);
-	float roll = state.setpoint[0];
-	float pitch = state.setpoint[1];
+	const float cosine = root(q[0] * q[0] + q[3] * q[3]);
+	const float scale = unlikely(cosine < kInverted) ? 0.0F : 2.0F / cosine;
+	const float east = scale * (q[1] * q[0] - q[2] * q[3]);
+	const float north = scale * (q[1] * q[3] + q[2] * q[0]);
+	const float c = 1.0F - 2.0F * (heading.sine * heading.sine);
+	const float s = 2.0F * (heading.sine * heading.cosine);
+	model = Model{};
+	model.angle[0] = c * east + s * north;
+	model.angle[1] = c * north - s * east;
+}
 
-	if (unlikely(following)) {
-		roll = model.angle[0];
-		pitch = model.angle[1];
+// One period of the attitude model, semi-implicit Euler. Attitude: the setpoint's heading, then the model's tilt.
+[[gnu::noinline]] void advance(const Gains &gains, const State &state, Model &model, float (&attitude)[4])
+{
+	const float(&q)[4] = state.attitude_setpoint;
+	const Heading heading = heading_of(q);
+
+	if (model.running != 0) {
+		const float omega = gains.model_omega;
+		const float stiffness = omega * omega;
+		const float friction = (2.0F * gains.model_damping) * omega;
+		const float wanted[kModelAxes] = {
+			2.0F * (heading.cosine * q[1] + heading.sine * q[2]),
+			2.0F * (heading.cosine * q[2] - heading.sine * q[1]),
+		};
+
+		for (int j = 0; j < kModelAxes; j++) {
+			const float acceleration = stiffness * (wanted[j] - model.angle[j]) - friction * model.rate[j];
+			model.acceleration[j] = acceleration;
+			model.rate[j] += gains.period * acceleration;
+			model.angle[j] += gains.period * model.rate[j];
+		}
+
+	} else {
+		start(heading, state.attitude, model);
 	}
 
-	roll -= state.attitude[0];
-	pitch -= state.attitude[1];
-	const float yaw = wrap(state.setpoint[2] - state.attitude[2]);
-	float roll_rate = row(gains.kp_o[0], roll, pitch);
-	float pitch_rate = row(gains.kp_o[1], roll, pitch);
+	const float roll = 0.5F * model.angle[0];
+	const float pitch = 0.5F * model.angle[1];
+	const float tilt = root(1.0F - (roll * roll + pitch * pitch));
+	attitude[0] = heading.cosine * tilt;
+	attitude[1] = heading.cosine * roll - heading.sine * pitch;
+	attitude[2] = heading.cosine * pitch + heading.sine * roll;
+	attitude[3] = heading.sine * tilt;
+}
 
-	if (unlikely(following)) {
-		roll_rate += row(gains.kff_o[0], model.rate[0], model.rate[1]);
-		pitch_rate += row(gains.kff_o[1], model.rate[0], model.rate[1]);
+// Attitude controller: rate setpoint r. `acceleration`: of the attitude model, in body axes, rad/s^2.
+[[gnu::noinline]] void outer_loop(const Gains &gains, const State &state, const Model &model, const float (&target)[4],
+				  float (&r)[kAxes], float (&acceleration)[kModelAxes])
+{
+	// conj(q) target: the rotation from q to the target, in the axes of q.
+	const float(&q)[4] = state.attitude;
+	float w = ((q[0] * target[0] + q[1] * target[1]) + q[2] * target[2]) + q[3] * target[3];
+	float x = ((q[0] * target[1] - q[1] * target[0]) - q[2] * target[3]) + q[3] * target[2];
+	float y = ((q[0] * target[2] + q[1] * target[3]) - q[2] * target[0]) - q[3] * target[1];
+	float z = ((q[0] * target[3] - q[1] * target[2]) + q[2] * target[1]) - q[3] * target[0];
+
+	if (w < 0.0F) {
+		w = -w;
+		x = -x;
+		y = -y;
+		z = -z;
+	}
+
+	// It is a tilt (cosine, roll, pitch, 0), then a turn (w, 0, 0, z) / cosine; all are of half angles. The turn is
+	// weighted: (turn, 0, 0, weight z) / length.
+	const float square = w * w + z * z;
+	const float cosine = root(square);
+	float roll = 2.0F * x;
+	float pitch = 2.0F * y;
+	float yaw = 0.0F;
+
+	if (cosine > kInverted) {
+		const float turn = cosine - gains.yaw_weight * (cosine - w);
+		const float weighted = gains.yaw_weight * z;
+		const float scale = 2.0F / (cosine * root(turn * turn + weighted * weighted));
+		const float tilt_roll = x * w - y * z;
+		const float tilt_pitch = y * w + x * z;
+		roll = scale * (tilt_roll * turn + tilt_pitch * weighted);
+		pitch = scale * (tilt_pitch * turn - tilt_roll * weighted);
+		yaw = scale * (square * z);
+	}
+
+	// Earth's z axis in body axes, times the setpoint's yaw rate.
+	const float yaw_rate = 2.0F * state.yaw_rate_setpoint;
+	float roll_rate = row(gains.kp_o[0], roll, pitch) + yaw_rate * (q[1] * q[3] - q[0] * q[2]);
+	float pitch_rate = row(gains.kp_o[1], roll, pitch) + yaw_rate * (q[2] * q[3] + q[0] * q[1]);
+	const float turn_rate = gains.yaw_kp_o * yaw + yaw_rate * (0.5F - (q[1] * q[1] + q[2] * q[2]));
+
+	if (unlikely(follows(gains))) {
+		float turn_cosine = 1.0F;
+		float turn_sine = 0.0F;
+
+		if (cosine > kInverted) {
+			turn_cosine = (w * w - z * z) / square;
+			turn_sine = (2.0F * (w * z)) / square;
+		}
+
+		const float rate[kModelAxes] = {
+			turn_cosine * model.rate[0] - turn_sine * model.rate[1],
+			turn_sine * model.rate[0] + turn_cosine * model.rate[1],
+		};
+		acceleration[0] = turn_cosine * model.acceleration[0] - turn_sine * model.acceleration[1];
+		acceleration[1] = turn_sine * model.acceleration[0] + turn_cosine * model.acceleration[1];
+		roll_rate += row(gains.kff_o[0], rate[0], rate[1]);
+		pitch_rate += row(gains.kff_o[1], rate[0], rate[1]);
 	}
 
 	r[0] = clamp(roll_rate, gains.rate_max[0]);
 	r[1] = clamp(pitch_rate, gains.rate_max[1]);
-	r[2] = clamp(gains.yaw_kp_o * yaw, gains.rate_max[2]);
+	r[2] = clamp(turn_rate, gains.rate_max[2]);
+}
+
+// Rate setpoint r of the present mode. The attitude model moves one period ahead.
+[[gnu::always_inline]] inline void update_rates_setpoint(const Gains &gains, const State &state, Model &model,
+							 float (&r)[kAxes], float (&acceleration)[kModelAxes])
+{
+	if (unlikely(state.rate_mode != 0)) {
+		if (&r != &state.rates_setpoint) { copy(state.rates_setpoint, r); }
+
+	} else if (unlikely(follows(gains))) {
+		float attitude[4];
+		advance(gains, state, model, attitude);
+		outer_loop(gains, state, model, attitude, r, acceleration);
+
+	} else {
+		outer_loop(gains, state, model, state.attitude_setpoint, r, acceleration);
+	}
 }
 
 struct Axes {
@@ -147,16 +233,16 @@ struct Signals {
 	float pitch_acceleration;
 };
 
-[[gnu::always_inline]] inline Signals signals(const Gains &gains, const State &state, const Model &model,
-					      const float (&r)[kAxes])
+[[gnu::always_inline]] inline Signals signals(const Gains &gains, const State &state,
+						const float (&acceleration)[kModelAxes], const float (&r)[kAxes])
 {
 	return {
 		{r[0], r[1], r[2]},
 		{r[0] - state.rates[0], r[1] - state.rates[1], r[2] - state.rates[2]},
 		{state.derivative[0], state.derivative[1], state.derivative[2]},
 		follows(gains),
-		model.acceleration[0],
-		model.acceleration[1],
+		acceleration[0],
+		acceleration[1],
 	};
 }
 
@@ -168,7 +254,7 @@ struct Terms {
 	float slope;  // Ki e
 };
 
-[[gnu::always_inline]] inline Terms inner_loop(const Gains &gains, const Signals &x, int j)
+[[gnu::always_inline]] inline Terms rate_terms(const Gains &gains, const Signals &x, int j)
 {
 	if (j == 2) {
 		return {
@@ -191,159 +277,279 @@ struct Terms {
 	};
 }
 
-float sum(const Terms &terms, float integral)
+// v without the integral.
+float sum(const Terms &terms) { return (terms.proportional - terms.derivative) + terms.feedforward; }
+
+[[gnu::cold, gnu::noinline]] void clear(State &state)
 {
-	return ((terms.proportional + integral) - terms.derivative) + terms.feedforward;
+	for (float &integral : state.integral) { integral = 0.0F; }
+
+	state.model.running = 0;
+	state.slewing = 0;
 }
 
-void clear_integral(State &state)
+// v of each axis without its integral.
+[[gnu::cold, gnu::noinline]] void torque_of(const Gains &gains, const State &state, const float (&r)[kAxes],
+		const float (&acceleration)[kModelAxes], float (&v)[kAxes])
 {
-	for (int j = 0; j < kAxes; j++) { state.integral[j] = 0.0F; }
+	const Signals x = signals(gains, state, acceleration, r);
+
+	for (int j = 0; j < kAxes; j++) { v[j] = sum(rate_terms(gains, x, j)); }
 }
 
-// v of each axis, with the attitude model one period ahead.
-[[gnu::cold, gnu::noinline]] void evaluate(const Gains &gains, const State &state, float (&v)[kAxes])
+// The same with the rate setpoint of the next period, if the inputs stay as they are.
+[[gnu::cold, gnu::noinline]] void next_torque(const Gains &gains, const State &state, float (&v)[kAxes])
 {
 	float r[kAxes];
+	float acceleration[kModelAxes] = {};
 	Model model = state.model;
-
-	if (follows(gains)) { advance(gains, state, model); }
-
-	outer_loop(gains, state, model, r);
-	const Signals x = signals(gains, state, model, r);
-
-	for (int j = 0; j < kAxes; j++) { v[j] = sum(inner_loop(gains, x, j), state.integral[j]); }
+	update_rates_setpoint(gains, state, model, r, acceleration);
+	torque_of(gains, state, r, acceleration, v);
 }
 
-// Accepts a value within its range, otherwise holds the last valid one. True: invalid for too long.
-[[gnu::always_inline]] inline bool accept(float value, float limit, float &held, int32_t &age, uint32_t &fault_count)
+// Counts invalid samples, and the samples since the last valid one. `missing` and the result are fault bits; the latter
+// of inputs that are invalid for too long. The derivative of a rate starts again after that.
+[[gnu::cold, gnu::noinline]] int32_t count_missing(State &state, int32_t missing, int32_t silent)
 {
-	if (unlikely(!within(value, limit))) {
-		fault_count++;
+	int32_t failed = 0;
 
-		if (age <= kHoldSamples) { age++; }
+	for (uint32_t bits = static_cast<uint32_t>(missing | state.missing); bits != 0U; bits &= bits - 1U) {
+		const int i = __builtin_ctz(bits);
+		int32_t &age = state.age[i];
+		const bool first = age > kHoldSamples;
 
-		return age > kHoldSamples;
+		if ((missing >> i & 1) == 0) {
+			age = 0;
+
+		} else {
+			state.fault_count++;
+			age = first || (silent >> i & 1) != 0 ? kHoldSamples + 1 : age + 1;
+		}
+
+		const bool expired = age > kHoldSamples;
+
+		if (expired) { failed |= 1 << i; }
+
+		if (i >= 2 && (first || expired)) {
+			state.derivative[i - 2] = 0.0F;
+
+			if (expired) { state.rates[i - 2] = 0.0F; }
+		}
 	}
 
-	held = value;
-	age = 0;
-	return false;
+	state.missing = missing;
+	return state.rate_mode != 0 ? failed & ~kAttitudeFault : failed;
+}
+
+// NaN means none; any other value out of range is a fault. Returns 0 for both.
+[[gnu::cold, gnu::noinline]] float optional(float value, float limit, uint32_t &fault_count)
+{
+	if (within(value, limit)) { return value; }
+
+	if (within(value, __builtin_inff())) { fault_count++; }
+
+	return 0.0F;
+}
+
+// Turns q towards `target` by at most half of `angle` of rotation; both are unit quaternions.
+[[gnu::cold, gnu::noinline]] void slew(const float (&target)[4], float angle, float (&q)[4])
+{
+	float along = 0.0F;
+
+	for (int i = 0; i < 4; i++) { along += q[i] * target[i]; }
+
+	const float sign = along < 0.0F ? -1.0F : 1.0F;
+	float across[4];
+	float square = 0.0F;
+
+	for (int i = 0; i < 4; i++) {
+		across[i] = sign * (target[i] - along * q[i]);
+		square += across[i] * across[i];
+	}
+
+	const float distance = root(square);
+
+	if (distance <= angle) {
+		copy(target, q);
+		return;
+	}
+
+	const float step = angle / distance;
+	square = 0.0F;
+
+	for (int i = 0; i < 4; i++) {
+		across[i] = q[i] + step * across[i];
+		square += across[i] * across[i];
+	}
+
+	const float scale = 1.0F / root(square);
+
+	for (int i = 0; i < 4; i++) { q[i] = scale * across[i]; }
+}
+
+[[gnu::always_inline]] inline bool is_rotation(const float (&q)[4])
+{
+	return within(length_squared(q) - 1.0F, kMaxNormError);
+}
+
+// Takes over an attitude setpoint, within the slew limit.
+[[gnu::always_inline]] inline void move_setpoint(State &state, const Input &input)
+{
+	float(&q)[4] = state.attitude_setpoint;
+
+	if (unlikely(!within(state.gains.setpoint_slew, 0.0F))) {
+		if (state.slewing == 0) { copy(state.attitude, q); }
+
+		state.slewing = input.armed;
+		slew(input.attitude_setpoint, 0.5F * (state.gains.setpoint_slew * state.gains.period), q);
+
+	} else {
+		copy(input.attitude_setpoint, q);
+	}
+}
+
+[[gnu::cold, gnu::noinline]] bool accept_rates_setpoint(State &state, const Input &input)
+{
+	state.slewing = 0;
+	state.model.running = 0;
+	state.acceleration[0] = state.acceleration[1] = 0.0F;
+
+	for (float rate : input.rates_setpoint) {
+		if (!within(rate, kMaxRate)) { return false; }
+	}
+
+	copy(input.rates_setpoint, state.rates_setpoint);
+	return true;
+}
+
+// Replaces invalid rates by the last valid ones. Returns their fault bits.
+[[gnu::cold, gnu::noinline]] int32_t check_rates(const State &state, float (&rates)[kAxes])
+{
+	int32_t missing = 0;
+
+	for (int i = 0; i < kAxes; i++) {
+		if (!within(rates[i], kMaxRate)) {
+			missing |= kRateFault << i;
+			rates[i] = state.rates[i];
+		}
+	}
+
+	return missing;
 }
 
 // Returns the bits of Output::fault.
 [[gnu::always_inline]] inline int32_t accept_inputs(State &state, const Input &input)
 {
-	int32_t failed = 0;
+	int32_t missing = input.silent & kAllFaults;
+	bool wanted = true;
+	state.rate_mode = input.rate_mode;
+
+	if (is_rotation(input.attitude)) {
+		copy(input.attitude, state.attitude);
+
+	} else {
+		missing |= kAttitudeFault;
+	}
+
+	if (unlikely(input.rate_mode != 0)) {
+		wanted = accept_rates_setpoint(state, input);
+
+	} else if (is_rotation(input.attitude_setpoint)) {
+		move_setpoint(state, input);
+
+	} else {
+		wanted = false;
+	}
+
+	if (!wanted) { missing |= kSetpointFault; }
+
+	state.yaw_rate_setpoint = input.yaw_rate_setpoint;
+
+	if (unlikely(!within(input.yaw_rate_setpoint, kMaxRate))) {
+		state.yaw_rate_setpoint = optional(input.yaw_rate_setpoint, kMaxRate, state.fault_count);
+	}
+
 	const float pole = state.gains.derivative_pole;
 	const float filter_gain = (1.0F - pole) / state.gains.period;
-	uint32_t fault_count = state.fault_count;
 
+	float rates[kAxes] = {input.rates[0], input.rates[1], input.rates[2]};
+
+	// Each is checked by itself only if their squares are large.
+	if (unlikely(!within((rates[0] * rates[0] + rates[1] * rates[1]) + rates[2] * rates[2], kMaxRate * kMaxRate))) {
+		missing |= check_rates(state, rates);
+	}
+
+#pragma GCC unroll 3
 	for (int i = 0; i < kAxes; i++) {
-		if (accept(input.attitude_setpoint[i], kMaxAngle, state.setpoint[i], state.age[i], fault_count)) {
-			failed |= 1 << i;
-		}
+		state.derivative[i] = pole * state.derivative[i] + filter_gain * (rates[i] - state.rates[i]);
+		state.rates[i] = rates[i];
+	}
 
-		if (accept(input.attitude[i], kMaxAngle, state.attitude[i], state.age[kAxes + i], fault_count)) {
-			failed |= 8 << i;
-		}
+	if (unlikely((missing | state.missing) != 0)) { return count_missing(state, missing, input.silent); }
 
-		int32_t &age = state.age[2 * kAxes + i];
-		const bool first = age > kHoldSamples;
-		const float previous = state.rates[i];
-		float derivative = pole * state.derivative[i];
+	return 0;
+}
 
-		if (accept(input.rates[i], kMaxRate, state.rates[i], age, fault_count)) {
-			failed |= 64 << i;
-			derivative = 0.0F;
+// u of an axis at a limit of u or of its integral, or with unallocated torque. The integral does not grow further
+// into saturation.
+[[gnu::noinline]] float limited(float rest, float increment, float limit, float integral_max, int32_t saturation,
+				float &integral)
+{
+	const float grown = integral + increment;
+	const float moment = rest + grown;
+	float highest = integral_max;
+	float lowest = -integral_max;
 
-		} else if (unlikely(first)) {
-			derivative = 0.0F;
+	if (moment > limit || saturation > 0) { highest = integral; }
+
+	if (moment < -limit || saturation < 0) { lowest = integral; }
+
+	integral = grown > highest ? highest : (grown < lowest ? lowest : grown);
+	return clamp(rest + integral, limit);
+}
+
+// Torque u from the signals x, and the integrals. An integral is within its limit from the last period and is never -0,
+// so a zero increment keeps its bits.
+[[gnu::always_inline]] inline void inner_loop(const Gains &gains, const Input &input, const Signals &x,
+					      const float (&excitation)[kAxes], float period,
+					      float (&integrals)[kAxes], float (&u)[kAxes])
+{
+	for (int j = 0; j < kAxes; j++) {
+		const Terms terms = rate_terms(gains, x, j);
+		const float rest = sum(terms) + excitation[j];
+		const float increment = period * terms.slope;
+		const float grown = integrals[j] + increment;
+		const float moment = rest + grown;
+		const float limit = gains.moment_max[j];
+		const float integral_max = gains.integral_max[j];
+
+		if (unlikely(__builtin_fabsf(moment) > limit || __builtin_fabsf(grown) > integral_max
+			     || input.saturation[j] != 0)) {
+			u[j] = limited(rest, increment, limit, integral_max, input.saturation[j], integrals[j]);
 
 		} else {
-			derivative += filter_gain * (state.rates[i] - previous);
+			integrals[j] = grown;
+			u[j] = moment;
 		}
-
-		state.derivative[i] = derivative;
 	}
-
-	state.fault_count = fault_count;
-	return failed;
 }
 
-// NaN means no excitation; any other value out of range is a fault.
-float accept_excitation(float value, uint32_t &fault_count)
-{
-	if (!within(value, kMaxExcitation)) {
-		if (within(value, __builtin_inff())) { fault_count++; }
-
-		value = 0.0F;
-	}
-
-	return value;
-}
-
-// An input was invalid for too long: only damp the rates still measured. An axis without its rate gets no torque.
-[[gnu::cold, gnu::noinline]] void damp_rates(State &state, int32_t failed, const Input &input, Output &output)
+// An input was invalid for too long: r = 0, and the integrals and the excitation are left out. An axis without a valid
+// rate, whose y_i is 0, gets no torque.
+[[gnu::cold, gnu::noinline]] void damp_rates(State &state, int32_t failed, Output &output)
 {
 	const Gains &gains = state.gains;
-	const int32_t lost = failed >> (2 * kAxes);
 	state.model.running = 0;
-	const float roll = (lost & 1) != 0 ? 0.0F : state.rates[0];
-	const float pitch = (lost & 2) != 0 ? 0.0F : state.rates[1];
+	state.slewing = 0;
+
+	const float still[kAxes] = {};
+	const float steady[kModelAxes] = {};
+	torque_of(gains, state, still, steady, output.moment);
+	copy(still, output.rates_setpoint);
 
 	for (int j = 0; j < kAxes; j++) {
-		float moment = j == 2 ? -(gains.yaw_kp_i * state.rates[2]) - gains.yaw_kd_i * state.derivative[2]
-			       : -row(gains.kp_i[j], roll, pitch) - row(gains.kd_i[j], state.derivative[0], state.derivative[1]);
-
-		if ((lost & (1 << j)) != 0) { moment = 0.0F; }
-
-		accept_excitation(input.excitation[j], state.fault_count);
-		output.moment[j] = clamp(moment, gains.moment_max[j]);
-		output.rates_setpoint[j] = 0.0F;
-	}
-}
-
-// Normal operation, with anti-windup per axis. The integral is within its limit from the last period and is never -0,
-// so a zero increment keeps its bits.
-void control(State &state, const Input &input, Output &output)
-{
-	const Gains &gains = state.gains;
-	const bool integrating = input.armed != 0 && input.landed == 0;
-	const float period = integrating ? gains.period : 0.0F;
-
-	if (follows(gains)) {
-		advance(gains, state, state.model);
-		state.model.running = input.armed;
-	}
-
-	outer_loop(gains, state, state.model, output.rates_setpoint);
-	const Signals x = signals(gains, state, state.model, output.rates_setpoint);
-
-	for (int j = 0; j < kAxes; j++) {
-		const Terms terms = inner_loop(gains, x, j);
-		const float excitation = accept_excitation(input.excitation[j], state.fault_count);
-		const float limit = gains.moment_max[j];
-		const float increment = period * terms.slope;
-		const float before = state.integral[j];
-		float integral = before + increment;
-		float moment = sum(terms, integral) + excitation;
-		bool held = false;
-
-		if (increment > 0.0F) {
-			held = moment > limit || input.saturation[j] > 0;
-
-		} else if (increment < 0.0F) {
-			held = moment < -limit || input.saturation[j] < 0;
-		}
-
-		if (unlikely(held || __builtin_fabsf(integral) > gains.integral_max[j])) {
-			integral = held ? before : clamp(integral, gains.integral_max[j]);
-			moment = sum(terms, integral) + excitation;
-		}
-
-		state.integral[j] = integral;
-		output.moment[j] = clamp(moment, limit);
+		const bool lost = (failed & (kRateFault << j)) != 0;
+		output.moment[j] = lost ? 0.0F : clamp(output.moment[j], gains.moment_max[j]);
 	}
 }
 
@@ -353,7 +559,10 @@ void control(State &state, const Input &input, Output &output)
 {
 	state = State{};
 
-	for (int i = 0; i < 3 * kAxes; i++) { state.age[i] = kHoldSamples + 1; }
+	for (int32_t &age : state.age) { age = kHoldSamples + 1; }
+
+	state.missing = kAllFaults;
+	state.attitude[0] = state.attitude_setpoint[0] = 1.0F;
 
 	const bool accepted = acceptable(gains);
 
@@ -372,38 +581,56 @@ void control(State &state, const Input &input, Output &output)
 	if (!acceptable(gains)) { return false; }
 
 	float before[kAxes];
-	float rest[kAxes];
-	evaluate(state.gains, state, before);
-	clear_integral(state);
-	evaluate(gains, state, rest);
+	float after[kAxes];
+	next_torque(state.gains, state, before);
+	next_torque(gains, state, after);
 
 	for (int j = 0; j < kAxes; j++) {
 		const bool unused = j == 2 ? within(gains.yaw_ki_i, 0.0F)
 				    : within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F);
-		state.integral[j] = unused ? 0.0F : clamp(before[j] - rest[j], gains.integral_max[j]);
+		const float integral = (before[j] + state.integral[j]) - after[j];
+		state.integral[j] = unused ? 0.0F : clamp(integral, gains.integral_max[j]);
 	}
 
 	state.gains = gains;
 
-	if (!follows(gains)) { state.model.running = 0; }
+	if (!follows(gains)) {
+		state.model.running = 0;
+		state.acceleration[0] = state.acceleration[1] = 0.0F;
+	}
 
 	return true;
 }
 
 void step(State &state, const Input &input, Output &output)
 {
+	const Gains &gains = state.gains;
 	const int32_t failed = accept_inputs(state, input);
+	float excitation[kAxes];
+	copy(input.excitation, excitation);
 
-	if (input.armed == 0) {
-		clear_integral(state);
-		state.model.running = 0;
+	// Each is checked by itself only if their squares are large.
+	if (unlikely(!within((excitation[0] * excitation[0] + excitation[1] * excitation[1]) + excitation[2] * excitation[2],
+			     kMaxExcitation * kMaxExcitation))) {
+		for (float &value : excitation) { value = optional(value, kMaxExcitation, state.fault_count); }
 	}
 
-	if (failed != 0) {
-		damp_rates(state, failed, input, output);
+	if (input.armed == 0) { clear(state); }
+
+	if (unlikely(failed != 0)) {
+		damp_rates(state, failed, output);
 
 	} else {
-		control(state, input, output);
+		// A setpoint or attitude that is missing now holds the rate setpoint.
+		if ((state.missing & (kSetpointFault | kAttitudeFault)) == 0) {
+			update_rates_setpoint(gains, state, state.model, state.rates_setpoint, state.acceleration);
+			state.model.running = input.rate_mode != 0 ? 0 : input.armed;
+		}
+
+		copy(state.rates_setpoint, output.rates_setpoint);
+		const Signals x = signals(gains, state, state.acceleration, state.rates_setpoint);
+		const float period = input.armed != 0 && input.landed == 0 ? gains.period : 0.0F;
+		inner_loop(gains, input, x, excitation, period, state.integral, output.moment);
 	}
 
 	output.fault = failed;
