@@ -497,14 +497,17 @@ float sum(const Terms &terms) { return (terms.proportional - terms.derivative) +
 {
 	const float grown = integral + increment;
 	const float moment = rest + grown;
-	float highest = integral_max;
-	float lowest = -integral_max;
+	bool held = false;
 
-	if (moment > limit || saturation > 0) { highest = integral; }
+	if (increment > 0.0F) {
+		held = moment > limit || saturation > 0;
 
-	if (moment < -limit || saturation < 0) { lowest = integral; }
+	} else if (increment < 0.0F) {
+		held = moment < -limit || saturation < 0;
+	}
 
-	integral = grown > highest ? highest : (grown < lowest ? lowest : grown);
+	if (!held) { integral = clamp(grown, integral_max); }
+
 	return clamp(rest + integral, limit);
 }
 
