@@ -380,8 +380,9 @@ class Controller:
         """U = -Kp y_i - Kd d on axes with a valid rate, zero on the others; I is frozen."""
         f = self.f
         self.model, self.slewing = None, False
+        self.rates_setpoint, self.acceleration = [f(0)] * 3, [f(0)] * 2
         if not armed:
             self.integral = [f(0)] * 3
-        v = self._rest([f(0)] * 3, [f(0)] * 2)
+        v = self._rest(self.rates_setpoint, self.acceleration)
         u = [f(0) if lost[j] else self._clamp(v[j], self.moment_max[j]) for j in range(3)]
         return Step(np.array(u, f), np.zeros(3, f), fault, self.fault_count)

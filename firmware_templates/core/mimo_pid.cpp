@@ -545,10 +545,11 @@ float sum(const Terms &terms) { return (terms.proportional - terms.derivative) +
 	state.model.running = 0;
 	state.slewing = 0;
 
-	const float still[kAxes] = {};
-	const float steady[kModelAxes] = {};
-	torque_of(gains, state, still, steady, output.moment);
-	copy(still, output.rates_setpoint);
+	for (float &rate : state.rates_setpoint) { rate = 0.0F; }
+
+	state.acceleration[0] = state.acceleration[1] = 0.0F;
+	copy(state.rates_setpoint, output.rates_setpoint);
+	torque_of(gains, state, state.rates_setpoint, state.acceleration, output.moment);
 
 	for (int j = 0; j < kAxes; j++) {
 		const bool lost = (failed & (kRateFault << j)) != 0;

@@ -82,7 +82,7 @@ def _attitude_quaternion(s: VehicleState) -> Any:
 
 
 def _attitude_target(s: VehicleState) -> Any:
-    wanted = _floats(quaternions(s.record["setpoint"][None])[0])
+    wanted = _floats(setpoint_quaternions(s.record[None])[0])
     return mavlink.MAVLink_attitude_target_message(
         s.milliseconds, 0, wanted, *_floats(s.record["rates_setpoint"]), float(s.record["collective"])
     )
