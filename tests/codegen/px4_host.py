@@ -65,8 +65,7 @@ WORDS = {
     "integral": 3,
     "excitation": 3,
     "thrust": 3,
-    "angles": 3,
-    "wanted": 3,
+    "attitude": 4,
     "q_d": 4,
     "yaw_rate": 1,
 }

@@ -8,7 +8,6 @@
 #include <sstream>
 #include <string>
 
-#include "attitude.hpp"
 #include "excitation.hpp"
 #include "mc_mimo_pid.hpp"
 
@@ -107,7 +106,7 @@ void words(const float *values, int count)
 	}
 }
 
-// torque, rate setpoint, integral, excitation, thrust; then the angles from the module's own functions.
+// torque, rate setpoint, integral, excitation, thrust; then the last attitude and attitude setpoint, of whoever.
 void print_published()
 {
 	const auto torque = last<vehicle_torque_setpoint_s>(ORB_ID(vehicle_torque_setpoint));
@@ -117,10 +116,6 @@ void print_published()
 	const auto thrust = last<vehicle_thrust_setpoint_s>(ORB_ID(vehicle_thrust_setpoint));
 	const auto attitude = last<vehicle_attitude_s>(ORB_ID(vehicle_attitude));
 	const auto setpoint = last<vehicle_attitude_setpoint_s>(ORB_ID(vehicle_attitude_setpoint));
-	float angles[3];
-	float wanted[3];
-	mimopilot::angles(attitude.q, angles);
-	mimopilot::setpoint_angles(setpoint.q_d, angles[2], wanted);
 	printf("out %llu", static_cast<unsigned long long>(torque.timestamp_sample));
 	words(torque.xyz, 3);
 	words(&rates.roll, 1);
@@ -133,8 +128,7 @@ void print_published()
 	words(&excitation.y, 1);
 	words(&excitation.z, 1);
 	words(thrust.xyz, 3);
-	words(angles, 3);
-	words(wanted, 3);
+	words(attitude.q, 4);
 	words(setpoint.q_d, 4);
 	words(&setpoint.yaw_sp_move_rate, 1);
 	printf(" %s\n", excitation.name);
@@ -275,6 +269,15 @@ void execute(Line &line)
 		setpoint.yaw_sp_move_rate = line.number();
 		line.numbers(setpoint.thrust_body);
 		publish(ORB_ID(vehicle_attitude_setpoint), setpoint);
+
+	} else if (command == "rates_setpoint") {
+		vehicle_rates_setpoint_s setpoint{};
+		setpoint.timestamp = now;
+		setpoint.roll = line.number();
+		setpoint.pitch = line.number();
+		setpoint.yaw = line.number();
+		line.numbers(setpoint.thrust_body);
+		publish(ORB_ID(vehicle_rates_setpoint), setpoint);
 
 	} else if (command == "attitude") {
 		vehicle_attitude_s attitude{};
