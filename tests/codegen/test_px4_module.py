@@ -46,6 +46,15 @@ def native_outputs(gains, inputs):
     return NativeController(load_native(gains), gains).run(inputs)
 
 
+def level_inputs(count, **values):
+    """Armed rows at the attitude and the setpoint of `AIRBORNE`."""
+    inputs = np.zeros(count, INPUT)
+    inputs["attitude"][:, 0] = inputs["attitude_setpoint"][:, 0] = inputs["armed"] = 1
+    for name, value in values.items():
+        inputs[name] = value
+    return inputs
+
+
 def assert_same_bits(got, expected):
     assert len(got) == len(expected)
     assert got.tobytes() == np.ascontiguousarray(expected).tobytes()
@@ -190,8 +199,7 @@ def test_new_gains_take_effect_within_a_second_without_a_jump(program, gains):
         rates.append(rng.normal(size=3) * 0.05)
         commands.append(f"gyro 4000 {text(*rates[-1])}")
     out = drive(program, commands).out
-    inputs = np.zeros(400, INPUT)
-    inputs["rates"], inputs["armed"] = rates, 1
+    inputs = level_inputs(400, rates=rates)
     unchanged = native_outputs(gains, inputs)["moment"]
     change = int(np.flatnonzero((unchanged != out["torque"]).any(axis=1))[0])
     assert 100 <= change <= 350
@@ -204,8 +212,7 @@ def test_new_gains_take_effect_within_a_second_without_a_jump(program, gains):
 def test_gains_out_of_range_are_refused_by_name_and_the_old_ones_stay(program, gains):
     wrong = ["param MIMO_RP_RR 99", "param MIMO_RP_PP 0.2"]
     result = drive(program, [*AIRBORNE, STEP, *wrong, *["gyro 4000 0.1 0.1 0.1"] * 300])
-    inputs = np.zeros(300, INPUT)
-    inputs["rates"], inputs["armed"] = 0.1, 1
+    inputs = level_inputs(300, rates=0.1)
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
     assert any("MIMO_RP_RR is not within 0.0001 to 5" in line for line in result.log)
 
@@ -255,8 +262,7 @@ def test_the_excitation_runs_once_on_roll_then_pitch_and_is_published(program, g
     assert set(code) == {-1, 0, 1, 2}
     assert "finished" in last_end(result)
     # The core gets the same excitation.
-    inputs = np.zeros(len(x), INPUT)
-    inputs["excitation"], inputs["armed"] = np.column_stack([x, y, 0 * x]), 1
+    inputs = level_inputs(len(x), excitation=np.column_stack([x, y, 0 * x]))
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
 
 
@@ -344,6 +350,5 @@ def test_other_gains_use_their_own_values_and_period(gains, tmp_path):
     other = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, Ts=0.002), moment_scale=None)
     program = build(other, "crtp", tmp_path)
     start = ["gyro_interval 2000", *AIRBORNE, *["gyro 2000 0.1 -0.2 0.3"] * 20]
-    inputs = np.zeros(19, INPUT)
-    inputs["rates"], inputs["armed"] = [0.1, -0.2, 0.3], 1
+    inputs = level_inputs(19, rates=[0.1, -0.2, 0.3])
     assert_same_bits(drive(program, start).out["torque"], native_outputs(other, inputs)["moment"])

@@ -272,7 +272,7 @@ void execute(Line &line)
 
 	} else if (command == "rates_setpoint") {
 		vehicle_rates_setpoint_s setpoint{};
-		setpoint.timestamp = now;
+		setpoint.timestamp = now + 1;  // later than what the module published at `now`
 		setpoint.roll = line.number();
 		setpoint.pitch = line.number();
 		setpoint.yaw = line.number();
