@@ -229,9 +229,32 @@ def test_the_excitation_runs_once_on_roll_then_pitch_and_is_published(program, g
     assert set(np.abs(y[pitch])) == {amplitude} and not y[np.setdiff1d(np.arange(len(y)), pitch)].any()
     assert set(code) == {-1, 0, 1, 2}
     assert "finished" in last_end(result)
+    # The topic speaks from the request, within a second before the start, to the first sample without.
+    told = np.flatnonzero(result.announced)
+    assert np.ptp(told) + 1 == len(told) and told[-1] == pitch[-1] + 1
+    assert roll[0] - 250 <= told[0] < roll[0] or roll[0] == told[0]
     # The core gets the same excitation.
     inputs = level_inputs(len(x), excitation=np.column_stack([x, y, 0 * x]))
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
+
+
+def test_the_parts_of_the_torque_are_published_fifty_times_a_second(program):
+    gains = coupled_gains()
+    elements = [f"param MIMO_{code} {text(value)}" for code, value in gains.elements().items() if code != "TS"]
+    tilted = f"setpoint {text(*quaternion(0.1, -0.2, 0.3), 0, 0, 0, -0.5)}"
+    rng = np.random.default_rng(5)
+    turning = [f"gyro 4000 {text(*(rng.normal(size=3) * 0.3))}" for _ in range(500)]
+    result = drive(program, [*elements, "param MC_YAW_TQ_CUTOFF 0", *AIRBORNE, tilted, STEP, *turning])
+    lines = [line.split()[1:] for line in result.other if line.startswith("MIMO_PID")]
+    parts = np.array([[int(word, 16) for word in words] for words in lines], np.uint32).view(np.float32)
+    parts = parts.reshape(-1, 5, 3)  # proportional, integral, derivative, feed-forward, cross-axis
+    assert len(parts) == 100
+    torque = result.out["torque"][4::5]
+    free = np.abs(torque) < [1.0, 0.9, 0.8]
+    assert free.mean() > 0.9
+    np.testing.assert_allclose(parts.sum(axis=1)[free], torque[free], atol=2e-6)
+    np.testing.assert_allclose(parts[:, 1], result.out["integral"][4::5])
+    assert (np.abs(parts[:, [0, 1, 2, 4], :2]).max(axis=0) > 1e-3).all() and not parts[:, 4, 2].any()
 
 
 @pytest.mark.parametrize(("axis", "column"), [(1, 0), (2, 1)])

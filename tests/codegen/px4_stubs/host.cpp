@@ -78,7 +78,10 @@ void print_published()
 	const auto torque = last<vehicle_torque_setpoint_s>(ORB_ID(vehicle_torque_setpoint));
 	const auto rates = last<vehicle_rates_setpoint_s>(ORB_ID(vehicle_rates_setpoint));
 	const auto status = last<rate_ctrl_status_s>(ORB_ID(rate_ctrl_status));
-	const auto excitation = last<debug_vect_s>(ORB_ID(debug_vect));
+	auto excitation = last<debug_vect_s>(ORB_ID(debug_vect));
+
+	if (excitation.timestamp != now) { excitation = {0, 0.0F, 0.0F, -1.0F, "silent"}; }
+
 	const auto thrust = last<vehicle_thrust_setpoint_s>(ORB_ID(vehicle_thrust_setpoint));
 	const auto attitude = last<vehicle_attitude_s>(ORB_ID(vehicle_attitude));
 	const auto setpoint = last<vehicle_attitude_setpoint_s>(ORB_ID(vehicle_attitude_setpoint));
@@ -98,6 +101,13 @@ void print_published()
 	words(setpoint.q_d, 4);
 	words(&setpoint.yaw_sp_move_rate, 1);
 	printf(" %s\n", excitation.name);
+	const auto parts = last<debug_array_s>(ORB_ID(debug_array));
+
+	if (parts.timestamp == now) {
+		printf("%s", parts.name);
+		words(parts.data, 15);
+		printf("\n");
+	}
 }
 
 void module(const char *command)
