@@ -15,6 +15,7 @@
 #include <uORB/topics/actuator_controls_status.h>
 #include <uORB/topics/battery_status.h>
 #include <uORB/topics/control_allocator_status.h>
+#include <uORB/topics/debug_array.h>
 #include <uORB/topics/debug_vect.h>
 #include <uORB/topics/hover_thrust_estimate.h>
 #include <uORB/topics/manual_control_setpoint.h>
@@ -73,6 +74,7 @@ private:
 	void notice(const char *text);
 	void observe(hrt_abstime now);
 	void excite(float (&moment)[3]);
+	void log();
 	void publish(hrt_abstime timestamp_sample);
 	void release();
 
@@ -96,6 +98,7 @@ private:
 	uORB::Subscription _vehicle_torque_setpoint_sub{ORB_ID(vehicle_torque_setpoint)};
 
 	mimopilot::Topic<uORB::Publication<actuator_controls_status_s>> _actuator_controls_status_pub{ORB_ID(actuator_controls_status_0)};
+	uORB::Publication<debug_array_s> _debug_array_pub{ORB_ID(debug_array)};
 	uORB::Publication<debug_vect_s> _debug_vect_pub{ORB_ID(debug_vect)};
 	mimopilot::Topic<uORB::PublicationMulti<rate_ctrl_status_s>> _rate_ctrl_status_pub{ORB_ID(rate_ctrl_status)};
 	mimopilot::Topic<uORB::Publication<vehicle_attitude_setpoint_s>> _vehicle_attitude_setpoint_pub{ORB_ID(vehicle_attitude_setpoint)};
@@ -134,6 +137,8 @@ private:
 	vehicle_torque_setpoint_s _stock_torque{};  // of PX4's own controllers
 	const char *_obstacle{nullptr};
 	const char *_wrong_gain{nullptr};
+	int _unlogged{0};                // samples
+	bool _excitation_logged{false};
 	bool _wanted{false};
 	orb_advert_t _mavlink_log_pub{nullptr};
 

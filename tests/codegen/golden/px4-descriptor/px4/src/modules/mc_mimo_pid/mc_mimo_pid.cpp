@@ -9,6 +9,7 @@
 
 #include "attitude.hpp"
 #include "bumpless.hpp"
+#include "contributions.hpp"
 #include "gains.hpp"
 #include "stock_controllers.hpp"
 
@@ -17,6 +18,8 @@ using namespace mimopilot;
 namespace {
 
 constexpr char kExcitationName[] = "MIMO_EXC";
+constexpr char kPartsName[] = "MIMO_PID";
+constexpr int kLogSamples = static_cast<int>(0.02F / kGains.period + 0.5F);  // as PX4 logs rate_ctrl_status, 50 Hz
 constexpr uint32_t kBackup = static_cast<uint32_t>(1.0e7F * kGains.period);  // us, 10 periods: wakes up without a gyro
 
 // An optional field of a topic: NaN means not set.
@@ -448,16 +451,36 @@ void McMimoPid::excite(float (&moment)[3])
 	}
 }
 
+// For the log: the excitation from the request to the first sample without, and what the controller thinks.
+void McMimoPid::log()
+{
+	if (_excitation.phase() != Excitation::Phase::Off || _excitation_logged) {
+		debug_vect_s excitation{};
+		memcpy(excitation.name, kExcitationName, sizeof(kExcitationName));
+		excitation.x = _input.excitation[0];
+		excitation.y = _input.excitation[1];
+		excitation.z = _excitation.running() ? static_cast<float>(static_cast<int>(_excitation.phase())) : -1.0F;
+		excitation.timestamp = hrt_absolute_time();
+		_debug_vect_pub.publish(excitation);
+		_excitation_logged = _excitation.phase() != Excitation::Phase::Off;
+	}
+
+	if (++_unlogged >= kLogSamples) {
+		_unlogged = 0;
+		debug_array_s parts{};
+		static_assert(sizeof(Contributions) <= sizeof(parts.data), "the array must hold all parts");
+		Contributions contribution;
+		contributions(_state, _output, contribution);
+		memcpy(parts.data, &contribution, sizeof(contribution));
+		memcpy(parts.name, kPartsName, sizeof(kPartsName));
+		parts.timestamp = hrt_absolute_time();
+		_debug_array_pub.publish(parts);
+	}
+}
+
 void McMimoPid::publish(hrt_abstime timestamp_sample)
 {
-	debug_vect_s excitation{};
-	memcpy(excitation.name, kExcitationName, sizeof(kExcitationName));
-	excitation.x = _input.excitation[0];
-	excitation.y = _input.excitation[1];
-	excitation.z = _excitation.running() ? static_cast<float>(static_cast<int>(_excitation.phase())) : -1.0F;
-	excitation.timestamp = hrt_absolute_time();
-	_debug_vect_pub.publish(excitation);
-
+	log();
 	vehicle_rates_setpoint_s rates{};
 	rates.roll = _output.rates_setpoint[0];
 	rates.pitch = _output.rates_setpoint[1];
