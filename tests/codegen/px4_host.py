@@ -34,14 +34,30 @@ PX4_FLAGS = (
     "-Wframe-larger-than=2048",
     "-Wno-unused-parameter",
 )
-#: PX4's own parameters that the module reads, with defaults.
+#: PX4's own parameters that the module reads, with their defaults in PX4 v1.16; int32 where no point is.
 PX4_PARAMETERS = {
     "MPC_MAN_TILT_MAX": 35.0,
+    "MC_MAN_TILT_TAU": 0.0,
     "MPC_MAN_Y_MAX": 150.0,
+    "MPC_MAN_Y_TAU": 0.08,
+    "MPC_YAW_EXPO": 0.6,
+    "MPC_HOLD_DZ": 0.1,
+    "MC_AIRMODE": 0,
+    "MPC_THR_CURVE": 0,
     "MPC_MANTHR_MIN": 0.08,
     "MPC_THR_HOVER": 0.5,
     "MPC_THR_MAX": 1.0,
     "COM_SPOOLUP_TIME": 1.0,
+    "MC_ACRO_R_MAX": 100.0,
+    "MC_ACRO_P_MAX": 100.0,
+    "MC_ACRO_Y_MAX": 100.0,
+    "MC_ACRO_EXPO": 0.0,
+    "MC_ACRO_EXPO_Y": 0.0,
+    "MC_ACRO_SUPEXPO": 0.0,
+    "MC_ACRO_SUPEXPOY": 0.0,
+    "MC_BAT_SCALE_EN": 0,
+    "MC_YAW_TQ_CUTOFF": 2.0,
+    "MC_AT_EN": 0,
 }
 WORDS = {
     "torque": 3,
@@ -52,6 +68,7 @@ WORDS = {
     "angles": 3,
     "wanted": 3,
     "q_d": 4,
+    "yaw_rate": 1,
 }
 OUT = np.dtype([(name, "<f4", count) for name, count in WORDS.items()])
 
@@ -64,7 +81,8 @@ def definitions(files: dict[str, str]) -> dict[str, dict]:
 
 def parameters_header(entries: dict[str, dict]) -> str:
     """What PX4's build generates from module.yaml: an enum, types and defaults."""
-    kinds = {name: entry["type"] == "float" for name, entry in entries.items()} | dict.fromkeys(PX4_PARAMETERS, True)
+    kinds = {name: entry["type"] == "float" for name, entry in entries.items()}
+    kinds |= {name: isinstance(value, float) for name, value in PX4_PARAMETERS.items()}
     values = {name: entry["default"] for name, entry in entries.items()} | PX4_PARAMETERS
     names = list(kinds)
     apply = [f"#define APPLY_{n}(m, x, ...) m(x) APPLY_{n - 1}(m, __VA_ARGS__)" for n in range(2, len(names) + 1)]
@@ -81,10 +99,12 @@ def parameters_header(entries: dict[str, dict]) -> str:
             "constexpr bool is_float(params p) { return kFloat[static_cast<int>(p)]; }",
             "inline double *values() {",
             "static double v[] = {" + ", ".join(repr(float(values[n])) for n in names) + "}; return v; }",
-            "inline void set_value(const char *name, double value) {",
+            "inline int find(const char *name) {",
             "static const char *const names[] = {" + ", ".join(f'"{n}"' for n in names) + "};",
-            f"for (int i = 0; i < {len(names)}; i++) {{",
-            "if (strcmp(names[i], name) == 0) { values()[i] = value; return; } } abort(); }",
+            f"for (int i = 0; i < {len(names)}; i++) {{ if (strcmp(names[i], name) == 0) {{ return i; }} }}",
+            "return 0xffff; }",
+            "inline void set_value(const char *name, double value) {",
+            "const int i = find(name); if (i == 0xffff) { abort(); } values()[i] = value; }",
             "}",
             "#define APPLY_1(m, x) m(x)",
             *apply,

@@ -10,12 +10,13 @@ from scipy.stats import ks_2samp
 from mimopilot.codegen.layout import INPUT
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.tuning.excitation import prbs
-from tests.codegen.px4_host import PX4_PARAMETERS, STANDARD, build, drive
+from tests.codegen.px4_host import STANDARD, build, drive
 from tests.conftest import coupled_gains, following_gains
 
 HOLD_MODE = 4
 LEVEL = "attitude 1 0 0 0 0 1 0 0 0"
-AIRBORNE = ["gyro 0 0 0 0", "start", f"mode 1 0 1 1 {HOLD_MODE}", "land 0 0", LEVEL, "setpoint 1 0 0 0 0 0 0 -0.5"]
+START = ["param MC_YAW_TQ_CUTOFF 0", "gyro 0 0 0 0", "start"]
+AIRBORNE = [*START, f"mode 1 0 1 1 {HOLD_MODE}", "land 0 0", LEVEL, "setpoint 1 0 0 0 0 0 0 -0.5"]
 STEP = "gyro 4000 0 0 0"
 
 
@@ -243,7 +244,7 @@ def test_a_heading_reset_rotates_the_setpoint(program):
 def excited(program, *events, axis=3, seconds=0.2, mode=HOLD_MODE, steps=600, settings=()):
     """A flight with an excitation requested in the air; events: (sample, command)."""
     setup = [f"param MIMO_EX_DUR {seconds}", "param MIMO_EX_HMIN 2", "param MIMO_EX_HMAX 9", *settings]
-    commands = [*AIRBORNE[:2], *setup, *AIRBORNE[2:], f"mode 1 0 1 1 {mode}", *[STEP] * 300]
+    commands = [*START, *setup, *AIRBORNE[len(START) :], f"mode 1 0 1 1 {mode}", *[STEP] * 300]
     commands += [f"param MIMO_EX_AX {axis}"]
     events = dict(events)
     for k in range(steps):
@@ -356,68 +357,6 @@ def test_the_pulses_have_the_distribution_of_tunings_prbs(programs):
         assert ks_2samp(ours, theirs).pvalue > 0.05
     first = [drive(programs["crtp"], [f"prbs {seed} 10 60 1"]).other[0] for seed in range(20)]
     assert set(first) == {"prbs 1", "prbs -1"}
-
-
-# Sticks: Stabilized is nav_state 15, manual without altitude control.
-
-
-def by_sticks(program, *commands, attitude=1):
-    return drive(program, [*AIRBORNE, f"mode 1 1 0 {attitude} 15", "sticks 1 0 0 0 0", *[STEP] * 300, *commands])
-
-
-def test_sticks_command_the_same_tilt_as_in_px4(program):
-    tilt = np.radians(PX4_PARAMETERS["MPC_MAN_TILT_MAX"])
-    for roll, pitch in ((0.5, 0.0), (0.0, 0.5), (1.0, 1.0), (-0.3, 0.6)):
-        out = by_sticks(program, f"sticks 1 {roll} {pitch} 0 0", STEP, STEP).out
-        w, x, y, z = out["q_d"][-1].astype(float)
-        length = np.hypot(roll, pitch)
-        assert 2 * np.arccos(w) == pytest.approx(tilt * min(1, length), abs=1e-3)
-        np.testing.assert_allclose([x, y], np.array([roll, -pitch]) / length * np.sqrt(x * x + y * y), atol=1e-6)
-        assert z == 0
-        assert np.sign(out["rates"][-1, 0]) == np.sign(roll) or roll == 0
-
-
-def test_centre_throttle_is_hover_thrust_and_thrust_is_zero_until_spool_up_ends(program):
-    out = by_sticks(program, "sticks 1 0 0 0 1", STEP, STEP, "sticks 1 0 0 0 -1", STEP, STEP).out
-    thrust = -out["thrust"][:, 2]
-    assert (thrust[:240] == 0).all()
-    assert thrust[260] == np.float32(0.5)
-    assert thrust[-3] == 1.0
-    assert thrust[-1] == pytest.approx(0.08, abs=1e-6)
-
-
-def test_the_yaw_stick_commands_a_rate_and_then_the_heading_is_held(program):
-    out = by_sticks(program, "sticks 1 0 0 0.5 0", STEP, STEP).out
-    assert out["rates"][-1, 2] == pytest.approx(0.5 * np.radians(PX4_PARAMETERS["MPC_MAN_Y_MAX"]), rel=1e-5)
-    turned = f"attitude {text(*quaternion(0, 0, 0.4))} 0 1 0 0 0"
-    held = f"attitude {text(*quaternion(0, 0, 0.3))} 0 1 0 0 0"
-    out = by_sticks(program, "sticks 1 0 0 0.5 0", turned, STEP, "sticks 1 0 0 0 0", held, STEP, STEP).out
-    assert out["wanted"][-1, 2] == pytest.approx(0.4, abs=1e-5)
-    assert out["rates"][-1, 2] > 0.1
-
-
-def test_the_heading_is_not_held_at_minimum_throttle(program):
-    turned = f"attitude {text(*quaternion(0, 0, 0.4))} 0 1 0 0 0"
-    for throttle, heading in ((-1, 0.4), (0, 0.0)):
-        out = by_sticks(program, f"sticks 1 0 0 0 {throttle}", turned, STEP, STEP).out
-        assert out["wanted"][-1, 2] == pytest.approx(heading, abs=1e-5)
-
-
-def test_a_heading_reset_shifts_the_held_heading(program):
-    step = quaternion(0, 0, 0.4)
-    out = by_sticks(program, f"attitude {text(*step)} 1 {text(*step)}", STEP, STEP).out
-    assert out["wanted"][-1, 2] == pytest.approx(0.4, abs=1e-5)
-
-
-def test_minimum_throttle_on_the_ground_is_zero_thrust(program):
-    out = by_sticks(program, "sticks 1 0 0 0 -1", "land 1 0", STEP, STEP).out
-    assert out["thrust"][-1, 2] == pytest.approx(0, abs=1e-6)
-
-
-def test_acro_flies_as_stabilized_with_an_error_message(program):
-    result = by_sticks(program, "sticks 1 0.5 0 0 0", STEP, STEP, attitude=0)
-    assert sum("Acro flies as Stabilized" in line for line in result.log) == 1
-    assert result.out["wanted"][-1, 0] == pytest.approx(0.5 * np.radians(35), abs=1e-3)
 
 
 def test_other_gains_use_their_own_values_and_period(gains, tmp_path):

@@ -14,8 +14,11 @@
 
 #define DEFINE_TOPIC(name) const orb_metadata __orb_##name{#name, sizeof(name##_s)}
 extern "C" {
+const orb_metadata __orb_actuator_controls_status_0{"actuator_controls_status_0", sizeof(actuator_controls_status_s)};
+DEFINE_TOPIC(battery_status);
 DEFINE_TOPIC(control_allocator_status);
 DEFINE_TOPIC(debug_vect);
+DEFINE_TOPIC(hover_thrust_estimate);
 DEFINE_TOPIC(manual_control_setpoint);
 DEFINE_TOPIC(parameter_update);
 DEFINE_TOPIC(rate_ctrl_status);
@@ -24,6 +27,7 @@ DEFINE_TOPIC(vehicle_attitude);
 DEFINE_TOPIC(vehicle_attitude_setpoint);
 DEFINE_TOPIC(vehicle_control_mode);
 DEFINE_TOPIC(vehicle_land_detected);
+DEFINE_TOPIC(vehicle_local_position);
 DEFINE_TOPIC(vehicle_rates_setpoint);
 DEFINE_TOPIC(vehicle_status);
 DEFINE_TOPIC(vehicle_thrust_setpoint);
@@ -36,6 +40,7 @@ namespace {
 
 uint64_t now = 1000000;
 uint64_t gyro_interval = 4000;
+vehicle_status_s vehicle{};
 
 }  // namespace
 
@@ -131,6 +136,7 @@ void print_published()
 	words(angles, 3);
 	words(wanted, 3);
 	words(setpoint.q_d, 4);
+	words(&setpoint.yaw_sp_move_rate, 1);
 	printf(" %s\n", excitation.name);
 }
 
@@ -176,7 +182,15 @@ void execute(Line &line)
 		line.numbers(rates);
 		now += static_cast<uint64_t>(step);
 		const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
+		const unsigned powers = uORB::node(ORB_ID(actuator_controls_status_0)).generation;
 		gyro(rates);
+
+		if (uORB::node(ORB_ID(actuator_controls_status_0)).generation != powers) {
+			const auto power = last<actuator_controls_status_s>(ORB_ID(actuator_controls_status_0));
+			printf("power");
+			words(power.control_power, 3);
+			printf("\n");
+		}
 
 		if (uORB::node(ORB_ID(vehicle_torque_setpoint)).generation != before) {
 			print_published();
@@ -201,15 +215,37 @@ void execute(Line &line)
 
 	} else if (command == "mode") {
 		vehicle_control_mode_s mode{};
-		vehicle_status_s status{};
 		mode.flag_armed = line.flag();
 		mode.flag_control_manual_enabled = line.flag();
 		mode.flag_control_altitude_enabled = line.flag();
 		mode.flag_control_attitude_enabled = line.flag();
 		mode.flag_control_rates_enabled = true;
-		status.nav_state = static_cast<uint8_t>(line.number());
+		vehicle.nav_state = static_cast<uint8_t>(line.number());
+		vehicle.armed_time = !mode.flag_armed ? 0 : (vehicle.armed_time == 0 ? now : vehicle.armed_time);
 		publish(ORB_ID(vehicle_control_mode), mode);
-		publish(ORB_ID(vehicle_status), status);
+		publish(ORB_ID(vehicle_status), vehicle);
+
+	} else if (command == "vehicle") {
+		vehicle.vehicle_type = static_cast<uint8_t>(line.number());
+		vehicle.is_vtol = line.flag();
+		publish(ORB_ID(vehicle_status), vehicle);
+
+	} else if (command == "hover") {
+		hover_thrust_estimate_s hover{};
+		hover.valid = line.flag();
+		hover.hover_thrust = line.number();
+		publish(ORB_ID(hover_thrust_estimate), hover);
+
+	} else if (command == "heading") {
+		vehicle_local_position_s position{};
+		position.heading_good_for_control = line.flag();
+		publish(ORB_ID(vehicle_local_position), position);
+
+	} else if (command == "battery") {
+		battery_status_s battery{};
+		battery.connected = line.flag();
+		battery.scale = line.number();
+		publish(ORB_ID(battery_status), battery);
 
 	} else if (command == "land") {
 		vehicle_land_detected_s land{};
@@ -287,6 +323,7 @@ int px4_usleep(unsigned microseconds)
 int main()
 {
 	std::string text;
+	vehicle.vehicle_type = vehicle_status_s::VEHICLE_TYPE_ROTARY_WING;
 
 	while (std::getline(std::cin, text)) {
 		Line line(text);

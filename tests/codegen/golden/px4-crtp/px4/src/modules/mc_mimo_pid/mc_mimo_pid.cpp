@@ -8,12 +8,12 @@
 
 #include "attitude.hpp"
 #include "gains.hpp"
+#include "multicopter.hpp"
 
 using namespace mimopilot;
 
 namespace {
 
-constexpr float kRadian = 0.017453293F;  // rad/deg
 constexpr char kExcitationName[] = "MIMO_EXC";
 
 // An optional field of a topic: NaN means not set.
@@ -118,6 +118,7 @@ void McMimoPid::update_parameters()
 	}
 
 	_excitation.configure(_parameters.excitation());
+	read(_settings);
 }
 
 void McMimoPid::Run()
@@ -176,16 +177,10 @@ void McMimoPid::update_inputs()
 		_mode_refused = refused;
 	}
 
-	if (!_control_mode.flag_armed) {
-		_armed_since = 0;
-
-	} else if (_armed_since == 0) {
-		_armed_since = hrt_absolute_time();
-	}
-
 	vehicle_land_detected_s land_detected;
 
 	if (_vehicle_land_detected_sub.update(&land_detected)) {
+		_landed = land_detected.landed;
 		_on_ground = land_detected.landed || land_detected.maybe_landed;
 	}
 
@@ -200,8 +195,28 @@ void McMimoPid::update_inputs()
 
 	_input.armed = _control_mode.flag_armed ? 1 : 0;
 	_input.landed = _on_ground ? 1 : 0;
+	update_stock_inputs();
 	update_attitude();
 	update_setpoint();
+}
+
+void McMimoPid::update_stock_inputs()
+{
+	hover_thrust_estimate_s hover;
+
+	if (_hover_thrust_estimate_sub.update(&hover)) { _throttle.estimate(_settings, hover.valid, hover.hover_thrust); }
+
+	vehicle_local_position_s position;
+
+	if (_vehicle_local_position_sub.update(&position)) { _heading_good = position.heading_good_for_control; }
+
+	battery_status_s battery;
+
+	if (_battery_status_sub.update(&battery) && battery.connected) { _actuation.battery(battery.scale); }
+
+	const float armed_for = 1.0e-6F * static_cast<float>(hrt_absolute_time() - _status.armed_time);
+	const bool spooled_up = _control_mode.flag_armed && armed_for > _settings.spool_up_time;
+	_throttle.update(_settings, _landed, spooled_up, kGains.period);
 }
 
 void McMimoPid::update_attitude()
@@ -234,7 +249,7 @@ void McMimoPid::update_setpoint()
 	vehicle_attitude_setpoint_s setpoint;
 
 	if (flown_by_sticks()) {
-		if (_in_control) { make_setpoint_from_sticks(); }
+		make_setpoint_from_sticks();
 
 	} else {
 		_sticks.release();
@@ -260,23 +275,18 @@ void McMimoPid::update_setpoint()
 
 void McMimoPid::make_setpoint_from_sticks()
 {
-	StickSettings settings;
-	settings.tilt_max = kRadian * _parameters.tilt_max();
-	settings.yaw_rate_max = kRadian * _parameters.yaw_rate_max();
-	settings.thrust_min = _on_ground ? 0.0F : _parameters.thrust_min();
-	settings.thrust_hover = _parameters.thrust_hover();
-	settings.thrust_max = _parameters.thrust_max();
 	const StickInput input{_manual.roll, _manual.pitch, _manual.yaw, _manual.throttle};
-	const StickSetpoint sticks = _sticks.setpoint(settings, input, optional(_input.attitude[2]));
+	const float heading = optional(_input.attitude[2]);
+	const StickSetpoint sticks = _sticks.setpoint(_settings, input, heading, _heading_good, kGains.period);
 	const hrt_abstime now = hrt_absolute_time();
-	const float armed_for = _armed_since == 0 ? 0.0F : 1.0e-6F * static_cast<float>(now - _armed_since);
-	const bool spooled_up = _armed_since != 0 && armed_for > _parameters.spool_up_time();
 
 	memcpy(_q_d, sticks.q_d, sizeof(_q_d));
 	_yaw_rate = sticks.yaw_rate;
 	_thrust[0] = _thrust[1] = 0.0F;
-	_thrust[2] = spooled_up ? -sticks.thrust : 0.0F;
+	_thrust[2] = -_throttle.thrust(_settings, _manual.throttle);
 	_setpoint_time = now;
+
+	if (!_in_control) { return; }
 
 	vehicle_attitude_setpoint_s setpoint{};
 	memcpy(setpoint.q_d, _q_d, sizeof(_q_d));
@@ -344,22 +354,38 @@ void McMimoPid::publish(const vehicle_angular_velocity_s &angular_velocity, cons
 	_rate_ctrl_status_pub.publish(status);
 
 	vehicle_thrust_setpoint_s thrust{};
-	memcpy(thrust.xyz, _thrust, sizeof(_thrust));
+	vehicle_torque_setpoint_s torque{};
+	memcpy(thrust.xyz, _thrust, sizeof(thrust.xyz));
+	memcpy(torque.xyz, output.moment, sizeof(torque.xyz));
+	_actuation.apply(_settings, kGains.period, torque.xyz, thrust.xyz);
+
 	thrust.timestamp_sample = angular_velocity.timestamp_sample;
 	thrust.timestamp = hrt_absolute_time();
 	_vehicle_thrust_setpoint_pub.publish(thrust);
 
-	// Last, because the torque setpoint triggers the allocator.
-	vehicle_torque_setpoint_s torque{};
-	memcpy(torque.xyz, output.moment, sizeof(torque.xyz));
+	// Triggers the allocator: after the thrust.
 	torque.timestamp_sample = angular_velocity.timestamp_sample;
 	torque.timestamp = hrt_absolute_time();
 	_vehicle_torque_setpoint_pub.publish(torque);
+
+	actuator_controls_status_s power{};
+
+	if (_actuation.power(torque.xyz, kGains.period, power.control_power)) {
+		power.timestamp = torque.timestamp;
+		_actuator_controls_status_pub.publish(power);
+	}
 }
 
 int McMimoPid::task_spawn(int argc, char *argv[])
 {
 	if (!gyro_keeps_period()) { return PX4_ERROR; }
+
+	const char *const reason = not_flown();
+
+	if (reason != nullptr) {
+		PX4_ERR("not started: %s", reason);
+		return PX4_ERROR;
+	}
 
 	McMimoPid *const instance = new McMimoPid();
 

@@ -94,14 +94,6 @@ public:
 
 	int32_t excitation_mode() const { return _mimo_ex_mode.get(); }
 
-	// PX4's own parameters for Stabilized mode.
-	float tilt_max() const { return _mpc_man_tilt_max.get(); }          // deg
-	float yaw_rate_max() const { return _mpc_man_y_max.get(); }         // deg/s
-	float thrust_min() const { return _mpc_manthr_min.get(); }
-	float thrust_hover() const { return _mpc_thr_hover.get(); }
-	float thrust_max() const { return _mpc_thr_max.get(); }
-	float spool_up_time() const { return _com_spoolup_time.get(); }     // s
-
 private:
 	static int32_t samples(float seconds)
 	{
@@ -165,12 +157,6 @@ private:
 		(ParamFloat<px4::params::MIMO_EX_DUR>) _mimo_ex_dur,
 		(ParamInt<px4::params::MIMO_EX_SEED>) _mimo_ex_seed,
 		(ParamInt<px4::params::MIMO_EX_MODE>) _mimo_ex_mode,
-		(ParamFloat<px4::params::MIMO_EX_TILT>) _mimo_ex_tilt,
-		(ParamFloat<px4::params::MPC_MAN_TILT_MAX>) _mpc_man_tilt_max,
-		(ParamFloat<px4::params::MPC_MAN_Y_MAX>) _mpc_man_y_max,
-		(ParamFloat<px4::params::MPC_MANTHR_MIN>) _mpc_manthr_min,
-		(ParamFloat<px4::params::MPC_THR_HOVER>) _mpc_thr_hover,
-		(ParamFloat<px4::params::MPC_THR_MAX>) _mpc_thr_max,
-		(ParamFloat<px4::params::COM_SPOOLUP_TIME>) _com_spoolup_time
+		(ParamFloat<px4::params::MIMO_EX_TILT>) _mimo_ex_tilt
 	)
 };

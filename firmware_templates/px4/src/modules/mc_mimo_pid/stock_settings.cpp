@@ -1,0 +1,38 @@
+#include "stock_settings.hpp"
+
+#include <px4_platform_common/param.h>
+
+namespace mimopilot {
+
+void read(StockSettings &settings)
+{
+	using px4::params;
+	static constexpr params kNames[] = {
+		params::MPC_MAN_TILT_MAX, params::MC_MAN_TILT_TAU, params::MPC_MAN_Y_MAX, params::MPC_MAN_Y_TAU,
+		params::MPC_YAW_EXPO, params::MPC_HOLD_DZ, params::MC_AIRMODE, params::MPC_THR_CURVE, params::MPC_MANTHR_MIN,
+		params::MPC_THR_HOVER, params::MPC_THR_MAX, params::COM_SPOOLUP_TIME, params::MC_ACRO_R_MAX,
+		params::MC_ACRO_P_MAX, params::MC_ACRO_Y_MAX, params::MC_ACRO_EXPO, params::MC_ACRO_EXPO,
+		params::MC_ACRO_EXPO_Y, params::MC_ACRO_SUPEXPO, params::MC_ACRO_SUPEXPO, params::MC_ACRO_SUPEXPOY,
+		params::MC_BAT_SCALE_EN, params::MC_YAW_TQ_CUTOFF,
+	};
+	static_assert(sizeof(settings) / sizeof(float) == sizeof(kNames) / sizeof(kNames[0]), "one float a parameter");
+	float *value = &settings.tilt_max;
+
+	for (const params name : kNames) {
+		const param_t handle = param_handle(name);
+		param_set_used(handle);
+
+		if (param_type(handle) == PARAM_TYPE_FLOAT) {
+			param_get(handle, value);
+
+		} else {
+			int32_t integer = 0;
+			param_get(handle, &integer);
+			*value = static_cast<float>(integer);
+		}
+
+		value++;
+	}
+}
+
+}  // namespace mimopilot
