@@ -85,9 +85,6 @@ def parameters_header(entries: dict[str, dict]) -> str:
     kinds |= {name: isinstance(value, float) for name, value in PX4_PARAMETERS.items()}
     values = {name: entry["default"] for name, entry in entries.items()} | PX4_PARAMETERS
     names = list(kinds)
-    apply = [f"#define APPLY_{n}(m, x, ...) m(x) APPLY_{n - 1}(m, __VA_ARGS__)" for n in range(2, len(names) + 1)]
-    places = ", ".join(f"_{n}" for n in range(len(names)))
-    counts = ", ".join(f"APPLY_{n}" for n in range(len(names), 0, -1))
     return "\n".join(
         [
             "#pragma once",
@@ -96,20 +93,17 @@ def parameters_header(entries: dict[str, dict]) -> str:
             "namespace px4 {",
             f"enum class params {{ {', '.join(names)} }};",
             "constexpr bool kFloat[] = {" + ", ".join("true" if kinds[n] else "false" for n in names) + "};",
-            "constexpr bool is_float(params p) { return kFloat[static_cast<int>(p)]; }",
             "inline double *values() {",
             "static double v[] = {" + ", ".join(repr(float(values[n])) for n in names) + "}; return v; }",
-            "inline int find(const char *name) {",
+            "inline const char *name(int i) {",
             "static const char *const names[] = {" + ", ".join(f'"{n}"' for n in names) + "};",
-            f"for (int i = 0; i < {len(names)}; i++) {{ if (strcmp(names[i], name) == 0) {{ return i; }} }}",
+            "return names[i]; }",
+            "inline int find(const char *wanted) {",
+            f"for (int i = 0; i < {len(names)}; i++) {{ if (strcmp(name(i), wanted) == 0) {{ return i; }} }}",
             "return 0xffff; }",
             "inline void set_value(const char *name, double value) {",
             "const int i = find(name); if (i == 0xffff) { abort(); } values()[i] = value; }",
             "}",
-            "#define APPLY_1(m, x) m(x)",
-            *apply,
-            f"#define APPLY_PICK({places}, macro, ...) macro",
-            f"#define APPLY_ALL(m, ...) APPLY_PICK(__VA_ARGS__, {counts}, 0)(m, __VA_ARGS__)",
             "",
         ]
     )

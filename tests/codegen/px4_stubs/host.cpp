@@ -7,6 +7,9 @@
 #include <map>
 #include <sstream>
 #include <string>
+#include <vector>
+
+#include <px4_platform_common/param.h>
 
 #include "attitude.hpp"
 #include "excitation.hpp"
@@ -48,15 +51,101 @@ namespace uORB {
 
 px4::WorkItem *scheduled = nullptr;
 
+// A topic and its last message.
+struct Node {
+	std::vector<uint8_t> message;
+	unsigned generation{0};
+	bool advertised{false};
+};
+
 Node &node(const orb_metadata *meta)
 {
 	static std::map<const orb_metadata *, Node> nodes;
 	return nodes[meta];
 }
 
+void *Manager::orb_add_internal_subscriber(const orb_metadata *meta) { return &node(meta); }
+bool Manager::is_advertised(const void *node) { return static_cast<const Node *>(node)->advertised; }
+
+unsigned Manager::updates_available(const void *node, unsigned last_generation)
+{
+	return is_advertised(node) ? static_cast<const Node *>(node)->generation - last_generation : 0;
+}
+
+bool Manager::orb_data_copy(void *node, void *dst, unsigned &generation, bool only_if_updated)
+{
+	const Node &topic = *static_cast<Node *>(node);
+
+	if (!topic.advertised || topic.message.empty() || (only_if_updated && generation == topic.generation)) { return false; }
+
+	memcpy(dst, topic.message.data(), topic.message.size());
+	generation = topic.generation;
+	return true;
+}
+
+int Manager::orb_publish(const orb_metadata *meta, orb_advert_t handle, const void *data)
+{
+	Node &topic = *static_cast<Node *>(handle);
+	const uint8_t *const bytes = static_cast<const uint8_t *>(data);
+	topic.message.assign(bytes, bytes + meta->o_size);
+	topic.generation++;
+	return 0;
+}
+
+int Manager::orb_unadvertise(orb_advert_t handle)
+{
+	static_cast<Node *>(handle)->advertised = false;
+	return 0;
+}
+
+bool SubscriptionCallbackWorkItem::registerCallback()
+{
+	scheduled = _item;
+	return true;
+}
+
+void SubscriptionCallbackWorkItem::unregisterCallback() { scheduled = nullptr; }
+
+bool SubscriptionInterval::updated() { return hrt_absolute_time() - _last >= _interval && _subscription.updated(); }
+
+bool SubscriptionInterval::copy(void *dst)
+{
+	_last = hrt_absolute_time();
+	return _subscription.copy(dst);
+}
+
 }  // namespace uORB
 
+orb_advert_t orb_advertise(const orb_metadata *meta, const void *)
+{
+	uORB::node(meta).advertised = true;
+	return &uORB::node(meta);
+}
+
 hrt_abstime hrt_absolute_time() { return now; }
+
+param_t param_find(const char *name) { return static_cast<param_t>(px4::find(name)); }
+const char *param_name(param_t handle) { return px4::name(handle); }
+int param_type(param_t handle) { return px4::kFloat[handle] ? PARAM_TYPE_FLOAT : PARAM_TYPE_INT32; }
+void param_set_used(param_t) {}
+
+int param_get(param_t handle, float *value)
+{
+	*value = static_cast<float>(px4::values()[handle]);
+	return 0;
+}
+
+int param_get(param_t handle, int32_t *value)
+{
+	*value = static_cast<int32_t>(px4::values()[handle]);
+	return 0;
+}
+
+perf_counter_t perf_alloc(enum perf_counter_type, const char *) { return nullptr; }
+void perf_free(perf_counter_t) {}
+void perf_begin(perf_counter_t) {}
+void perf_end(perf_counter_t) {}
+void perf_print_counter(perf_counter_t) {}
 
 void px4_log(const char *level, const char *format, ...)
 {

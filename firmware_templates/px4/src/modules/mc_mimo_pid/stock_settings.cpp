@@ -1,6 +1,6 @@
 #include "stock_settings.hpp"
 
-#include <px4_platform_common/param.h>
+#include "parameter_value.hpp"
 
 namespace mimopilot {
 
@@ -19,18 +19,8 @@ void read(StockSettings &settings)
 	float *value = &settings.tilt_max;
 
 	for (const params name : kNames) {
-		const param_t handle = param_handle(name);
-		param_set_used(handle);
-
-		if (param_type(handle) == PARAM_TYPE_FLOAT) {
-			param_get(handle, value);
-
-		} else {
-			int32_t integer = 0;
-			param_get(handle, &integer);
-			*value = static_cast<float>(integer);
-		}
-
+		param_set_used(param_handle(name));
+		*value = parameter_value(name);
 		value++;
 	}
 }

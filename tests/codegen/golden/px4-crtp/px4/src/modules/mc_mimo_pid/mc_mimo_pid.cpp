@@ -83,7 +83,6 @@ bool gyro_keeps_period()
 }  // namespace
 
 McMimoPid::McMimoPid() :
-	ModuleParams(nullptr),
 	WorkItem(MODULE_NAME, px4::wq_configurations::rate_ctrl),
 	_clock(kGains.period)
 {
@@ -105,13 +104,11 @@ bool McMimoPid::init()
 
 void McMimoPid::update_parameters()
 {
-	updateParams();
 	Gains gains;
-	const mimo_pid_parameter *const wrong = _parameters.gains(gains);
+	const char *const wrong = _parameters.read(gains);
 
 	if (wrong != nullptr) {
-		PX4_ERR("%s is not within %g to %g: no gain changed", wrong->name,
-			static_cast<double>(wrong->minimum), static_cast<double>(wrong->maximum));
+		PX4_ERR("%s is out of its range: no gain changed", wrong);
 
 	} else if (memcmp(&gains, &_state.gains, sizeof(gains)) != 0) {
 		set_gains(_state, gains);
@@ -414,12 +411,6 @@ int McMimoPid::print_status()
 	if (_output.fault != 0) { PX4_INFO("only damping rates: invalid inputs 0x%x", static_cast<unsigned>(_output.fault)); }
 
 	PX4_INFO("excitation %s, last one: %s", describe(_excitation.phase()), describe(_excitation.end()));
-	const float *const gains = &_state.gains.kp_o[0][0];
-
-	for (int i = 0; i < MIMO_PID_PARAMETER_COUNT; i++) {
-		PX4_INFO_RAW("  %-16s %g\n", mimo_pid_parameters[i].name, static_cast<double>(gains[i]));
-	}
-
 	perf_print_counter(_cycle_perf);
 	return 0;
 }

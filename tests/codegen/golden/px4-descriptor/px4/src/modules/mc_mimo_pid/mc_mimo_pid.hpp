@@ -2,10 +2,10 @@
 // Cascaded MIMO PID attitude controller for multicopters, replaces mc_att_control and mc_rate_control.
 #pragma once
 
+#include <drivers/drv_hrt.h>
 #include <lib/perf/perf_counter.h>
 #include <px4_platform_common/defines.h>
 #include <px4_platform_common/module.h>
-#include <px4_platform_common/module_params.h>
 #include <px4_platform_common/px4_work_queue/WorkItem.hpp>
 #include <uORB/Publication.hpp>
 #include <uORB/PublicationMulti.hpp>
@@ -41,7 +41,7 @@
 
 using namespace time_literals;
 
-class McMimoPid : public ModuleBase, public ModuleParams, public px4::WorkItem
+class McMimoPid : public ModuleBase, public px4::WorkItem
 {
 public:
 	static Descriptor desc;
@@ -101,7 +101,7 @@ private:
 	bool _on_ground{true};  // landed or maybe landed
 	bool _heading_good{true};
 
-	MimoParameters _parameters{this};
+	mimopilot::Parameters _parameters{};
 	mimopilot::StockSettings _settings{};
 	mimopilot::SampleClock _clock;
 	mimopilot::Sticks _sticks{};
