@@ -57,6 +57,8 @@ PX4_PARAMETERS = {
     "MC_ACRO_SUPEXPOY": 0.0,
     "MC_BAT_SCALE_EN": 0,
     "MC_YAW_TQ_CUTOFF": 2.0,
+    "COM_OF_LOSS_T": 1.0,
+    "COM_RC_LOSS_T": 0.5,
     "MC_AT_EN": 0,
 }
 WORDS = {
@@ -123,7 +125,7 @@ def build(gains, api: str, folder: Path) -> Path:
     common = [find_compiler(), STANDARD[api], *PX4_FLAGS, *includes]
     jobs = {core / "mimo_pid.cpp": ["-fno-fast-math", "-fno-reciprocal-math", "-fno-associative-math", *WARNINGS]}
     jobs |= {path: [*WARNINGS, "-Wno-unused-parameter"] for path in sorted(module.glob("*.cpp"))}
-    jobs[STUBS / "host.cpp"] = ["-Wall", "-fexceptions", "-frtti"]
+    jobs |= {path: ["-Wall", "-fexceptions", "-frtti"] for path in sorted(STUBS.glob("*.cpp"))}
     objects = []
     for source, flags in jobs.items():
         objects.append(folder / f"{source.stem}.o")
@@ -165,6 +167,7 @@ def drive(program: Path, commands: Iterable[str]) -> Transcript:
     text = "\n".join(commands) + "\n"
     result = subprocess.run([str(program)], input=text, capture_output=True, text=True, check=False, timeout=60)
     assert result.returncode == 0, result.stdout[-500:] + result.stderr
+    assert "two publishers" not in result.stdout
     rows, ticks, log, exits, other = [], [], [], [], []
     for line in result.stdout.splitlines():
         kind, _, rest = line.partition(" ")

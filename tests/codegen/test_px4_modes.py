@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.codegen.px4_host import PX4_PARAMETERS, STANDARD, build, drive
+from tests.codegen.px4_host import PX4_PARAMETERS, drive
 
 PERIOD = 0.004  # s
 HOLD, STABILIZED = 4, 15
@@ -16,18 +16,6 @@ START = ["gyro 0 0 0 0", "start", LEVEL, "land 0 0"]
 BY_STICKS = f"mode 1 1 0 1 {STABILIZED}"
 STEP = "gyro 4000 0 0 0"
 SPOOL_UP = [STEP] * 1100  # 1 s without thrust, then 2 s to full thrust, and the bottom's 1.6 s
-
-
-@pytest.fixture(scope="module")
-def programs(tmp_path_factory):
-    from tests.conftest import gains
-
-    return {api: build(gains.__wrapped__(), api, tmp_path_factory.mktemp(api)) for api in STANDARD}
-
-
-@pytest.fixture(scope="module", params=STANDARD)
-def program(request, programs):
-    return programs[request.param]
 
 
 def text(*values):
@@ -158,7 +146,8 @@ def test_the_thrust_is_ramped_from_zero_after_the_spool_up_time(program):
 
 
 def test_started_in_the_air_the_thrust_does_not_start_from_zero(program):
-    commands = [BY_STICKS, "gyro 0 0 0 0", "gyro 2000000 0 0 0", *START[1:], "sticks 1 0 0 0 -0.5", STEP, STEP]
+    before = [BY_STICKS, "land 0 0", "gyro 0 0 0 0", "gyro 2000000 0 0 0"]
+    commands = [*before, *START[1:], "sticks 1 0 0 0 -0.5", STEP, STEP]
     assert -drive(program, commands).out["thrust"][-1, 2] == pytest.approx(0.5 * (0.08 + 0.5), abs=1e-6)
 
 
@@ -219,26 +208,10 @@ def test_torque_and_thrust_are_scaled_by_the_battery_if_enabled(program):
 
 def test_the_power_of_the_torques_is_published_each_half_second(program):
     result, _ = flown(program, turning(1000))
-    powers = [np.array([int(w, 16) for w in line.split()[1:]], np.uint32).view(np.float32) for line in result.other]
+    lines = [line.split()[1:] for line in result.other if line.startswith("power")]
+    powers = [np.array([int(word, 16) for word in words], np.uint32).view(np.float32) for words in lines]
     time = np.add.accumulate(np.full(200, PERIOD, np.float32))
     count = int(np.argmax(time > 0.5)) + 1
     assert len(powers) == 999 // count
     squares = result.out["torque"][: count * len(powers)].astype(float) ** 2
     np.testing.assert_allclose(powers, squares.reshape(-1, count, 3).mean(axis=1), rtol=1e-4)
-
-
-# What is not flown.
-
-
-@pytest.mark.parametrize(("vehicle", "flown_"), [("1 0", True), ("1 1", False), ("2 0", False), ("0 0", False)])
-def test_it_starts_on_a_multicopter_only(program, vehicle, flown_):
-    result = drive(program, ["gyro 0 0 0 0", f"vehicle {vehicle}", "start"])
-    assert result.exits == [0 if flown_ else -1]
-    assert flown_ == (not any("multicopters only" in line for line in result.log))
-
-
-@pytest.mark.parametrize("enabled", [0, 1])
-def test_it_does_not_start_beside_px4s_autotune(program, enabled):
-    result = drive(program, [f"param MC_AT_EN {enabled}", "gyro 0 0 0 0", "start"])
-    assert result.exits == [-enabled]
-    assert bool(enabled) == any("MC_AT_EN" in line for line in result.log)

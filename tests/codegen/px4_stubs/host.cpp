@@ -4,187 +4,64 @@
 #include <stdlib.h>
 
 #include <iostream>
-#include <map>
 #include <sstream>
 #include <string>
-#include <vector>
 
 #include <px4_platform_common/param.h>
 
 #include "attitude.hpp"
 #include "excitation.hpp"
 #include "mc_mimo_pid.hpp"
-
-#define DEFINE_TOPIC(name) const orb_metadata __orb_##name{#name, sizeof(name##_s)}
-extern "C" {
-const orb_metadata __orb_actuator_controls_status_0{"actuator_controls_status_0", sizeof(actuator_controls_status_s)};
-DEFINE_TOPIC(battery_status);
-DEFINE_TOPIC(control_allocator_status);
-DEFINE_TOPIC(debug_vect);
-DEFINE_TOPIC(hover_thrust_estimate);
-DEFINE_TOPIC(manual_control_setpoint);
-DEFINE_TOPIC(parameter_update);
-DEFINE_TOPIC(rate_ctrl_status);
-DEFINE_TOPIC(vehicle_angular_velocity);
-DEFINE_TOPIC(vehicle_attitude);
-DEFINE_TOPIC(vehicle_attitude_setpoint);
-DEFINE_TOPIC(vehicle_control_mode);
-DEFINE_TOPIC(vehicle_land_detected);
-DEFINE_TOPIC(vehicle_local_position);
-DEFINE_TOPIC(vehicle_rates_setpoint);
-DEFINE_TOPIC(vehicle_status);
-DEFINE_TOPIC(vehicle_thrust_setpoint);
-DEFINE_TOPIC(vehicle_torque_setpoint);
-}
+#include "topics.hpp"
 
 extern "C" int mc_mimo_pid_main(int argc, char *argv[]);
 
 namespace {
 
-uint64_t now = 1000000;
 uint64_t gyro_interval = 4000;
+float stock_torque[3] {};
+bool muted[3] {};  // attitude, setpoint, sticks: not published any more
 vehicle_status_s vehicle{};
 
 }  // namespace
 
-namespace uORB {
-
-px4::WorkItem *scheduled = nullptr;
-
-// A topic and its last message.
-struct Node {
-	std::vector<uint8_t> message;
-	unsigned generation{0};
-	bool advertised{false};
-};
-
-Node &node(const orb_metadata *meta)
-{
-	static std::map<const orb_metadata *, Node> nodes;
-	return nodes[meta];
-}
-
-void *Manager::orb_add_internal_subscriber(const orb_metadata *meta) { return &node(meta); }
-bool Manager::is_advertised(const void *node) { return static_cast<const Node *>(node)->advertised; }
-
-unsigned Manager::updates_available(const void *node, unsigned last_generation)
-{
-	return is_advertised(node) ? static_cast<const Node *>(node)->generation - last_generation : 0;
-}
-
-bool Manager::orb_data_copy(void *node, void *dst, unsigned &generation, bool only_if_updated)
-{
-	const Node &topic = *static_cast<Node *>(node);
-
-	if (!topic.advertised || topic.message.empty() || (only_if_updated && generation == topic.generation)) { return false; }
-
-	memcpy(dst, topic.message.data(), topic.message.size());
-	generation = topic.generation;
-	return true;
-}
-
-int Manager::orb_publish(const orb_metadata *meta, orb_advert_t handle, const void *data)
-{
-	Node &topic = *static_cast<Node *>(handle);
-	const uint8_t *const bytes = static_cast<const uint8_t *>(data);
-	topic.message.assign(bytes, bytes + meta->o_size);
-	topic.generation++;
-	return 0;
-}
-
-int Manager::orb_unadvertise(orb_advert_t handle)
-{
-	static_cast<Node *>(handle)->advertised = false;
-	return 0;
-}
-
-bool SubscriptionCallbackWorkItem::registerCallback()
-{
-	scheduled = _item;
-	return true;
-}
-
-void SubscriptionCallbackWorkItem::unregisterCallback() { scheduled = nullptr; }
-
-bool SubscriptionInterval::updated() { return hrt_absolute_time() - _last >= _interval && _subscription.updated(); }
-
-bool SubscriptionInterval::copy(void *dst)
-{
-	_last = hrt_absolute_time();
-	return _subscription.copy(dst);
-}
-
-}  // namespace uORB
-
-orb_advert_t orb_advertise(const orb_metadata *meta, const void *)
-{
-	uORB::node(meta).advertised = true;
-	return &uORB::node(meta);
-}
-
-hrt_abstime hrt_absolute_time() { return now; }
-
-param_t param_find(const char *name) { return static_cast<param_t>(px4::find(name)); }
-const char *param_name(param_t handle) { return px4::name(handle); }
-int param_type(param_t handle) { return px4::kFloat[handle] ? PARAM_TYPE_FLOAT : PARAM_TYPE_INT32; }
-void param_set_used(param_t) {}
-
-int param_get(param_t handle, float *value)
-{
-	*value = static_cast<float>(px4::values()[handle]);
-	return 0;
-}
-
-int param_get(param_t handle, int32_t *value)
-{
-	*value = static_cast<int32_t>(px4::values()[handle]);
-	return 0;
-}
-
-perf_counter_t perf_alloc(enum perf_counter_type, const char *) { return nullptr; }
-void perf_free(perf_counter_t) {}
-void perf_begin(perf_counter_t) {}
-void perf_end(perf_counter_t) {}
-void perf_print_counter(perf_counter_t) {}
-
-void px4_log(const char *level, const char *format, ...)
-{
-	va_list arguments;
-	va_start(arguments, format);
-	printf("log %s ", level);
-	vprintf(format, arguments);
-	printf("\n");
-	va_end(arguments);
-}
-
 namespace {
 
+// A source that is alive says the same again.
 template<typename T>
-void publish(const orb_metadata *meta, const T &message)
+void repeat(const orb_metadata *meta, bool mute)
 {
-	// Never unadvertised, because these publishers outlive the module.
-	static uORB::Publication<T> *const publication = new uORB::Publication<T>(meta);
-	publication->publish(message);
+	if (mute || uORB::node(meta).message.empty()) { return; }
+
+	T message = last<T>(meta);
+	message.timestamp = now;
+	publish(meta, message);
 }
 
-template<typename T>
-T last(const orb_metadata *meta)
+// One sample. True if the module published the torque.
+bool gyro(const float (&rates)[3])
 {
-	T message{};
-	uORB::Subscription(meta).copy(&message);
-	return message;
-}
-
-void gyro(const float (&rates)[3])
-{
+	repeat<vehicle_attitude_s>(ORB_ID(vehicle_attitude), muted[0]);
+	repeat<vehicle_attitude_setpoint_s>(ORB_ID(vehicle_attitude_setpoint), muted[1]);
+	repeat<manual_control_setpoint_s>(ORB_ID(manual_control_setpoint), muted[2]);
 	vehicle_angular_velocity_s message{};
 	message.timestamp = message.timestamp_sample = now;
 
 	for (int i = 0; i < 3; i++) { message.xyz[i] = rates[i]; }
 
 	publish(ORB_ID(vehicle_angular_velocity), message);
+	run_commander();
+	run_stock(stock_torque);
+	const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
 
 	if (uORB::scheduled != nullptr) { uORB::scheduled->Run(); }
+
+	const bool published = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation != before;
+
+	if (published && stock_flies()) { printf("two publishers\n"); }
+
+	run_tasks();
+	return published;
 }
 
 void words(const float *values, int count)
@@ -235,6 +112,19 @@ void module(const char *command)
 	std::string argument = command;
 	char *argv[] = {&name[0], &argument[0]};
 	printf("exit %d\n", mc_mimo_pid_main(2, argv));
+	run_tasks();
+}
+
+// At rest until the module has stopped PX4's own controllers, at most two seconds.
+void wait_for_hand_over()
+{
+	const float still[3] = {};
+	const uint64_t end = now + 2000000;
+
+	while (stock_flies() && now < end) {
+		now += gyro_interval;
+		gyro(still);
+	}
 }
 
 struct Line : std::istringstream {
@@ -264,15 +154,43 @@ void execute(Line &line)
 	if (command == "start" || command == "stop" || command == "status") {
 		module(command.c_str());
 
+		if (command == "start") { wait_for_hand_over(); }
+
+	} else if (command == "mute") {
+		std::string source;
+		line >> source;
+		muted[source == "attitude" ? 0 : (source == "setpoint" ? 1 : 2)] = line.flag();
+
+	} else if (command == "stock") {
+		line.numbers(stock_torque);
+
+	} else if (command == "wait") {
+		long long left;
+		line >> left;
+
+		for (; left > 0; left -= 1000) {
+			now += 1000;
+			const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
+			run_scheduled();
+
+			if (uORB::node(ORB_ID(vehicle_torque_setpoint)).generation != before) { print_published(); }
+
+			run_tasks();
+		}
+
+	} else if (command == "arming") {
+		const auto reply = last<arming_check_reply_s>(ORB_ID(arming_check_reply));
+		printf("arming %d %d %d\n", static_cast<int>(reply.registration_id), static_cast<int>(reply.can_arm_and_run),
+		       static_cast<int>(reply.num_events));
+
 	} else if (command == "gyro") {
 		long long step;
 		float rates[3];
 		line >> step;
 		line.numbers(rates);
 		now += static_cast<uint64_t>(step);
-		const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
 		const unsigned powers = uORB::node(ORB_ID(actuator_controls_status_0)).generation;
-		gyro(rates);
+		const bool published = gyro(rates);
 
 		if (uORB::node(ORB_ID(actuator_controls_status_0)).generation != powers) {
 			const auto power = last<actuator_controls_status_s>(ORB_ID(actuator_controls_status_0));
@@ -281,7 +199,7 @@ void execute(Line &line)
 			printf("\n");
 		}
 
-		if (uORB::node(ORB_ID(vehicle_torque_setpoint)).generation != before) {
+		if (published) {
 			print_published();
 
 		} else {
@@ -297,11 +215,6 @@ void execute(Line &line)
 		px4::set_value(name.c_str(), line.number());
 		publish(ORB_ID(parameter_update), parameter_update_s{});
 
-	} else if (command == "stock") {
-		uORB::node(ORB_ID(vehicle_torque_setpoint)).advertised = line.flag();
-		uORB::node(ORB_ID(vehicle_rates_setpoint)).advertised = line.flag();
-		uORB::node(ORB_ID(vehicle_attitude_setpoint)).advertised = line.flag();
-
 	} else if (command == "mode") {
 		vehicle_control_mode_s mode{};
 		mode.flag_armed = line.flag();
@@ -310,6 +223,8 @@ void execute(Line &line)
 		mode.flag_control_attitude_enabled = line.flag();
 		mode.flag_control_rates_enabled = true;
 		vehicle.nav_state = static_cast<uint8_t>(line.number());
+		mode.flag_control_offboard_enabled = line.flag();
+		vehicle.nav_state_timestamp = now;
 		vehicle.armed_time = !mode.flag_armed ? 0 : (vehicle.armed_time == 0 ? now : vehicle.armed_time);
 		publish(ORB_ID(vehicle_control_mode), mode);
 		publish(ORB_ID(vehicle_status), vehicle);
@@ -349,6 +264,10 @@ void execute(Line &line)
 		sticks.pitch = line.number();
 		sticks.yaw = line.number();
 		sticks.throttle = line.number();
+
+		for (int i = 0; i < 6; i++) { (&sticks.aux1)[i] = line.number(); }
+
+		sticks.timestamp = now;
 		publish(ORB_ID(manual_control_setpoint), sticks);
 
 	} else if (command == "alloc") {
@@ -395,24 +314,16 @@ void execute(Line &line)
 
 }  // namespace
 
-// The gyro publishes while time passes.
-int px4_usleep(unsigned microseconds)
-{
-	const uint64_t end = now + microseconds;
-	const float still[3] = {};
-
-	while (now + gyro_interval <= end) {
-		now += gyro_interval;
-		gyro(still);
-	}
-
-	return 0;
-}
-
 int main()
 {
 	std::string text;
 	vehicle.vehicle_type = vehicle_status_s::VEHICLE_TYPE_ROTARY_WING;
+	vehicle.timestamp = now;
+	publish(ORB_ID(vehicle_status), vehicle);
+	vehicle_attitude_s level{};
+	level.q[0] = level.delta_q_reset[0] = 1.0F;
+	publish(ORB_ID(vehicle_attitude), level);
+	px4::set_value("MIMO_EN", 1.0);
 
 	while (std::getline(std::cin, text)) {
 		Line line(text);

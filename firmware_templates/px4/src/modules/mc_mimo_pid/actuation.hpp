@@ -14,6 +14,12 @@ public:
 	// Low-pass on the yaw torque, then the battery scale on both.
 	void apply(const StockSettings &settings, float period, float (&torque)[3], float (&thrust)[3]);
 
+	// The controller's torque that belongs to a published one, apart from the low-pass.
+	float unscaled(const StockSettings &settings, float torque) const
+	{
+		return settings.battery_scaling > 0.5F && _scale > 0.0F ? torque / _scale : torque;
+	}
+
 	// Mean square of the torques. True if `power` has been set, each half second.
 	bool power(const float (&torque)[3], float period, float (&power)[3]);
 

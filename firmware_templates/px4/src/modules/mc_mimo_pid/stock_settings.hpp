@@ -22,6 +22,9 @@ struct StockSettings {
 	float acro_superexpo[3];     // MC_ACRO_SUPEXPO twice, MC_ACRO_SUPEXPOY
 	float battery_scaling;       // MC_BAT_SCALE_EN
 	float yaw_torque_cutoff;     // MC_YAW_TQ_CUTOFF, Hz; 0: no filter
+	float offboard_loss_time;    // COM_OF_LOSS_T, s
+	float sticks_loss_time;      // COM_RC_LOSS_T, s
+	bool autotune;               // MC_AT_EN
 };
 
 void read(StockSettings &settings);

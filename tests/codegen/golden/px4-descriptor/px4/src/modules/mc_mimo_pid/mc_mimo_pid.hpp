@@ -6,7 +6,7 @@
 #include <lib/perf/perf_counter.h>
 #include <px4_platform_common/defines.h>
 #include <px4_platform_common/module.h>
-#include <px4_platform_common/px4_work_queue/WorkItem.hpp>
+#include <px4_platform_common/px4_work_queue/ScheduledWorkItem.hpp>
 #include <uORB/Publication.hpp>
 #include <uORB/PublicationMulti.hpp>
 #include <uORB/Subscription.hpp>
@@ -32,16 +32,20 @@
 #include <uORB/topics/vehicle_torque_setpoint.h>
 
 #include "actuation.hpp"
+#include "arming_check.hpp"
 #include "excitation.hpp"
+#include "hand_over.hpp"
 #include "mimo_pid.hpp"
 #include "parameters.hpp"
 #include "sample_clock.hpp"
+#include "silence.hpp"
 #include "sticks.hpp"
 #include "throttle.hpp"
+#include "topic.hpp"
 
 using namespace time_literals;
 
-class McMimoPid : public ModuleBase, public px4::WorkItem
+class McMimoPid : public ModuleBase, public px4::ScheduledWorkItem
 {
 public:
 	static Descriptor desc;
@@ -59,16 +63,21 @@ public:
 private:
 	void Run() override;
 	void update_parameters();
-	void update_inputs();
+	void update_inputs(hrt_abstime now);
 	void update_stock_inputs();
 	void update_attitude();
 	void update_setpoint();
+	void update_silence(hrt_abstime now);
 	void make_setpoint_from_sticks();
-	void control(const vehicle_angular_velocity_s &angular_velocity);
+	void note_obstacle(hrt_abstime now);
+	void notice(const char *text);
+	void observe(hrt_abstime now);
 	void excite(float (&moment)[3]);
-	void publish(const vehicle_angular_velocity_s &angular_velocity, const mimopilot::Output &output);
+	void publish(hrt_abstime timestamp_sample);
+	void release();
 
-	bool take_over();
+	mimopilot::Obstacle obstacle() const;
+	bool flies(hrt_abstime now);
 	bool flown_by_sticks() const;
 
 	uORB::SubscriptionCallbackWorkItem _vehicle_angular_velocity_sub{this, ORB_ID(vehicle_angular_velocity)};
@@ -86,13 +95,13 @@ private:
 	uORB::Subscription _vehicle_status_sub{ORB_ID(vehicle_status)};
 	uORB::Subscription _vehicle_torque_setpoint_sub{ORB_ID(vehicle_torque_setpoint)};
 
-	uORB::Publication<actuator_controls_status_s> _actuator_controls_status_pub{ORB_ID(actuator_controls_status_0)};
+	mimopilot::Topic<uORB::Publication<actuator_controls_status_s>> _actuator_controls_status_pub{ORB_ID(actuator_controls_status_0)};
 	uORB::Publication<debug_vect_s> _debug_vect_pub{ORB_ID(debug_vect)};
-	uORB::PublicationMulti<rate_ctrl_status_s> _rate_ctrl_status_pub{ORB_ID(rate_ctrl_status)};
-	uORB::Publication<vehicle_attitude_setpoint_s> _vehicle_attitude_setpoint_pub{ORB_ID(vehicle_attitude_setpoint)};
-	uORB::Publication<vehicle_rates_setpoint_s> _vehicle_rates_setpoint_pub{ORB_ID(vehicle_rates_setpoint)};
-	uORB::Publication<vehicle_thrust_setpoint_s> _vehicle_thrust_setpoint_pub{ORB_ID(vehicle_thrust_setpoint)};
-	uORB::Publication<vehicle_torque_setpoint_s> _vehicle_torque_setpoint_pub{ORB_ID(vehicle_torque_setpoint)};
+	mimopilot::Topic<uORB::PublicationMulti<rate_ctrl_status_s>> _rate_ctrl_status_pub{ORB_ID(rate_ctrl_status)};
+	mimopilot::Topic<uORB::Publication<vehicle_attitude_setpoint_s>> _vehicle_attitude_setpoint_pub{ORB_ID(vehicle_attitude_setpoint)};
+	mimopilot::Topic<uORB::Publication<vehicle_rates_setpoint_s>> _vehicle_rates_setpoint_pub{ORB_ID(vehicle_rates_setpoint)};
+	mimopilot::Topic<uORB::Publication<vehicle_thrust_setpoint_s>> _vehicle_thrust_setpoint_pub{ORB_ID(vehicle_thrust_setpoint)};
+	mimopilot::Topic<uORB::Publication<vehicle_torque_setpoint_s>> _vehicle_torque_setpoint_pub{ORB_ID(vehicle_torque_setpoint)};
 
 	vehicle_control_mode_s _control_mode{};
 	vehicle_status_s _status{};
@@ -104,6 +113,8 @@ private:
 	mimopilot::Parameters _parameters{};
 	mimopilot::StockSettings _settings{};
 	mimopilot::SampleClock _clock;
+	mimopilot::HandOver _hand_over{};
+	mimopilot::ArmingCheck _arming_check{};
 	mimopilot::Sticks _sticks{};
 	mimopilot::Throttle _throttle{};
 	mimopilot::Actuation _actuation{};
@@ -117,9 +128,15 @@ private:
 	hrt_abstime _setpoint_time{0};
 	uint8_t _quat_reset_counter{0};
 	bool _attitude_seen{false};
-	bool _topics_free{false};
-	bool _in_control{false};
+	hrt_abstime _attitude_time{0};
+	hrt_abstime _rates_time{0};
+	vehicle_torque_setpoint_s _stock_torque{};  // of PX4's own controllers
+	int32_t _silent{0};           // bits of Output::fault whose source has stopped
+	const char *_obstacle{nullptr};
+	const char *_wrong_gain{nullptr};
+	bool _wanted{false};
 	bool _mode_refused{false};
+	orb_advert_t _mavlink_log_pub{nullptr};
 
 	perf_counter_t _cycle_perf{perf_alloc(PC_ELAPSED, MODULE_NAME": cycle")};
 };
