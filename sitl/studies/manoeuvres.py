@@ -24,6 +24,7 @@ from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.flight.simulator import TRUTH, Simulator
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.studies.reproduction import Reproduction
+from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.gains import Gains
 
 MANOEUVRES = "manoeuvres"
@@ -35,6 +36,7 @@ BANKS_DEG, YAW_RATE, TURN = (20.0, 35.0, 45.0), 1.5, 6.0
 FLIP_RATE = 8.0  # rad/s; 460 deg/s, within what small vehicles reach
 RECOVERY_DEG, HEADINGS_DEG = 150.0, (90.0, 170.0)
 AFTER = 4.0  # s after a flip, a step or an upset
+_UNITS = (("roll", np.array([1, 0, 0])), ("pitch", np.array([0, 1, 0])))
 LEVEL_DEG, ARRIVED_DEG = 10.0, 5.0  # tilt of a recovered vehicle, error of a heading that is reached
 
 Law = Callable[[Gains, NDArray[np.float64], NDArray[np.float64], float], NDArray[np.float64]]
@@ -211,6 +213,47 @@ def _heading_figures(scenario: Scenario, truth: NDArray[Any]) -> dict[str, float
     return {"heading reached, s": np.inf if late else arrived, "largest tilt, deg": tilt_deg(after["attitude"]).max()}
 
 
+def attitude_errors() -> list[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
+    """Attitude errors (3,), deg, of the flown law and as differences of Euler angles: for attitudes and setpoints.
+
+    The flown one is the rate setpoint with an attitude gain of 1 on each axis.
+    """
+    sizes = [(size, axis, unit) for size in (5, 10, 25) for axis, unit in _UNITS]
+    cases = [(f"level to {axis} of {size} deg", np.zeros(3), size * unit) for size, axis, unit in sizes]
+    cases += [(f"{axis} from -{size} to {size} deg", -size * unit, size * unit) for size, axis, unit in sizes[2:]]
+    cases += [
+        (f"roll {bank} deg, to {what}", np.array([bank, 0, 0]), np.array([bank, 0, 0]) + change)
+        for bank in (20, 45)
+        for what, change in (("pitch of 10 deg", (0, 10, 0)), ("heading of 10 deg", (0, 0, 10)))
+    ]
+    wide = (100.0,) * 3
+    start = load_airframe(AIRFRAMES[0]).default_gains()
+    gains = replace(
+        start, Kp_o=np.eye(2), yaw=replace(start.yaw, Kp_o=1.0), limits=replace(start.limits, rate_max=wide)
+    )
+    found = []
+    for name, attitude, setpoint in cases:
+        q, wanted = (_quaternion(angles) for angles in (attitude, setpoint))
+        flown = Controller(gains, np.float64).step(wanted, q, np.zeros(3)).rates_setpoint
+        found.append((name, np.degrees(flown), np.subtract(setpoint, attitude).astype(float)))
+    return found
+
+
+def _quaternion(angles_deg: Any) -> NDArray[np.float64]:
+    """Quaternion w, x, y, z of roll, pitch, yaw, deg."""
+    x, y, z, w = Rotation.from_euler("ZYX", np.asarray(angles_deg, float)[::-1], degrees=True).as_quat()
+    return np.array([w, x, y, z])
+
+
+def _errors_table() -> ReportTable:
+    rows = [
+        (name, *(f"{one:.2f}" for one in flown), *(f"{one:.2f}" for one in euler))
+        for name, flown, euler in attitude_errors()
+    ]
+    columns = ("attitude error, deg", "roll", "pitch", "yaw", "Euler roll", "Euler pitch", "Euler yaw")
+    return ReportTable("Attitude error of the flown law, and as differences of Euler angles", columns, rows)
+
+
 def reproduce_manoeuvres(out: Path) -> Reproduction:
     """Fly the suite with the airframes' own gains and write its report, manoeuvres.html."""
     report = inside(out, f"{MANOEUVRES}.html")
@@ -232,6 +275,8 @@ def reproduce_manoeuvres(out: Path) -> Reproduction:
         "good. Heading reached: within {ARRIVED_DEG:g} degrees for good."
     )
     sections = [Section(table.caption, load_airframe(table.caption).airframe.description, [table]) for table in tables]
+    tables.append(_errors_table())
+    sections.append(Section("Attitude error", "For one axis from level the flown law has 2 sin(a/2).", tables[-1:]))
     write_report(report, f"mimopilot reproduce {MANOEUVRES}", lead, sections)
     return Reproduction(figures, tuple(tables), report)
 

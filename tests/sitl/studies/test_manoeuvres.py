@@ -9,6 +9,7 @@ from mimopilot.sitl.studies.manoeuvres import (
     FLIP_RATE,
     RECOVERY_DEG,
     YAW_RATE,
+    attitude_errors,
     euler_rates,
     fly_manoeuvre,
     manoeuvres,
@@ -56,10 +57,31 @@ def test_a_heading_step_is_flown_level(angle):
     assert np.isfinite(figures["heading reached, s"])
 
 
+def test_from_level_one_axis_differs_from_the_angle_by_less_than_one_percent_up_to_25_degrees():
+    largest = 0.0
+    for name, flown, euler in attitude_errors():
+        if name.startswith("level"):
+            axis = np.argmax(np.abs(euler))
+            assert flown[axis] == pytest.approx(np.degrees(2 * np.sin(np.radians(euler[axis] / 2))), rel=1e-9)
+            assert np.abs(np.delete(flown, axis)).max() < 1e-9
+            largest = max(largest, abs(flown[axis] / euler[axis] - 1))
+    assert 0.0078 < largest < 0.01
+
+
+def test_banked_the_errors_of_the_two_laws_differ():
+    errors = {name: (flown, euler) for name, flown, euler in attitude_errors()}
+    # 10 degrees of heading at 45 degrees of bank: the thrust's direction turns, mostly by pitch.
+    flown, euler = errors["roll 45 deg, to heading of 10 deg"]
+    assert euler.tolist() == [0, 0, 10]
+    assert flown[1] == pytest.approx(10 * np.sin(np.radians(45)), rel=0.02)
+    reversing = errors["roll from -25 to 25 deg"][0]
+    assert reversing[0] == pytest.approx(np.degrees(2 * np.sin(np.radians(25))), rel=1e-9)
+
+
 def test_the_report_shows_each_manoeuvre_of_each_airframe(tmp_path):
     found = reproduce_manoeuvres(tmp_path)
     assert found.report.is_file()
-    for name, table in zip(("adam0", "adam0_boom", "antr"), found.tables, strict=True):
+    for name, table in zip(("adam0", "adam0_boom", "antr"), found.tables[:3], strict=True):
         assert {row[0] for row in table.rows} == set(SUITE) == set(found.figures[name])
     turn = found.figures["antr"]["turn at 45 deg of bank"]
     assert turn["quaternion"]["tilt error, deg"] < 0.1 < 1 < turn["euler"]["tilt error, deg"]
