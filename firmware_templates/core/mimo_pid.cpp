@@ -13,9 +13,11 @@
 
 #include "mimo_pid.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 // Code size and step time have a budget: the attributes below keep step() fast and the rest small.
 
@@ -81,7 +83,7 @@ struct Heading {
 	if (unlikely(cosine < kInverted)) { return {1.0F, 0.0F}; }
 
 	const float inverse = 1.0F / cosine;
-	return {q[0] * inverse, q[3] * inverse};
+	return {q[0] *inverse, q[3] *inverse};
 }
 
 // The model at rest, with the measured direction of body z.
@@ -109,8 +111,8 @@ struct Heading {
 		const float stiffness = omega * omega;
 		const float friction = (2.0F * gains.model_damping) * omega;
 		const float wanted[kModelAxes] = {
-			2.0F * (heading.cosine * q[1] + heading.sine * q[2]),
-			2.0F * (heading.cosine * q[2] - heading.sine * q[1]),
+			2.0F * (heading.cosine *q[1] + heading.sine *q[2]),
+			2.0F * (heading.cosine *q[2] - heading.sine *q[1]),
 		};
 
 		for (int j = 0; j < kModelAxes; j++) {
@@ -186,8 +188,8 @@ struct Heading {
 		}
 
 		const float rate[kModelAxes] = {
-			turn_cosine * model.rate[0] - turn_sine * model.rate[1],
-			turn_sine * model.rate[0] + turn_cosine * model.rate[1],
+			turn_cosine *model.rate[0] - turn_sine *model.rate[1],
+			turn_sine *model.rate[0] + turn_cosine *model.rate[1],
 		};
 		acceleration[0] = turn_cosine * model.acceleration[0] - turn_sine * model.acceleration[1];
 		acceleration[1] = turn_sine * model.acceleration[0] + turn_cosine * model.acceleration[1];
@@ -202,7 +204,7 @@ struct Heading {
 
 // Rate setpoint r of the present mode. The attitude model moves one period ahead.
 [[gnu::always_inline]] inline void update_rates_setpoint(const Gains &gains, const State &state, Model &model,
-							 float (&r)[kAxes], float (&acceleration)[kModelAxes])
+		float (&r)[kAxes], float (&acceleration)[kModelAxes])
 {
 	if (unlikely(state.rate_mode != 0)) {
 		if (&r != &state.rates_setpoint) { copy(state.rates_setpoint, r); }
@@ -234,7 +236,7 @@ struct Signals {
 };
 
 [[gnu::always_inline]] inline Signals signals(const Gains &gains, const State &state,
-						const float (&acceleration)[kModelAxes], const float (&r)[kAxes])
+		const float (&acceleration)[kModelAxes], const float (&r)[kAxes])
 {
 	return {
 		{r[0], r[1], r[2]},
@@ -480,6 +482,7 @@ float sum(const Terms &terms) { return (terms.proportional - terms.derivative) +
 	}
 
 #pragma GCC unroll 3
+
 	for (int i = 0; i < kAxes; i++) {
 		state.derivative[i] = pole * state.derivative[i] + filter_gain * (rates[i] - state.rates[i]);
 		state.rates[i] = rates[i];
@@ -514,8 +517,8 @@ float sum(const Terms &terms) { return (terms.proportional - terms.derivative) +
 // Torque u from the signals x, and the integrals. An integral is within its limit from the last period and is never -0,
 // so a zero increment keeps its bits.
 [[gnu::always_inline]] inline void inner_loop(const Gains &gains, const Input &input, const Signals &x,
-					      const float (&excitation)[kAxes], float period,
-					      float (&integrals)[kAxes], float (&u)[kAxes])
+		const float (&excitation)[kAxes], float period,
+		float (&integrals)[kAxes], float (&u)[kAxes])
 {
 	for (int j = 0; j < kAxes; j++) {
 		const Terms terms = rate_terms(gains, x, j);
