@@ -24,7 +24,7 @@ from mimopilot.common.files import inside, read_text, sha256, write_atomically
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains, gains_to_toml
 from mimopilot.tuning.parameter_row import POSITIVE, Row, Shape
-from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, check_names
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, PARAMETERS, ROWS, check_names
 
 #: These and the parameter table define the C interface.
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
@@ -114,6 +114,7 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
         "parameters": PARAMETERS,
         "identity": list(gains.identity()),
         "excitation_settings": EXCITATION,
+        "settings": (*EXCITATION, ENABLE),
         "px4_parameters": entries(gains),
         "literal": literal,
         "rows": ROWS,

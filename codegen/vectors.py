@@ -64,7 +64,8 @@ def _quaternions(turns: NDArray[np.float64], generator: np.random.Generator) -> 
     """Quaternions (N, 4) of rotation vectors (N, 3), rad, of either sign and a length up to 0.5 % from 1."""
     angle = np.linalg.norm(turns, axis=1, keepdims=True)
     q = np.hstack([np.cos(angle / 2), np.sin(angle / 2) * turns / np.maximum(angle, 1e-12)])
-    return q * generator.choice([-1, 1], (len(q), 1)) * generator.choice([1.0, 0.995, 1.005], (len(q), 1))
+    factor = generator.choice([-1, 1], (len(q), 1)) * generator.choice([1.0, 0.995, 1.005], (len(q), 1))
+    return np.asarray(factor * q, dtype=np.float64)
 
 
 def reference_outputs(controller: Controller, inputs: NDArray[Any]) -> NDArray[Any]:

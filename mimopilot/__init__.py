@@ -27,6 +27,7 @@ _PUBLIC = {
             "certify",
             "advise",
             "load_gains",
+            "import_params",
             "generate",
             "load_airframe",
             "fly",
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
     from mimopilot.api import experiment as experiment
     from mimopilot.api import fly as fly
     from mimopilot.api import generate as generate
+    from mimopilot.api import import_params as import_params
     from mimopilot.api import inspect as inspect
     from mimopilot.api import load_airframe as load_airframe
     from mimopilot.api import load_gains as load_gains

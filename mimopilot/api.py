@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from mimopilot.tuning.experiment import Experiment
     from mimopilot.tuning.gains import Gains, Triple
     from mimopilot.tuning.logs.columns import Columns
+    from mimopilot.tuning.logs.imported_gains import ImportedGains
     from mimopilot.tuning.logs.inspection import Inspection
     from mimopilot.tuning.reference_model import ContinuousModel
     from mimopilot.tuning.spec import TuningSpec
@@ -217,6 +218,63 @@ def load_gains(path: PathLike) -> Gains:
     from mimopilot.tuning.gains_file import load_gains as load
 
     return load(path)
+
+
+def import_params(
+    source: PathLike | None = None,
+    *,
+    connect: str | None = None,
+    defaults: str | None = None,
+    rate: float | None = None,
+    airframe: PathLike | Airframe | None = None,
+    timeout: float = 12.0,
+    signing_key: PathLike | None = None,
+    system: int = 0,
+) -> ImportedGains:
+    """Make gains from those of a vehicle's stock controller, PX4's or ArduPilot's.
+
+    Parameters
+    ----------
+    source : str or Path, optional
+        Parameter file of QGroundControl, MAVProxy or Mission Planner, or a flight log (ULog, dataflash).
+    connect : str, optional
+        Vehicle to read from instead: ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
+    defaults : str, optional
+        ``px4-v1.16``: that PX4's defaults for what the source lacks. None: then it is refused.
+    rate : float, optional, Hz
+        Control rate; by default that of the parameters.
+    airframe : str, Path or Airframe, optional
+        Vehicle whose unit of torque the gains have. None: what the vehicle publishes, else not known.
+    timeout, signing_key, system
+        Of the link, as in `upload`.
+
+    Returns
+    -------
+    ImportedGains
+        `gains`, without a certificate; the parameters that they are made of (`used`), and what the stock controller
+        does that they do not hold (`not_carried`).
+
+    Raises
+    ------
+    Error
+        When the source cannot be read, holds no complete gains of a multirotor, or a value is not possible.
+    """
+    from mimopilot.common.errors import Error
+    from mimopilot.tuning.logs.imported_gains import import_gains, read_source
+
+    if (source is None) == (connect is None):
+        raise Error("give either a parameter file or flight log, or --connect to read from a vehicle")
+    if source is not None:
+        found = read_source(Path(source))
+    else:
+        from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+        from mimopilot.sitl.mavlink.ground_station.stock_parameters import read_stock_parameters
+
+        key = Path(signing_key) if signing_key else None
+        found = read_stock_parameters(LinkOptions(str(connect), system, timeout, key))
+    body = load_airframe(airframe) if isinstance(airframe, str | Path) else airframe
+    scale = body.moment_scale() if body else None
+    return import_gains(found, defaults=defaults, rate=rate, moment_scale=scale)
 
 
 class GeneratedTree(NamedTuple):

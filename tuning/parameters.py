@@ -278,8 +278,8 @@ EXCITATION: tuple[Setting, ...] = (
     Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stop above this roll or pitch"),
 )
 
-#: Whether a vehicle's start-up script starts this controller or that of the flight stack.
-ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
+#: Which controller flies: this one or that of the flight stack; from 2 on, a switch chooses in flight.
+ENABLE = Setting("MIMO_EN", "", 0, 0, 7, True, "1: this controller flies; 0: the stock one; 2-7: RC AUX1-6 chooses")
 
 
 def check_names() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,6 +18,9 @@ from mimopilot.cli.options import (
     YesOption,
     warn,
 )
+
+if TYPE_CHECKING:
+    from mimopilot.tuning.logs.imported_gains import ImportedGains
 
 ConnectOption = Annotated[
     str, typer.Option("--connect", help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyACM0,57600.")
@@ -36,6 +39,10 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: mimopilot upload my.gains.toml --connect udpin:127.0.0.1:14550")(upload)
     app.command(epilog="Example: mimopilot restore my.before-1.params --connect /dev/ttyACM0,57600")(restore)
     app.command(epilog="Example: mimopilot params my.gains.toml --format qgc --out my.params")(params)
+    app.command(
+        epilog="Example: mimopilot import-params vehicle.params --out first.gains.toml; "
+        "mimopilot import-params --connect udpin:0.0.0.0:14550 --out first.gains.toml"
+    )(import_params)
 
 
 def upload(
@@ -161,3 +168,98 @@ def params(
         raise SitlError("--out: a comparison is printed; give either a gains file or --connect to write a file")
     else:
         compare(gains, options)
+
+
+def import_params(
+    source: Annotated[
+        Path | None,
+        typer.Argument(help="Parameter file (QGroundControl, MAVProxy, Mission Planner) or flight log (ULog, .bin)."),
+    ] = None,
+    connect: Annotated[str | None, typer.Option(help="Vehicle to read from; see upload.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Gains file to write; by default a new one beside the source, NAME.gains.toml.")
+    ] = None,
+    defaults: Annotated[
+        str | None, typer.Option(help="px4-v1.16: its defaults for what the file lacks. Without it that is refused.")
+    ] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Control rate, Hz; by default IMU_GYRO_RATEMAX or SCHED_LOOP_RATE.")
+    ] = None,
+    airframe: Annotated[
+        str | None, typer.Option(help="Airframe whose unit of torque the gains have; by default it is unknown.")
+    ] = None,
+    timeout: TimeoutOption = 12.0,
+    signing_key: KeyOption = None,
+    system: SystemOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a first gains file from a vehicle's stock gains.
+
+    Of PX4 or ArduCopter. What a gains file cannot hold is listed; a parameter that is not found is no zero or default,
+    the command then ends. The gains have no certificate.
+    """
+    import mimopilot as mp
+    from mimopilot.common.console import print_json
+    from mimopilot.tuning.errors import TuningError
+
+    target = out or (source.with_suffix(".gains.toml") if source else Path("vehicle.gains.toml"))
+    if out is None and target.exists():
+        raise TuningError(f"{target}: exists; give --out to replace it or to write another file")
+    found = mp.import_params(
+        source,
+        connect=connect,
+        defaults=defaults,
+        rate=rate,
+        airframe=airframe,
+        timeout=timeout,
+        signing_key=signing_key,
+        system=system,
+    )
+    found.gains.save(target)
+    warn(source or str(connect), found.warnings)
+    if as_json:
+        origin = found.gains.provenance.details
+        print_json(
+            {
+                "out": str(target),
+                "source": origin["source"],
+                "source_sha256": origin["source_sha256"],
+                "parameters": found.used,
+                "defaults": list(found.defaults),
+                "Ts": found.gains.Ts,
+                "elements": found.gains.elements(),
+                "moment_scale": found.gains.moment_scale,
+                "not_carried": list(found.not_carried),
+                "warnings": list(found.warnings),
+            }
+        )
+        return
+    print_import(found)
+    print(f"written to {target}; no certificate: fly an experiment with these gains, then mimopilot tune or certify")
+
+
+def print_import(found: ImportedGains) -> None:
+    """Table of the parameters and the gains that they became, and what the gains do not hold."""
+    from mimopilot.common.console import print_table
+    from mimopilot.tuning.parameter_row import Shape
+    from mimopilot.tuning.parameters import ROWS
+
+    gains, rows = found.gains, []
+    elements = gains.elements()
+    for row in ROWS:
+        for code in row.codes:
+            names = found.stock.names(row, code)
+            if names:
+                given = " x ".join(f"{found.used[name]:g}" for name in names)
+                value = row.value(elements[code], gains.Ts)
+                unit = "Hz" if row.shape is Shape.POLE else row.unit.replace("norm", "")
+                notes = "default" if any(name in found.defaults for name in names) else ""
+                rows.append([" x ".join(names), given, f"{row.key} {code}", f"{value:.6g}", unit, notes])
+    rate = found.stock.rate
+    given = f"{found.used[rate]:g}" if rate in found.used else ""
+    notes = ("default" if rate in found.defaults else "") if given else "--rate"
+    rows.append([rate, given, "Ts", f"{gains.Ts:.6g}", "s", notes])
+    print_table(f"Gains of {found.stock.name}", ["parameter", "value", "gain", "value", "unit", ""], rows)
+    print("not in the gains file:")
+    for text in found.not_carried:
+        print(f"  {text}")

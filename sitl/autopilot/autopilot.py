@@ -25,8 +25,8 @@ from mimopilot.tuning.gains import Gains
 MIN_THRUST_RATIO, MAX_THRUST_RATIO = 0.5, 1.5  # of hover; chosen: altitude hold accelerates by at most half of g
 MIN_TILT_COSINE = 0.5  # 60 degrees, the largest tilt of a setpoint: beyond it thrust is not increased further
 
-#: Inputs and outputs of one period: the signals of a flight log. The setpoint is roll, pitch, yaw (rad) with its yaw rate
-#: (rad/s) or, in rate mode, the body rates (rad/s).
+#: Inputs and outputs of one period: the signals of a flight log. The setpoint is roll, pitch, yaw (rad) and its yaw
+#: rate (rad/s) or, in rate mode, the body rates (rad/s).
 RECORD = np.dtype(
     [
         ("setpoint", "f4", 3),

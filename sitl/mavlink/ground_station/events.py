@@ -12,8 +12,9 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from mimopilot.sitl.mavlink.wire.float32 import REAL32
 
-#: MAV_PARAM_TYPE.
-INT32 = 6
+#: MAV_PARAM_TYPE. PX4 sends the bits of an INT32. ArduPilot's whole numbers are INT8, INT16 or INT32, sent as floats.
+INT8, INT16, INT32 = 2, 4, 6
+WHOLE = (INT8, INT16, INT32)
 #: MAV_COMP_ID_AUTOPILOT1.
 AUTOPILOT = 1
 #: MAV_CMD_PREFLIGHT_STORAGE.

@@ -15,9 +15,9 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     DOES_NOT_EXIST,
     FAILED,
     IN_PROGRESS,
-    INT32,
     REASONS,
     STORAGE_COMMAND,
+    WHOLE,
     CommandAck,
     Exchange,
     Outgoing,
@@ -72,7 +72,7 @@ class ParameterClient(VehicleLinkState):
     now, tries, system, force_armed
         See `sitl.mavlink.ground_station.vehicle_link_state.VehicleLinkState`.
     integers : collection of str
-        Names that may be INT32 on the vehicle; all others must be REAL32.
+        Names that may be whole numbers on the vehicle; all others must be REAL32.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class ParameterClient(VehicleLinkState):
         if isinstance(message, ParameterRefusal):
             reason = REASONS.get(message.reason, f"PARAM_ERROR {message.reason}")
             return Answer(None, f"refused: {reason}", message.reason == DOES_NOT_EXIST)
-        if message.kind != REAL32 and not (message.kind == INT32 and message.name in self.integers):
+        if message.kind != REAL32 and not (message.kind in WHOLE and message.name in self.integers):
             return Answer(None, f"is not a float on the vehicle (param_type {message.kind})")
         self._kinds[message.name] = message.kind
         if wanted is not None and message.value != wanted:

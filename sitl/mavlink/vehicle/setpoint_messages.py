@@ -78,14 +78,16 @@ class SetpointReceiver:
         if rate_mode and mask & mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE:
             return f"setpoint refused: type_mask {mask}: body rates need a thrust"
         if not rate_mode and (rates[0] != 0 or rates[1] != 0):
-            return f"setpoint refused: type_mask {mask}: with an attitude only the yaw rate counts, add 3 to ignore others"
-        if not rate_mode and (angles is None or max(abs(angles[0]), abs(angles[1])) > MAX_TILT):
+            return f"setpoint refused: type_mask {mask}: with an attitude only the yaw rate counts, add 3"
+        if angles is None or (not rate_mode and max(abs(angles[0]), abs(angles[1])) > MAX_TILT):
             return f"setpoint refused: expected a quaternion, tilted by at most {math.degrees(MAX_TILT):.0f} degrees"
         thrust = None if mask & mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE else message.thrust
         if thrust is not None and not 0 <= thrust <= 1:
             return f"setpoint refused: thrust {thrust:g}, expected 0 to 1"
         yaw_rate = 0.0 if rate_mode else rates[2]
-        self.vehicle.attitude.put(AttitudeSetpoint(*angles, thrust, yaw_rate, rate_mode), self.vehicle.now)
+        first, second, third = angles
+        setpoint = AttitudeSetpoint(first, second, third, thrust, yaw_rate, rate_mode)
+        self.vehicle.attitude.put(setpoint, self.vehicle.now)
         return ""
 
     def _manual_control(self, message: Any) -> str:

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.mavparm import MAVParmDict
 
-from mimopilot.common.errors import InputFileError
-from mimopilot.sitl.errors import SitlError
+from mimopilot.common.errors import Error, InputFileError
 from mimopilot.sitl.mavlink.wire.float32 import single
-from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, NAME, parameter_text, read_parameters
+from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text, read_parameters
+from mimopilot.tuning.logs.parameter_file import NAME
 from mimopilot.tuning.parameters import PARAMETERS
 
 names = st.from_regex(NAME, fullmatch=True)
@@ -81,7 +81,7 @@ def test_every_parameter_name_is_valid_in_a_file():
 def test_an_invalid_file_is_refused_with_its_line(tmp_path, text, message):
     path = tmp_path / "x.params"
     path.write_text(text)
-    with pytest.raises(SitlError, match=message):
+    with pytest.raises(Error, match=message):
         read_parameters(path)
 
 
@@ -92,15 +92,15 @@ def test_a_file_that_was_truncated_or_edited_is_refused(tmp_path, form):
     text = parameter_text(form, values)
     for size in range(len(text) - 1):  # without its last newline it is still complete
         path.write_text(text[:size])
-        with pytest.raises(SitlError, match=r"holds no parameters|incomplete|cut short"):
+        with pytest.raises(Error, match=r"holds no parameters|incomplete|cut short"):
             read_parameters(path)
     lines = text.splitlines(keepends=True)
     path.write_text("".join(lines[:-10]))
     count = len(PARAMETERS)
-    with pytest.raises(SitlError, match=f"incomplete: holds {count - 10} parameters, but its first line says {count}"):
+    with pytest.raises(Error, match=f"incomplete: holds {count - 10} parameters, but its first line says {count}"):
         read_parameters(path)
     path.write_text(text.replace("0.105", "0.106"))
-    with pytest.raises(SitlError, match=r"damaged or edited.*delete the first line"):
+    with pytest.raises(Error, match=r"damaged or edited.*delete the first line"):
         read_parameters(path)
     path.write_text(text.replace("0.105", "0.106").split("\n", 1)[1])
     assert read_parameters(path) == values | {PARAMETERS[5].name: single(0.106)}
@@ -121,6 +121,6 @@ def test_any_text_is_read_or_refused(tmp_path_factory, text):
     path.write_text(text, errors="replace")
     try:
         values = read_parameters(path)
-    except SitlError:
+    except Error:
         return
     assert all(NAME.fullmatch(name) and math.isfinite(value) for name, value in values.items())

@@ -5,16 +5,19 @@
 #include <float.h>
 #include <math.h>
 #include <string.h>
+#include <systemlib/mavlink_log.h>
 
 #include "attitude.hpp"
+#include "bumpless.hpp"
 #include "gains.hpp"
+#include "stock_controllers.hpp"
 
 using namespace mimopilot;
 
 namespace {
 
-constexpr float kRadian = 0.017453293F;  // rad/deg
 constexpr char kExcitationName[] = "MIMO_EXC";
+constexpr uint32_t kBackup = static_cast<uint32_t>(1.0e7F * kGains.period);  // us, 10 periods: wakes up without a gyro
 
 // An optional field of a topic: NaN means not set.
 float optional(float value) { return PX4_ISFINITE(value) ? value : 0.0F; }
@@ -53,40 +56,12 @@ const char *describe(Excitation::End end)
 	}
 }
 
-// Whether the gyro publishes once per control period, measured for a second.
-bool gyro_keeps_period()
-{
-	uORB::Subscription gyro{ORB_ID(vehicle_angular_velocity)};
-	vehicle_angular_velocity_s first{};
-	vehicle_angular_velocity_s last{};
-	const bool seen = gyro.copy(&first);
-	const unsigned generation = gyro.get_last_generation();
-	px4_usleep(1000000);
-
-	if (!seen || !gyro.copy(&last)) {
-		PX4_ERR("not started: no vehicle_angular_velocity");
-		return false;
-	}
-
-	const uint32_t samples = gyro.get_last_generation() - generation;
-
-	if (!keeps_period(first.timestamp_sample, last.timestamp_sample, samples, kGains.period)) {
-		const double seconds = 1e-6 * static_cast<double>(last.timestamp_sample - first.timestamp_sample);
-		PX4_ERR("not started: gyro rate is %.1f Hz, gains are for %.1f Hz; set IMU_GYRO_RATEMAX and reboot",
-			static_cast<double>(samples) / seconds, 1.0 / static_cast<double>(kGains.period));
-		return false;
-	}
-
-	return true;
-}
-
 }  // namespace
 
 ModuleBase::Descriptor McMimoPid::desc{task_spawn, custom_command, print_usage};
 
 McMimoPid::McMimoPid() :
-	ModuleParams(nullptr),
-	WorkItem(MODULE_NAME, px4::wq_configurations::rate_ctrl),
+	ScheduledWorkItem(MODULE_NAME, px4::wq_configurations::rate_ctrl),
 	_clock(kGains.period)
 {
 	initialise(_state, kGains);
@@ -107,30 +82,36 @@ bool McMimoPid::init()
 
 void McMimoPid::update_parameters()
 {
-	updateParams();
 	Gains gains;
-	const mimo_pid_parameter *const wrong = _parameters.gains(gains);
+	_wrong_gain = _parameters.read(gains);
 
-	if (wrong != nullptr) {
-		PX4_ERR("%s is not within %g to %g: no gain changed", wrong->name,
-			static_cast<double>(wrong->minimum), static_cast<double>(wrong->maximum));
+	if (_wrong_gain != nullptr) {
+		PX4_ERR("%s is out of its range: no gain changed", _wrong_gain);
 
 	} else if (memcmp(&gains, &_state.gains, sizeof(gains)) != 0) {
 		set_gains(_state, gains);
 	}
 
 	_excitation.configure(_parameters.excitation());
+	read(_settings);
 }
 
 void McMimoPid::Run()
 {
-	if (should_exit()) {
+	if (should_exit() && !stock_controllers_busy()) {
 		_vehicle_angular_velocity_sub.unregisterCallback();
+		ScheduleClear();
+		_arming_check.unregister();
+		release();
+
+		if (_hand_over.replaces()) { command_stock_controllers(true); }
+
 		exit_and_cleanup(desc);
 		return;
 	}
 
 	perf_begin(_cycle_perf);
+	ScheduleDelayed(kBackup);
 
 	if (_parameter_update_sub.updated()) {
 		parameter_update_s update;
@@ -138,34 +119,132 @@ void McMimoPid::Run()
 		update_parameters();
 	}
 
+	const hrt_abstime now = hrt_absolute_time();
 	vehicle_angular_velocity_s angular_velocity;
+	bool sampled = false;
 
-	if (_vehicle_angular_velocity_sub.update(&angular_velocity) && _clock.advance(angular_velocity.timestamp_sample)) {
-		update_inputs();
+	if (_vehicle_angular_velocity_sub.update(&angular_velocity)) {
+		sampled = _clock.advance(angular_velocity.timestamp_sample);
+		_rates_time = angular_velocity.timestamp;
+		memcpy(_input.rates, angular_velocity.xyz, sizeof(_input.rates));
+	}
 
-		if (_control_mode.flag_control_rates_enabled && take_over()) { control(angular_velocity); }
+	if (sampled || silent(now, _rates_time, kHoldTime)) {
+		update_inputs(now);
+		note_obstacle(now);
+
+		if (!flies(now)) {
+			observe(now);
+
+		} else if (_control_mode.flag_control_rates_enabled) {
+			excite(_input.excitation);
+			step(_state, _input, _output);
+			publish(sampled ? angular_velocity.timestamp_sample : now);
+		}
 	}
 
 	perf_end(_cycle_perf);
 }
 
-// Only one controller at a time: do not publish while another one advertises the torque or rate setpoint.
-// Takes over within two samples after the other has stopped.
-bool McMimoPid::take_over()
+void McMimoPid::notice(const char *text)
 {
-	if (!_in_control) {
-		const bool free = !_vehicle_torque_setpoint_sub.advertised() && !_vehicle_rates_setpoint_sub.advertised();
-		_in_control = free && _topics_free;
-		_topics_free = free;
-
-		// mc_att_control unadvertised this topic when it stopped; other publishers do not advertise it again.
-		if (_in_control) { _vehicle_attitude_setpoint_pub.advertise(); }
-	}
-
-	return _in_control;
+	mavlink_vasprintf(_MSG_PRIO_WARNING, &_mavlink_log_pub, "%s", text);
+	PX4_WARN("%s", text);
 }
 
-void McMimoPid::update_inputs()
+Obstacle McMimoPid::obstacle() const
+{
+	if (!_wanted || _status.timestamp == 0) { return {}; }
+
+	if (_status.is_vtol || _status.vehicle_type != vehicle_status_s::VEHICLE_TYPE_ROTARY_WING) { return wrong_vehicle(); }
+
+	if (_settings.autotune) { return autotune_enabled(); }
+
+	if (_clock.rate() == SampleClock::Rate::Wrong) { return wrong_gyro_rate(); }
+
+	return _wrong_gain != nullptr ? wrong_parameter() : Obstacle{};
+}
+
+void McMimoPid::note_obstacle(hrt_abstime now)
+{
+	const int32_t enabled = _parameters.enabled();
+
+	if (enabled < 2) {
+		_wanted = enabled == 1;
+
+	} else if (_manual.valid) {
+		_wanted = (&_manual.aux1)[enabled - 2] > 0.0F;
+	}
+
+	const Obstacle found = obstacle();
+
+	if (found.text != nullptr && found.text != _obstacle) { notice(found.text); }
+
+	_obstacle = found.text;
+	_arming_check.answer(now, found);
+}
+
+bool McMimoPid::flies(hrt_abstime now)
+{
+	const bool flew = _hand_over.flies();
+	HandOver::Conditions conditions;
+	conditions.wanted = _wanted;
+	conditions.able = _obstacle == nullptr && _status.timestamp != 0 && _clock.rate() == SampleClock::Rate::Kept
+			  && (_silent & (kAttitudeFault | kRatesFault)) == 0;
+	conditions.faulty = _output.fault != 0 && _control_mode.flag_armed && !_on_ground;
+	conditions.busy = stock_controllers_busy();
+	conditions.torque_free = !_vehicle_torque_setpoint_sub.advertised();
+	const HandOver::Action action = _hand_over.step(now, conditions);
+
+	if (action == HandOver::Action::StartStock) {
+		notice(_hand_over.gave_up() ? "MIMO: invalid inputs, handed back" : "MIMO handed back");
+		release();
+	}
+
+	if (action != HandOver::Action::None) { command_stock_controllers(action == HandOver::Action::StartStock); }
+
+	if (_hand_over.flies() && !flew) {
+		notice("MIMO flies");
+		_state.fault_count = 0;
+		_vehicle_attitude_setpoint_pub.take();
+		_vehicle_rates_setpoint_pub.take();
+		_actuation.start(_actuation.unscaled(_settings, _stock_torque.xyz[2]));
+	}
+
+	return _hand_over.flies();
+}
+
+// The torque and its status are free for PX4's own controllers; the setpoints have other publishers, too.
+void McMimoPid::release()
+{
+	_vehicle_torque_setpoint_pub.end();
+	_vehicle_thrust_setpoint_pub.end();
+	_rate_ctrl_status_pub.end();
+	_actuator_controls_status_pub.end();
+	_vehicle_attitude_setpoint_pub.leave();
+	_vehicle_rates_setpoint_pub.leave();
+}
+
+// While PX4's own controllers fly: the integrators make up for the difference, so that the torque does not jump at the
+// hand-over.
+void McMimoPid::observe(hrt_abstime now)
+{
+	_vehicle_torque_setpoint_sub.update(&_stock_torque);
+	const bool tracks = _input.armed != 0 && !silent(now, _stock_torque.timestamp, kHoldTime);
+	_input.armed = 0;
+	memset(_input.excitation, 0, sizeof(_input.excitation));
+	step(_state, _input, _output);
+
+	if (tracks) {
+		float torque[kAxes];
+
+		for (int i = 0; i < kAxes; i++) { torque[i] = _actuation.unscaled(_settings, _stock_torque.xyz[i]) - _output.moment[i]; }
+
+		start_integrals(_state, torque);
+	}
+}
+
+void McMimoPid::update_inputs(hrt_abstime now)
 {
 	_vehicle_status_sub.update(&_status);
 	_manual_control_setpoint_sub.update(&_manual);
@@ -178,16 +257,10 @@ void McMimoPid::update_inputs()
 		_mode_refused = refused;
 	}
 
-	if (!_control_mode.flag_armed) {
-		_armed_since = 0;
-
-	} else if (_armed_since == 0) {
-		_armed_since = hrt_absolute_time();
-	}
-
 	vehicle_land_detected_s land_detected;
 
 	if (_vehicle_land_detected_sub.update(&land_detected)) {
+		_landed = land_detected.landed;
 		_on_ground = land_detected.landed || land_detected.maybe_landed;
 	}
 
@@ -202,8 +275,29 @@ void McMimoPid::update_inputs()
 
 	_input.armed = _control_mode.flag_armed ? 1 : 0;
 	_input.landed = _on_ground ? 1 : 0;
+	update_stock_inputs();
 	update_attitude();
 	update_setpoint();
+	update_silence(now);
+}
+
+void McMimoPid::update_stock_inputs()
+{
+	hover_thrust_estimate_s hover;
+
+	if (_hover_thrust_estimate_sub.update(&hover)) { _throttle.estimate(_settings, hover.valid, hover.hover_thrust); }
+
+	vehicle_local_position_s position;
+
+	if (_vehicle_local_position_sub.update(&position)) { _heading_good = position.heading_good_for_control; }
+
+	battery_status_s battery;
+
+	if (_battery_status_sub.update(&battery) && battery.connected) { _actuation.battery(battery.scale); }
+
+	const float armed_for = 1.0e-6F * static_cast<float>(hrt_absolute_time() - _status.armed_time);
+	const bool spooled_up = _control_mode.flag_armed && armed_for > _settings.spool_up_time;
+	_throttle.update(_settings, _landed, spooled_up, kGains.period);
 }
 
 void McMimoPid::update_attitude()
@@ -221,6 +315,7 @@ void McMimoPid::update_attitude()
 	}
 
 	_attitude_seen = true;
+	_attitude_time = attitude.timestamp;
 	_quat_reset_counter = attitude.quat_reset_counter;
 	angles(attitude.q, _input.attitude);
 }
@@ -236,7 +331,7 @@ void McMimoPid::update_setpoint()
 	vehicle_attitude_setpoint_s setpoint;
 
 	if (flown_by_sticks()) {
-		if (_in_control) { make_setpoint_from_sticks(); }
+		make_setpoint_from_sticks();
 
 	} else {
 		_sticks.release();
@@ -262,23 +357,18 @@ void McMimoPid::update_setpoint()
 
 void McMimoPid::make_setpoint_from_sticks()
 {
-	StickSettings settings;
-	settings.tilt_max = kRadian * _parameters.tilt_max();
-	settings.yaw_rate_max = kRadian * _parameters.yaw_rate_max();
-	settings.thrust_min = _on_ground ? 0.0F : _parameters.thrust_min();
-	settings.thrust_hover = _parameters.thrust_hover();
-	settings.thrust_max = _parameters.thrust_max();
 	const StickInput input{_manual.roll, _manual.pitch, _manual.yaw, _manual.throttle};
-	const StickSetpoint sticks = _sticks.setpoint(settings, input, optional(_input.attitude[2]));
+	const float heading = optional(_input.attitude[2]);
+	const StickSetpoint sticks = _sticks.setpoint(_settings, input, heading, _heading_good, kGains.period);
 	const hrt_abstime now = hrt_absolute_time();
-	const float armed_for = _armed_since == 0 ? 0.0F : 1.0e-6F * static_cast<float>(now - _armed_since);
-	const bool spooled_up = _armed_since != 0 && armed_for > _parameters.spool_up_time();
 
 	memcpy(_q_d, sticks.q_d, sizeof(_q_d));
 	_yaw_rate = sticks.yaw_rate;
 	_thrust[0] = _thrust[1] = 0.0F;
-	_thrust[2] = spooled_up ? -sticks.thrust : 0.0F;
+	_thrust[2] = -_throttle.thrust(_settings, _manual.throttle);
 	_setpoint_time = now;
+
+	if (!_hand_over.flies()) { return; }
 
 	vehicle_attitude_setpoint_s setpoint{};
 	memcpy(setpoint.q_d, _q_d, sizeof(_q_d));
@@ -288,12 +378,30 @@ void McMimoPid::make_setpoint_from_sticks()
 	_vehicle_attitude_setpoint_pub.publish(setpoint);
 }
 
-void McMimoPid::control(const vehicle_angular_velocity_s &angular_velocity)
+void McMimoPid::update_silence(hrt_abstime now)
 {
-	memcpy(_input.rates, angular_velocity.xyz, sizeof(_input.rates));
-	excite(_input.excitation);
-	step(_state, _input, _output);
-	publish(angular_velocity, _output);
+	SetpointSource source;
+	source.timestamp = flown_by_sticks() ? _manual.timestamp : _setpoint_time;
+	source.since = _status.nav_state_timestamp > _status.armed_time ? _status.nav_state_timestamp : _status.armed_time;
+	source.loss_time = 0.0F;
+
+	if (flown_by_sticks()) {
+		source.loss_time = _settings.sticks_loss_time;
+
+	} else if (_control_mode.flag_control_offboard_enabled || _status.nav_state >= vehicle_status_s::NAVIGATION_STATE_EXTERNAL1) {
+		source.loss_time = _settings.offboard_loss_time;
+	}
+
+	_silent = (silent(now, _attitude_time, kHoldTime) ? kAttitudeFault : 0) | (silent(now, _rates_time, kHoldTime) ? kRatesFault : 0)
+		  | (_control_mode.flag_armed && silent(now, source) ? kSetpointFault : 0);
+
+	for (int i = 0; i < kAxes; i++) {
+		if ((_silent & kSetpointFault) != 0) { _input.attitude_setpoint[i] = NAN; }
+
+		if ((_silent & kAttitudeFault) != 0) { _input.attitude[i] = NAN; }
+
+		if ((_silent & kRatesFault) != 0) { _input.rates[i] = NAN; }
+	}
 }
 
 void McMimoPid::excite(float (&moment)[3])
@@ -320,7 +428,7 @@ void McMimoPid::excite(float (&moment)[3])
 	}
 }
 
-void McMimoPid::publish(const vehicle_angular_velocity_s &angular_velocity, const Output &output)
+void McMimoPid::publish(hrt_abstime timestamp_sample)
 {
 	debug_vect_s excitation{};
 	memcpy(excitation.name, kExcitationName, sizeof(kExcitationName));
@@ -331,9 +439,9 @@ void McMimoPid::publish(const vehicle_angular_velocity_s &angular_velocity, cons
 	_debug_vect_pub.publish(excitation);
 
 	vehicle_rates_setpoint_s rates{};
-	rates.roll = output.rates_setpoint[0];
-	rates.pitch = output.rates_setpoint[1];
-	rates.yaw = output.rates_setpoint[2];
+	rates.roll = _output.rates_setpoint[0];
+	rates.pitch = _output.rates_setpoint[1];
+	rates.yaw = _output.rates_setpoint[2];
 	memcpy(rates.thrust_body, _thrust, sizeof(_thrust));
 	rates.timestamp = hrt_absolute_time();
 	_vehicle_rates_setpoint_pub.publish(rates);
@@ -346,23 +454,30 @@ void McMimoPid::publish(const vehicle_angular_velocity_s &angular_velocity, cons
 	_rate_ctrl_status_pub.publish(status);
 
 	vehicle_thrust_setpoint_s thrust{};
-	memcpy(thrust.xyz, _thrust, sizeof(_thrust));
-	thrust.timestamp_sample = angular_velocity.timestamp_sample;
+	vehicle_torque_setpoint_s torque{};
+	memcpy(thrust.xyz, _thrust, sizeof(thrust.xyz));
+	memcpy(torque.xyz, _output.moment, sizeof(torque.xyz));
+	_actuation.apply(_settings, kGains.period, torque.xyz, thrust.xyz);
+
+	thrust.timestamp_sample = timestamp_sample;
 	thrust.timestamp = hrt_absolute_time();
 	_vehicle_thrust_setpoint_pub.publish(thrust);
 
-	// Last, because the torque setpoint triggers the allocator.
-	vehicle_torque_setpoint_s torque{};
-	memcpy(torque.xyz, output.moment, sizeof(torque.xyz));
-	torque.timestamp_sample = angular_velocity.timestamp_sample;
+	// Triggers the allocator: after the thrust.
+	torque.timestamp_sample = timestamp_sample;
 	torque.timestamp = hrt_absolute_time();
 	_vehicle_torque_setpoint_pub.publish(torque);
+
+	actuator_controls_status_s power{};
+
+	if (_actuation.power(torque.xyz, kGains.period, power.control_power)) {
+		power.timestamp = torque.timestamp;
+		_actuator_controls_status_pub.publish(power);
+	}
 }
 
 int McMimoPid::task_spawn(int argc, char *argv[])
 {
-	if (!gyro_keeps_period()) { return PX4_ERROR; }
-
 	McMimoPid *const instance = new McMimoPid();
 
 	if (instance == nullptr) {
@@ -384,18 +499,12 @@ int McMimoPid::task_spawn(int argc, char *argv[])
 int McMimoPid::print_status()
 {
 	PX4_INFO("%s, %u bad inputs, %u bad sample times",
-		 _in_control ? "in control" : "waiting for the other controllers to stop",
+		 _hand_over.flies() ? "in control" : "PX4's own controllers fly",
 		 static_cast<unsigned>(_output.fault_count), static_cast<unsigned>(_clock.faults()));
 
 	if (_output.fault != 0) { PX4_INFO("only damping rates: invalid inputs 0x%x", static_cast<unsigned>(_output.fault)); }
 
 	PX4_INFO("excitation %s, last one: %s", describe(_excitation.phase()), describe(_excitation.end()));
-	const float *const gains = &_state.gains.kp_o[0][0];
-
-	for (int i = 0; i < MIMO_PID_PARAMETER_COUNT; i++) {
-		PX4_INFO_RAW("  %-16s %g\n", mimo_pid_parameters[i].name, static_cast<double>(gains[i]));
-	}
-
 	perf_print_counter(_cycle_perf);
 	return 0;
 }
@@ -410,8 +519,7 @@ int McMimoPid::print_usage(const char *reason)
 		R"DESCR_STR(
 ### Description
 Cascaded P + PID attitude controller with full 2x2 gains for roll and pitch, generated by mimopilot. It replaces
-mc_att_control and mc_rate_control: start it, then stop both of them. It does not start if the gyro rate is not the
-one its gains are for.
+mc_att_control and mc_rate_control while MIMO_EN says so.
 
 )DESCR_STR");
 

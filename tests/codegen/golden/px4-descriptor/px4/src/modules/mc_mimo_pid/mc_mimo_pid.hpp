@@ -2,18 +2,21 @@
 // Cascaded MIMO PID attitude controller for multicopters, replaces mc_att_control and mc_rate_control.
 #pragma once
 
+#include <drivers/drv_hrt.h>
 #include <lib/perf/perf_counter.h>
 #include <px4_platform_common/defines.h>
 #include <px4_platform_common/module.h>
-#include <px4_platform_common/module_params.h>
-#include <px4_platform_common/px4_work_queue/WorkItem.hpp>
+#include <px4_platform_common/px4_work_queue/ScheduledWorkItem.hpp>
 #include <uORB/Publication.hpp>
 #include <uORB/PublicationMulti.hpp>
 #include <uORB/Subscription.hpp>
 #include <uORB/SubscriptionCallback.hpp>
 #include <uORB/SubscriptionInterval.hpp>
+#include <uORB/topics/actuator_controls_status.h>
+#include <uORB/topics/battery_status.h>
 #include <uORB/topics/control_allocator_status.h>
 #include <uORB/topics/debug_vect.h>
+#include <uORB/topics/hover_thrust_estimate.h>
 #include <uORB/topics/manual_control_setpoint.h>
 #include <uORB/topics/parameter_update.h>
 #include <uORB/topics/rate_ctrl_status.h>
@@ -22,20 +25,27 @@
 #include <uORB/topics/vehicle_attitude_setpoint.h>
 #include <uORB/topics/vehicle_control_mode.h>
 #include <uORB/topics/vehicle_land_detected.h>
+#include <uORB/topics/vehicle_local_position.h>
 #include <uORB/topics/vehicle_rates_setpoint.h>
 #include <uORB/topics/vehicle_status.h>
 #include <uORB/topics/vehicle_thrust_setpoint.h>
 #include <uORB/topics/vehicle_torque_setpoint.h>
 
+#include "actuation.hpp"
+#include "arming_check.hpp"
 #include "excitation.hpp"
+#include "hand_over.hpp"
 #include "mimo_pid.hpp"
 #include "parameters.hpp"
 #include "sample_clock.hpp"
+#include "silence.hpp"
 #include "sticks.hpp"
+#include "throttle.hpp"
+#include "topic.hpp"
 
 using namespace time_literals;
 
-class McMimoPid : public ModuleBase, public ModuleParams, public px4::WorkItem
+class McMimoPid : public ModuleBase, public px4::ScheduledWorkItem
 {
 public:
 	static Descriptor desc;
@@ -53,44 +63,61 @@ public:
 private:
 	void Run() override;
 	void update_parameters();
-	void update_inputs();
+	void update_inputs(hrt_abstime now);
+	void update_stock_inputs();
 	void update_attitude();
 	void update_setpoint();
+	void update_silence(hrt_abstime now);
 	void make_setpoint_from_sticks();
-	void control(const vehicle_angular_velocity_s &angular_velocity);
+	void note_obstacle(hrt_abstime now);
+	void notice(const char *text);
+	void observe(hrt_abstime now);
 	void excite(float (&moment)[3]);
-	void publish(const vehicle_angular_velocity_s &angular_velocity, const mimopilot::Output &output);
+	void publish(hrt_abstime timestamp_sample);
+	void release();
 
-	bool take_over();
+	mimopilot::Obstacle obstacle() const;
+	bool flies(hrt_abstime now);
 	bool flown_by_sticks() const;
 
 	uORB::SubscriptionCallbackWorkItem _vehicle_angular_velocity_sub{this, ORB_ID(vehicle_angular_velocity)};
 	uORB::SubscriptionInterval _parameter_update_sub{ORB_ID(parameter_update), 1_s};
+	uORB::Subscription _battery_status_sub{ORB_ID(battery_status)};
 	uORB::Subscription _control_allocator_status_sub{ORB_ID(control_allocator_status)};
+	uORB::Subscription _hover_thrust_estimate_sub{ORB_ID(hover_thrust_estimate)};
 	uORB::Subscription _manual_control_setpoint_sub{ORB_ID(manual_control_setpoint)};
 	uORB::Subscription _vehicle_attitude_sub{ORB_ID(vehicle_attitude)};
 	uORB::Subscription _vehicle_attitude_setpoint_sub{ORB_ID(vehicle_attitude_setpoint)};
 	uORB::Subscription _vehicle_control_mode_sub{ORB_ID(vehicle_control_mode)};
 	uORB::Subscription _vehicle_land_detected_sub{ORB_ID(vehicle_land_detected)};
+	uORB::Subscription _vehicle_local_position_sub{ORB_ID(vehicle_local_position)};
 	uORB::Subscription _vehicle_rates_setpoint_sub{ORB_ID(vehicle_rates_setpoint)};
 	uORB::Subscription _vehicle_status_sub{ORB_ID(vehicle_status)};
 	uORB::Subscription _vehicle_torque_setpoint_sub{ORB_ID(vehicle_torque_setpoint)};
 
+	mimopilot::Topic<uORB::Publication<actuator_controls_status_s>> _actuator_controls_status_pub{ORB_ID(actuator_controls_status_0)};
 	uORB::Publication<debug_vect_s> _debug_vect_pub{ORB_ID(debug_vect)};
-	uORB::PublicationMulti<rate_ctrl_status_s> _rate_ctrl_status_pub{ORB_ID(rate_ctrl_status)};
-	uORB::Publication<vehicle_attitude_setpoint_s> _vehicle_attitude_setpoint_pub{ORB_ID(vehicle_attitude_setpoint)};
-	uORB::Publication<vehicle_rates_setpoint_s> _vehicle_rates_setpoint_pub{ORB_ID(vehicle_rates_setpoint)};
-	uORB::Publication<vehicle_thrust_setpoint_s> _vehicle_thrust_setpoint_pub{ORB_ID(vehicle_thrust_setpoint)};
-	uORB::Publication<vehicle_torque_setpoint_s> _vehicle_torque_setpoint_pub{ORB_ID(vehicle_torque_setpoint)};
+	mimopilot::Topic<uORB::PublicationMulti<rate_ctrl_status_s>> _rate_ctrl_status_pub{ORB_ID(rate_ctrl_status)};
+	mimopilot::Topic<uORB::Publication<vehicle_attitude_setpoint_s>> _vehicle_attitude_setpoint_pub{ORB_ID(vehicle_attitude_setpoint)};
+	mimopilot::Topic<uORB::Publication<vehicle_rates_setpoint_s>> _vehicle_rates_setpoint_pub{ORB_ID(vehicle_rates_setpoint)};
+	mimopilot::Topic<uORB::Publication<vehicle_thrust_setpoint_s>> _vehicle_thrust_setpoint_pub{ORB_ID(vehicle_thrust_setpoint)};
+	mimopilot::Topic<uORB::Publication<vehicle_torque_setpoint_s>> _vehicle_torque_setpoint_pub{ORB_ID(vehicle_torque_setpoint)};
 
 	vehicle_control_mode_s _control_mode{};
 	vehicle_status_s _status{};
 	manual_control_setpoint_s _manual{};
-	bool _on_ground{true};  // landed or maybe landed; assumed until known, to be safe
+	bool _landed{true};     // assumed until known, to be safe
+	bool _on_ground{true};  // landed or maybe landed
+	bool _heading_good{true};
 
-	MimoParameters _parameters{this};
+	mimopilot::Parameters _parameters{};
+	mimopilot::StockSettings _settings{};
 	mimopilot::SampleClock _clock;
+	mimopilot::HandOver _hand_over{};
+	mimopilot::ArmingCheck _arming_check{};
 	mimopilot::Sticks _sticks{};
+	mimopilot::Throttle _throttle{};
+	mimopilot::Actuation _actuation{};
 	mimopilot::Excitation _excitation{};
 	mimopilot::State _state{};
 	mimopilot::Input _input{};
@@ -99,12 +126,17 @@ private:
 	float _yaw_rate{0.0F};        // rad/s, feed-forward
 	float _thrust[3] {};          // body FRD, -1 to 1
 	hrt_abstime _setpoint_time{0};
-	hrt_abstime _armed_since{0};  // 0: disarmed
 	uint8_t _quat_reset_counter{0};
 	bool _attitude_seen{false};
-	bool _topics_free{false};
-	bool _in_control{false};
+	hrt_abstime _attitude_time{0};
+	hrt_abstime _rates_time{0};
+	vehicle_torque_setpoint_s _stock_torque{};  // of PX4's own controllers
+	int32_t _silent{0};           // bits of Output::fault whose source has stopped
+	const char *_obstacle{nullptr};
+	const char *_wrong_gain{nullptr};
+	bool _wanted{false};
 	bool _mode_refused{false};
+	orb_advert_t _mavlink_log_pub{nullptr};
 
 	perf_counter_t _cycle_perf{perf_alloc(PC_ELAPSED, MODULE_NAME": cycle")};
 };

@@ -2,175 +2,42 @@
 // The parameters of module.yaml, as PX4 stores them.
 #pragma once
 
-#include <px4_platform_common/module_params.h>
-#include <string.h>
-
 #include "excitation.hpp"
 #include "gains.hpp"
-#include "parameters.h"
 
-class MimoParameters : public ModuleParams
+namespace mimopilot {
+
+class Parameters
 {
 public:
-	explicit MimoParameters(ModuleParams *parent) : ModuleParams(parent) {}
+	// Marks all as in use: a log keeps no others.
+	Parameters();
 
-	// Reads the gains. Returns null, or the first parameter out of its range, because PX4 stores any value.
-	// The period is fixed in the firmware.
-	const mimo_pid_parameter *gains(mimopilot::Gains &gains) const
-	{
-		const float values[MIMO_PID_PARAMETER_COUNT] = {
-			_mimo_ap_rr.get(),
-			_mimo_ap_rp.get(),
-			_mimo_ap_pr.get(),
-			_mimo_ap_pp.get(),
-			_mimo_rp_rr.get(),
-			_mimo_rp_rp.get(),
-			_mimo_rp_pr.get(),
-			_mimo_rp_pp.get(),
-			_mimo_ri_rr.get(),
-			_mimo_ri_rp.get(),
-			_mimo_ri_pr.get(),
-			_mimo_ri_pp.get(),
-			_mimo_rd_rr.get(),
-			_mimo_rd_rp.get(),
-			_mimo_rd_pr.get(),
-			_mimo_rd_pp.get(),
-			_mimo_rf_rr.get(),
-			_mimo_rf_rp.get(),
-			_mimo_rf_pr.get(),
-			_mimo_rf_pp.get(),
-			_mimo_af_rr.get(),
-			_mimo_af_rp.get(),
-			_mimo_af_pr.get(),
-			_mimo_af_pp.get(),
-			_mimo_ra_rr.get(),
-			_mimo_ra_rp.get(),
-			_mimo_ra_pr.get(),
-			_mimo_ra_pp.get(),
-			_mimo_ap_yy.get(),
-			_mimo_rp_yy.get(),
-			_mimo_ri_yy.get(),
-			_mimo_rd_yy.get(),
-			_mimo_rf_yy.get(),
-			_mimo_rmax_r.get(),
-			_mimo_rmax_p.get(),
-			_mimo_rmax_y.get(),
-			_mimo_umax_r.get(),
-			_mimo_umax_p.get(),
-			_mimo_umax_y.get(),
-			_mimo_imax_r.get(),
-			_mimo_imax_p.get(),
-			_mimo_imax_y.get(),
-			_mimo_d_pole.get(),
-			0.004F,
-			_mimo_m_damp.get(),
-			_mimo_m_omega.get(),
-		};
+	// Reads all. Returns null, or the name of the first gain out of its range, because PX4 stores any value; `gains` is
+	// then of no use. What is fixed in the firmware stays so.
+	const char *read(Gains &gains);
 
-		for (int i = 0; i < MIMO_PID_PARAMETER_COUNT; i++) {
-			const mimo_pid_parameter &parameter = mimo_pid_parameters[i];
-
-			if (!(values[i] >= parameter.minimum && values[i] <= parameter.maximum)) { return &parameter; }
-		}
-
-		static_assert(sizeof(values) == sizeof(gains), "the parameter table must fit Gains");
-		memcpy(&gains, values, sizeof(gains));
-		return nullptr;
-	}
-
-	mimopilot::ExcitationSettings excitation() const
-	{
-		mimopilot::ExcitationSettings settings{};
-		settings.axis = _mimo_ex_ax.get();
-		settings.amplitude = _mimo_ex_amp.get();
-		settings.hold_min = _mimo_ex_hmin.get();
-		settings.hold_max = _mimo_ex_hmax.get();
-		settings.duration = samples(_mimo_ex_dur.get());
-		settings.pause = samples(1.0F);
-		settings.seed = _mimo_ex_seed.get();
-		settings.tilt_max = _mimo_ex_tilt.get();
-		return settings;
-	}
-
-	int32_t excitation_mode() const { return _mimo_ex_mode.get(); }
-
-	// PX4's own parameters for Stabilized mode.
-	float tilt_max() const { return _mpc_man_tilt_max.get(); }          // deg
-	float yaw_rate_max() const { return _mpc_man_y_max.get(); }         // deg/s
-	float thrust_min() const { return _mpc_manthr_min.get(); }
-	float thrust_hover() const { return _mpc_thr_hover.get(); }
-	float thrust_max() const { return _mpc_thr_max.get(); }
-	float spool_up_time() const { return _com_spoolup_time.get(); }     // s
+	ExcitationSettings excitation() const;
+	int32_t excitation_mode() const { return integer(MIMO_EX_MODE); }
+	int32_t enabled() const { return integer(MIMO_EN); }
 
 private:
-	static int32_t samples(float seconds)
-	{
-		return seconds > 0.0F && seconds < 1.0e3F ? static_cast<int32_t>(seconds / mimopilot::kGains.period + 0.5F) : 0;
-	}
+	enum Setting {
+		MIMO_EX_AX,
+		MIMO_EX_AMP,
+		MIMO_EX_HMIN,
+		MIMO_EX_HMAX,
+		MIMO_EX_DUR,
+		MIMO_EX_SEED,
+		MIMO_EX_MODE,
+		MIMO_EX_TILT,
+		MIMO_EN,
+		kSettingCount
+	};
 
-	DEFINE_PARAMETERS(
-		(ParamFloat<px4::params::MIMO_AP_RR>) _mimo_ap_rr,
-		(ParamFloat<px4::params::MIMO_AP_RP>) _mimo_ap_rp,
-		(ParamFloat<px4::params::MIMO_AP_PR>) _mimo_ap_pr,
-		(ParamFloat<px4::params::MIMO_AP_PP>) _mimo_ap_pp,
-		(ParamFloat<px4::params::MIMO_RP_RR>) _mimo_rp_rr,
-		(ParamFloat<px4::params::MIMO_RP_RP>) _mimo_rp_rp,
-		(ParamFloat<px4::params::MIMO_RP_PR>) _mimo_rp_pr,
-		(ParamFloat<px4::params::MIMO_RP_PP>) _mimo_rp_pp,
-		(ParamFloat<px4::params::MIMO_RI_RR>) _mimo_ri_rr,
-		(ParamFloat<px4::params::MIMO_RI_RP>) _mimo_ri_rp,
-		(ParamFloat<px4::params::MIMO_RI_PR>) _mimo_ri_pr,
-		(ParamFloat<px4::params::MIMO_RI_PP>) _mimo_ri_pp,
-		(ParamFloat<px4::params::MIMO_RD_RR>) _mimo_rd_rr,
-		(ParamFloat<px4::params::MIMO_RD_RP>) _mimo_rd_rp,
-		(ParamFloat<px4::params::MIMO_RD_PR>) _mimo_rd_pr,
-		(ParamFloat<px4::params::MIMO_RD_PP>) _mimo_rd_pp,
-		(ParamFloat<px4::params::MIMO_RF_RR>) _mimo_rf_rr,
-		(ParamFloat<px4::params::MIMO_RF_RP>) _mimo_rf_rp,
-		(ParamFloat<px4::params::MIMO_RF_PR>) _mimo_rf_pr,
-		(ParamFloat<px4::params::MIMO_RF_PP>) _mimo_rf_pp,
-		(ParamFloat<px4::params::MIMO_AF_RR>) _mimo_af_rr,
-		(ParamFloat<px4::params::MIMO_AF_RP>) _mimo_af_rp,
-		(ParamFloat<px4::params::MIMO_AF_PR>) _mimo_af_pr,
-		(ParamFloat<px4::params::MIMO_AF_PP>) _mimo_af_pp,
-		(ParamFloat<px4::params::MIMO_RA_RR>) _mimo_ra_rr,
-		(ParamFloat<px4::params::MIMO_RA_RP>) _mimo_ra_rp,
-		(ParamFloat<px4::params::MIMO_RA_PR>) _mimo_ra_pr,
-		(ParamFloat<px4::params::MIMO_RA_PP>) _mimo_ra_pp,
-		(ParamFloat<px4::params::MIMO_AP_YY>) _mimo_ap_yy,
-		(ParamFloat<px4::params::MIMO_RP_YY>) _mimo_rp_yy,
-		(ParamFloat<px4::params::MIMO_RI_YY>) _mimo_ri_yy,
-		(ParamFloat<px4::params::MIMO_RD_YY>) _mimo_rd_yy,
-		(ParamFloat<px4::params::MIMO_RF_YY>) _mimo_rf_yy,
-		(ParamFloat<px4::params::MIMO_RMAX_R>) _mimo_rmax_r,
-		(ParamFloat<px4::params::MIMO_RMAX_P>) _mimo_rmax_p,
-		(ParamFloat<px4::params::MIMO_RMAX_Y>) _mimo_rmax_y,
-		(ParamFloat<px4::params::MIMO_UMAX_R>) _mimo_umax_r,
-		(ParamFloat<px4::params::MIMO_UMAX_P>) _mimo_umax_p,
-		(ParamFloat<px4::params::MIMO_UMAX_Y>) _mimo_umax_y,
-		(ParamFloat<px4::params::MIMO_IMAX_R>) _mimo_imax_r,
-		(ParamFloat<px4::params::MIMO_IMAX_P>) _mimo_imax_p,
-		(ParamFloat<px4::params::MIMO_IMAX_Y>) _mimo_imax_y,
-		(ParamFloat<px4::params::MIMO_D_POLE>) _mimo_d_pole,
-		(ParamFloat<px4::params::MIMO_TS>) _mimo_ts,
-		(ParamFloat<px4::params::MIMO_M_DAMP>) _mimo_m_damp,
-		(ParamFloat<px4::params::MIMO_M_OMEGA>) _mimo_m_omega,
-		(ParamFloat<px4::params::MIMO_SCALE_R>) _mimo_scale_r,
-		(ParamFloat<px4::params::MIMO_SCALE_P>) _mimo_scale_p,
-		(ParamFloat<px4::params::MIMO_SCALE_Y>) _mimo_scale_y,
-		(ParamInt<px4::params::MIMO_EX_AX>) _mimo_ex_ax,
-		(ParamFloat<px4::params::MIMO_EX_AMP>) _mimo_ex_amp,
-		(ParamInt<px4::params::MIMO_EX_HMIN>) _mimo_ex_hmin,
-		(ParamInt<px4::params::MIMO_EX_HMAX>) _mimo_ex_hmax,
-		(ParamFloat<px4::params::MIMO_EX_DUR>) _mimo_ex_dur,
-		(ParamInt<px4::params::MIMO_EX_SEED>) _mimo_ex_seed,
-		(ParamInt<px4::params::MIMO_EX_MODE>) _mimo_ex_mode,
-		(ParamFloat<px4::params::MIMO_EX_TILT>) _mimo_ex_tilt,
-		(ParamFloat<px4::params::MPC_MAN_TILT_MAX>) _mpc_man_tilt_max,
-		(ParamFloat<px4::params::MPC_MAN_Y_MAX>) _mpc_man_y_max,
-		(ParamFloat<px4::params::MPC_MANTHR_MIN>) _mpc_manthr_min,
-		(ParamFloat<px4::params::MPC_THR_HOVER>) _mpc_thr_hover,
-		(ParamFloat<px4::params::MPC_THR_MAX>) _mpc_thr_max,
-		(ParamFloat<px4::params::COM_SPOOLUP_TIME>) _com_spoolup_time
-	)
+	int32_t integer(Setting setting) const { return static_cast<int32_t>(_settings[setting]); }
+
+	float _settings[kSettingCount] {};
 };
+
+}  // namespace mimopilot

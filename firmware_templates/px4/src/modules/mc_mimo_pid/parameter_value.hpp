@@ -1,0 +1,11 @@
+// Reads one of PX4's parameters.
+#pragma once
+
+#include <px4_platform_common/param.h>
+
+namespace mimopilot {
+
+// A whole number becomes a float of the same value, up to 2^24.
+float parameter_value(px4::params name);
+
+}  // namespace mimopilot

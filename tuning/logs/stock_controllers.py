@@ -1,0 +1,138 @@
+"""The controllers of PX4 and ArduPilot: which of their parameters is which of our gains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from mimopilot.tuning.gains import Limits
+from mimopilot.tuning.parameter_row import AXIS_LETTERS, Row, Shape
+
+
+@dataclass(frozen=True)
+class StockController:
+    """Parameters of an autopilot's own controller.
+
+    Attributes
+    ----------
+    name : str
+        The autopilot.
+    axes : tuple of 3 str
+        Its names of roll, pitch and yaw.
+    gains : mapping
+        Matrix -> parameter of an axis.
+    factor : str
+        Parameter of an axis that multiplies the rate terms; empty: none.
+    limits : mapping
+        Limit -> for each axis its parameter, the factor to our unit, and the value where it is not logged (NaN: not
+        known).
+    cutoffs : mapping
+        Cut-off of a filter -> parameter, Hz.
+    rate : str
+        Parameter of the control rate, Hz.
+    scalars : mapping
+        Scalar of our table -> parameter. A row that the table does not have is not mapped.
+    unlimited : mapping
+        Limit -> value where the parameter is 0, which means that there is no limit.
+    """
+
+    name: str
+    axes: tuple[str, str, str]
+    gains: Mapping[str, str]
+    factor: str
+    limits: Mapping[str, list[tuple[str, float, float]]]
+    cutoffs: Mapping[str, str]
+    rate: str
+    scalars: Mapping[str, str] = field(default_factory=dict)
+    unlimited: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    def maps(self, row: Row) -> bool:
+        """Whether it has parameters for a row of our table."""
+        return any(row.key in table for table in (self.gains, self.limits, self.cutoffs, self.scalars))
+
+    def names(self, row: Row, code: str) -> tuple[str, ...]:
+        """Parameters that an element of a row is made of; the first is its own, the others are factors."""
+        if row.shape in (Shape.POLE, Shape.SCALAR):
+            table = self.cutoffs if row.shape is Shape.POLE else self.scalars
+            return (table[row.key],) if row.key in table else ()
+        *_, letters = code.rpartition("_")
+        if letters[0] != letters[-1] or not self.maps(row):
+            return ()
+        axis = AXIS_LETTERS.index(letters[0])
+        if row.shape is Shape.AXES:
+            name = self.limits[row.key][axis][0]
+            return (name,) if name else ()
+        own = self.gains[row.key].format(axis=self.axes[axis])
+        return (own, self.factor.format(axis=self.axes[axis])) if self.factor and row.key in _SCALED else (own,)
+
+    def value(self, row: Row, code: str, values: Mapping[str, float]) -> float:
+        """What it has for an element of a row, in the unit of the gains file; NaN where `values` do not tell."""
+        names = self.names(row, code)
+        if row.shape is Shape.POLE:
+            return values.get(names[0], row.default or 0.0) if names else row.default or 0.0
+        if row.shape is Shape.SCALAR:
+            default = math.nan if row.default is None else row.default
+            return values.get(names[0], default) if names else default
+        if row.shape is Shape.AXES:
+            axis = AXIS_LETTERS.index(code[-1])
+            name, factor, default = self.limits[row.key][axis]
+            return factor * values.get(name, default) or self.unlimited.get(row.key, (0.0, 0.0, 0.0))[axis]
+        if row.key not in self.gains:
+            return math.nan
+        if not names:
+            return 0.0
+        own, *factors = names
+        return math.prod(values.get(name, 1.0) for name in factors) * values.get(own, math.nan)
+
+
+_DEGREE = math.pi / 180
+#: The rate terms that PX4's factor K multiplies (MulticopterRateControl::parameters_updated): not the feed-forward.
+_SCALED = ("Kp_i", "Ki_i", "Kd_i")
+_PX4_AXES = ("ROLL", "PITCH", "YAW")
+PX4 = StockController(
+    name="PX4",
+    axes=_PX4_AXES,
+    gains={
+        "Kp_o": "MC_{axis}_P",
+        "Kp_i": "MC_{axis}RATE_P",
+        "Ki_i": "MC_{axis}RATE_I",
+        "Kd_i": "MC_{axis}RATE_D",
+        "Kff_i": "MC_{axis}RATE_FF",
+    },
+    factor="MC_{axis}RATE_K",
+    limits={
+        "rate_max": [(f"MC_{axis}RATE_MAX", _DEGREE, math.nan) for axis in _PX4_AXES],
+        "moment_max": [("", 1.0, 1.0)] * 3,
+        "integral_max": [(name, 1.0, math.nan) for name in ("MC_RR_INT_LIM", "MC_PR_INT_LIM", "MC_YR_INT_LIM")],
+    },
+    cutoffs={"derivative_cutoff_hz": "IMU_DGYRO_CUTOFF"},
+    rate="IMU_GYRO_RATEMAX",
+    scalars={"yaw_weight": "MC_YAW_WEIGHT"},
+)
+_ARDUPILOT_AXES = ("RLL", "PIT", "YAW")
+ARDUPILOT = StockController(
+    name="ArduPilot",
+    axes=_ARDUPILOT_AXES,
+    gains={
+        "Kp_o": "ATC_ANG_{axis}_P",
+        "Kp_i": "ATC_RAT_{axis}_P",
+        "Ki_i": "ATC_RAT_{axis}_I",
+        "Kd_i": "ATC_RAT_{axis}_D",
+        "Kff_i": "ATC_RAT_{axis}_FF",
+    },
+    factor="",
+    limits={
+        "rate_max": [(f"ATC_RATE_{letter}_MAX", _DEGREE, 0.0) for letter in AXIS_LETTERS],
+        "moment_max": [("", 1.0, 1.0)] * 3,
+        "integral_max": [(f"ATC_RAT_{axis}_IMAX", 1.0, math.nan) for axis in _ARDUPILOT_AXES],
+    },
+    cutoffs={"derivative_cutoff_hz": "ATC_RAT_RLL_FLTD"},
+    rate="SCHED_LOOP_RATE",
+    unlimited={"rate_max": Limits().rate_max},
+)
+
+
+def stock_of(values: Mapping[str, float]) -> StockController:
+    """The controller whose parameters these are; PX4's if they do not tell."""
+    return ARDUPILOT if "ATC_RAT_RLL_P" in values else PX4
