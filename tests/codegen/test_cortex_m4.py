@@ -23,13 +23,14 @@ from mimopilot.tuning.parameter_row import Shape
 from mimopilot.tuning.parameters import PARAMETERS, rows
 from tests.conftest import assert_one_clear_line, following_gains
 
-#: PX4's compiler flags that affect code, and -fno-fast-math, which the controller requires.
+#: PX4's compiler flags that affect code, and those that the controller requires: -fno-fast-math, after which
+#: -fno-math-errno must stand again.
 PX4_FLAGS = (
     *("-std=gnu++14", "-Os", "-g", "-fdata-sections", "-ffunction-sections", "-fomit-frame-pointer"),
     *("-funsafe-math-optimizations", "-fno-strict-aliasing", "-fno-math-errno", "-fno-strength-reduce"),
     *("-fvisibility=hidden", "-fno-builtin-printf", "-fcheck-new", "-fno-exceptions", "-fno-rtti"),
     *("-fno-threadsafe-statics", "-Warray-bounds", "-Wcast-align", "-Wfloat-equal", "-Wlogical-op", "-Wpointer-arith"),
-    "-fno-fast-math",
+    *("-fno-fast-math", "-fno-math-errno"),
 )
 FLAGS = {
     "O0": (*CXX_FLAGS, "-O0"),
