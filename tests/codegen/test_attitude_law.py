@@ -105,7 +105,7 @@ def weighted_turn(errors):
 def test_a_weighted_turn_is_interpolated_and_differs_little_from_the_published_angle(
     library, weight, up_to, turn, error
 ):
-    """The core interpolates between no turn and the whole one, and normalises: no arc cosine. Degrees; 0.75 is the worst weight."""
+    """The core interpolates between no turn and the whole one, and normalises. Degrees; 0.75 is the worst weight."""
     attitude, setpoint = random_pairs(10_000, 3, turn=np.radians(up_to))
     found = flown_errors(library, weight, attitude, setpoint)
     published = published_errors(attitude, setpoint, weight)
