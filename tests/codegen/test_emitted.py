@@ -138,9 +138,8 @@ def test_cppcheck_finds_nothing(tree):
 
 def test_cppcheck_finds_an_inserted_error(tree):
     core = tree / "core" / "mimo_pid.cpp"
-    right = "i < 4; i++) { q[i] = scale * across[i]"
-    assert core.read_text().count(right) == 1
-    core.write_text(core.read_text().replace(right, right.replace("<", "<=")))
+    wrong = "for (int i = 0; i <= kAxes; i++) { state.integral[i] = 0.0F; }"
+    core.write_text(f"{core.read_text()}\nvoid wrong(mimopilot::State &state) {{ using mimopilot::kAxes; {wrong} }}\n")
     result = run(BIN / "cppcheck", "--error-exitcode=1", "--language=c++", "--quiet", core)
     assert result.returncode == 1
     assert "arrayIndexOutOfBounds" in result.stderr
