@@ -275,7 +275,7 @@ EXCITATION: tuple[Setting, ...] = (
     Setting("MIMO_EX_DUR", "s", 16.0, 0.1, 300.0, False, "excitation: time on each axis"),
     Setting("MIMO_EX_SEED", "", 1, 0, 1000000, True, "excitation: seed of the pulses"),
     Setting("MIMO_EX_MODE", "", 4, 0, 30, True, "excitation: only in this nav_state (2 Position, 4 Hold)"),
-    Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stop above this roll or pitch"),
+    Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stop above this tilt"),
 )
 
 #: Which controller flies: this one or that of the flight stack; from 2 on, a switch chooses in flight.

@@ -67,8 +67,7 @@ WORDS = {
     "integral": 3,
     "excitation": 3,
     "thrust": 3,
-    "angles": 3,
-    "wanted": 3,
+    "attitude": 4,
     "q_d": 4,
     "yaw_rate": 1,
 }
@@ -90,10 +89,11 @@ def parameters_header(entries: dict[str, dict]) -> str:
     return "\n".join(
         [
             "#pragma once",
+            "#include <stdint.h>",
             "#include <stdlib.h>",
             "#include <string.h>",
             "namespace px4 {",
-            f"enum class params {{ {', '.join(names)} }};",
+            f"enum class params : uint16_t {{ {', '.join(names)} }};",
             "constexpr bool kFloat[] = {" + ", ".join("true" if kinds[n] else "false" for n in names) + "};",
             "inline double *values() {",
             "static double v[] = {" + ", ".join(repr(float(values[n])) for n in names) + "}; return v; }",
@@ -153,6 +153,8 @@ class Transcript:
         Return values of start, stop and status.
     other : list of str
         Remaining lines.
+    announced : list of bool
+        For each row of `out`: whether the module published the excitation, too.
     """
 
     out: np.ndarray
@@ -160,6 +162,7 @@ class Transcript:
     log: list[str]
     exits: list[int]
     other: list[str]
+    announced: list[bool]
 
 
 def drive(program: Path, commands: Iterable[str]) -> Transcript:
@@ -168,12 +171,13 @@ def drive(program: Path, commands: Iterable[str]) -> Transcript:
     result = subprocess.run([str(program)], input=text, capture_output=True, text=True, check=False, timeout=60)
     assert result.returncode == 0, result.stdout[-500:] + result.stderr
     assert "two publishers" not in result.stdout
-    rows, ticks, log, exits, other = [], [], [], [], []
+    rows, ticks, log, exits, other, announced = [], [], [], [], [], []
     for line in result.stdout.splitlines():
         kind, _, rest = line.partition(" ")
         if kind == "out":
             words = rest.split()
-            assert words[-1] == "MIMO_EXC"
+            assert words[-1] in ("MIMO_EXC", "silent")
+            announced.append(words[-1] == "MIMO_EXC")
             rows.append([int(word, 16) for word in words[1:-1]])
         if kind in ("out", "quiet"):
             ticks.append(kind == "out")
@@ -184,4 +188,4 @@ def drive(program: Path, commands: Iterable[str]) -> Transcript:
         else:
             other.append(line)
     out = np.array(rows, np.uint32).reshape(len(rows), sum(WORDS.values())).view(OUT)[:, 0]
-    return Transcript(out, ticks, log, exits, other)
+    return Transcript(out, ticks, log, exits, other, announced)

@@ -98,10 +98,10 @@ def test_the_defaults_set_every_gain_the_gyro_rate_and_the_log_profile(gains):
     assert files["px4/airframe/mimo_defaults.txt"] in files["px4/sd_card/etc/config.txt"]
 
 
-def test_the_stock_controllers_stop_only_after_the_module_has_started(gains):
+def test_the_start_up_lines_start_the_module_and_stop_nothing(gains):
     script = render(gains, "px4")["px4/sd_card/etc/extras.txt"]
-    order = [script.index(word) for word in ("set +e", "MIMO_EN 1", "mc_mimo_pid start", "then\n\t\tmc_rate", "set -e")]
-    assert order == sorted(order)
+    order = [script.index(word) for word in ("set +e", "MIMO_EN 0", "then\n\tmc_mimo_pid start", "set -e")]
+    assert order == sorted(order) and " stop" not in script
     assert subprocess.run(["sh", "-n"], input=script, text=True, check=False).returncode == 0
 
 

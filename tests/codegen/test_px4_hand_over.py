@@ -6,10 +6,9 @@ The host program fails as soon as two modules publish torque (see `drive`).
 import numpy as np
 import pytest
 
-from mimopilot.codegen.layout import INPUT
 from mimopilot.codegen.native import NativeController, load_native
 from tests.codegen.px4_host import drive
-from tests.codegen.test_px4_module import AIRBORNE, HOLD_MODE, STEP, STOCK, quaternion, text
+from tests.codegen.test_px4_module import AIRBORNE, HOLD_MODE, STEP, STOCK, level_inputs, quaternion, text
 from tests.conftest import coupled_gains
 
 SECOND = [STEP] * 250
@@ -107,8 +106,7 @@ def test_from_stock_the_torque_does_not_jump_and_the_integrators_carry_it(progra
     turning = [f"gyro 4000 {text(0.1, 0.05, -0.05)}"] * 400
     start = [*elements, "param MIMO_EN 0", f"stock {text(*stock)}", *AIRBORNE, tilted]
     result = drive(program, [*start, *turning, "param MIMO_EN 1", *turning])
-    inputs = np.zeros(400, INPUT)
-    inputs["attitude"], inputs["rates"] = result.out["angles"][0], [0.1, 0.05, -0.05]
+    inputs = level_inputs(400, armed=0, attitude=result.out["attitude"][0], rates=[0.1, 0.05, -0.05])
     rest = NativeController(load_native(gains), gains).run(inputs)["moment"][-1]
     assert np.abs(rest - stock).max() > 0.05
     # One period of Ki e is added already.
@@ -119,14 +117,14 @@ def test_from_stock_the_torque_does_not_jump_and_the_integrators_carry_it(progra
 # Silence.
 
 
-@pytest.mark.parametrize(("source", "limit"), [("attitude", HOLD), ("setpoint", HOLD)])
-def test_a_silent_source_counts_as_invalid_and_then_as_a_fault(program, source, limit):
+@pytest.mark.parametrize("source", ["attitude", "setpoint"])
+def test_a_silent_source_counts_as_invalid_and_then_as_a_fault(program, source):
     tilted = f"setpoint {text(*quaternion(0.2, 0, 0), 0, 0, 0, -0.5)}"
     result = drive(program, [*AIRBORNE, tilted, STEP, STEP, STEP, f"mute {source} 1", *[STEP] * 400])
     rates = result.out["rates"][:, 0]
-    flown = int(np.argmax(rates == 0)) - 2
+    flown = int(np.argmax(rates == 0)) - 2  # since the source has stopped
     assert (rates[: flown + 2] > 1).all() and (rates[flown + 2 :] == 0).all()
-    assert limit <= flown <= limit + HOLD + 1
+    assert flown == HOLD
     # After half a second of that it hands back, and says so.
     assert abs(len(result.out) - (flown + 2 + 125)) <= 1
     assert lines(result, "stock") == [*STOPPED, *STARTED]
@@ -136,7 +134,7 @@ def test_a_silent_source_counts_as_invalid_and_then_as_a_fault(program, source, 
 def test_a_frozen_attitude_does_not_wind_up(program):
     tilted = f"setpoint {text(*quaternion(0.2, 0, 0), 0, 0, 0, -0.5)}"
     out = drive(program, [*AIRBORNE, tilted, STEP, STEP, "mute attitude 1", *[STEP] * 170]).out
-    assert (np.diff(out["integral"][2 * HOLD + 5 :, 0]) == 0).all()
+    assert (np.diff(out["integral"][HOLD + 5 :, 0]) == 0).all()
 
 
 def test_after_a_fault_it_flies_again_only_when_asked(program):
@@ -149,7 +147,8 @@ def test_after_a_fault_it_flies_again_only_when_asked(program):
 
 def test_without_a_gyro_it_wakes_up_gives_no_torque_and_hands_back(program):
     turning = ["gyro 4000 0.3 0 0"] * 5
-    result = drive(program, [*AIRBORNE, STEP, *turning, "wait 3000000"])
+    result = drive(program, [*AIRBORNE, STEP, *turning, "wait 1000000"])
+    assert 10 <= len(result.out) - 5 <= 18  # each 40 ms
     assert (result.out["torque"][-5:] == 0).all()
     assert lines(result, "stock") == [*STOPPED, *STARTED]
 
@@ -170,4 +169,4 @@ def test_sticks_are_legal_until_px4_declares_them_lost(program):
     rates = drive(program, [*commands, *[STEP] * 220]).out["rates"][:, 0]
     silent = int(0.5 * 250) + HOLD
     assert (rates[-220 : -220 + silent] > 1).all()
-    assert (rates[-220 + silent + HOLD + 2 :] == 0).all()
+    assert (rates[-220 + silent + 2 :] == 0).all()

@@ -7,13 +7,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mimopilot.codegen.layout import INPUT
+from mimopilot.codegen.native import NativeController, load_native
 from tests.codegen.px4_host import PX4_PARAMETERS, drive
 
 PERIOD = 0.004  # s
-HOLD, STABILIZED = 4, 15
+HOLD, ACRO, OFFBOARD, STABILIZED = 4, 10, 14, 15
 LEVEL = "attitude 1 0 0 0 0 1 0 0 0"
 START = ["gyro 0 0 0 0", "start", LEVEL, "land 0 0"]
 BY_STICKS = f"mode 1 1 0 1 {STABILIZED}"
+BY_RATE_STICKS = f"mode 1 1 0 0 {ACRO}"
+BY_RATES = f"mode 1 0 0 0 {OFFBOARD}"
+LEVEL_SETPOINT = "setpoint 1 0 0 0 0 0 0 -0.5"
+TILTED = "setpoint 0.995 0.0998749 0 0 0 0 0 -0.5"
 STEP = "gyro 4000 0 0 0"
 SPOOL_UP = [STEP] * 1100  # 1 s without thrust, then 2 s to full thrust, and the bottom's 1.6 s
 
@@ -168,6 +174,115 @@ def test_leaving_the_mode_forgets_the_sticks(program):
     out = by_sticks(program, "sticks 1 1 0 1 0", *[STEP] * 100, *away, BY_STICKS, STEP, MC_MAN_TILT_TAU=0.5)
     np.testing.assert_allclose(out["q_d"][-1], [np.cos(0.5), 0, 0, np.sin(0.5)], atol=1e-6)
     assert out["yaw_rate"][-1] == 0
+
+
+# Rate modes.
+
+
+def super_expo(x, share, bend):
+    return expo(x, share) * (1 - bend) / (1 - abs(x) * bend)
+
+
+def rate_inputs(out, rates, wanted):
+    inputs = np.zeros(len(out), INPUT)
+    inputs["rate_mode"] = inputs["armed"] = 1
+    inputs["rates"], inputs["rates_setpoint"] = rates, wanted
+    return inputs
+
+
+def assert_flown(gains, out, rates):
+    """Torques and rate setpoints are those of the rate controller alone, bit for bit."""
+    controller = NativeController(load_native(gains), gains)
+    rest = rate_inputs(out[:1], 0, 0)
+    rest["armed"] = 0  # PX4's own controllers fly
+    controller.run(rest)
+    expected = controller.run(rate_inputs(out, rates, out["rates"]))
+    assert out["torque"].tobytes() == np.ascontiguousarray(expected["moment"]).tobytes()
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {},
+        {"MC_ACRO_R_MAX": 360.0, "MC_ACRO_P_MAX": 250.0, "MC_ACRO_Y_MAX": 150.0, "MC_ACRO_EXPO": 0.69},
+        {"MC_ACRO_EXPO_Y": 0.4, "MC_ACRO_SUPEXPO": 0.7, "MC_ACRO_SUPEXPOY": 0.99, "MC_ACRO_EXPO": 0.1},
+    ],
+)
+def test_acro_flies_px4s_rates_with_the_rate_gains_alone(program, gains, changed):
+    rng, p = np.random.default_rng(4), {**PX4_PARAMETERS, **changed}
+    commands, wanted, thrusts, rates = [], [], [], []
+    for k in range(400):
+        if k % 5 == 0:
+            sticks = np.float32(rng.uniform(-1, 1, 4)) * (rng.random(4) < 0.8)
+            commands.append(f"sticks 1 {text(*sticks)}")
+        rates.append(np.float32(rng.normal(size=3)))
+        commands += [heading(rng.uniform(-3, 3)), f"gyro 4000 {text(*rates[-1])}"]
+        roll, pitch, yaw, throttle = sticks.astype(float)
+        curve = p["MC_ACRO_EXPO"], p["MC_ACRO_SUPEXPO"]
+        unit = [super_expo(roll, *curve), super_expo(-pitch, *curve)]
+        unit += [super_expo(yaw, p["MC_ACRO_EXPO_Y"], p["MC_ACRO_SUPEXPOY"])]
+        wanted.append(np.radians([p["MC_ACRO_R_MAX"], p["MC_ACRO_P_MAX"], p["MC_ACRO_Y_MAX"]]) * unit)
+        thrusts.append((throttle + 1) / 2)
+    off = {**changed, "MC_YAW_TQ_CUTOFF": 0.0}
+    out = drive(program, [*parameters(off), *START, BY_RATE_STICKS, STEP, *commands]).out
+    assert len(out) == 400
+    np.testing.assert_allclose(out["rates"], wanted, rtol=2e-6, atol=2e-6)
+    np.testing.assert_allclose(-out["thrust"][:, 2], thrusts, atol=1e-6)
+    assert_flown(gains, out, rates)
+
+
+def off_board(program, *commands):
+    hold = [*START, f"mode 1 0 1 1 {HOLD}", LEVEL_SETPOINT, STEP, TILTED, *[STEP] * 9]
+    return drive(program, [*parameters({"MC_YAW_TQ_CUTOFF": 0.0}), *hold, BY_RATES, *commands])
+
+
+def test_off_board_rates_are_flown_with_their_thrust(program, gains):
+    rng, commands, rates, wanted = np.random.default_rng(6), [], [], []
+    for k in range(200):
+        if k % 4 == 0:
+            wanted.append(np.float32(rng.normal(size=3)))
+            commands.append(f"rates_setpoint {text(*wanted[-1], 0.1, -0.2, -0.3)}")
+        rates.append(np.float32(rng.normal(size=3)))
+        commands.append(f"gyro 4000 {text(*rates[-1])}")
+    out = off_board(program, *commands).out[9:]
+    assert len(out) == 200
+    # It does not publish its own: the topic keeps the other program's.
+    np.testing.assert_array_equal(out["rates"], np.repeat(wanted, 4, axis=0))
+    assert (out["thrust"] == np.float32([0.1, -0.2, -0.3])).all()
+    inputs = rate_inputs(out, rates, out["rates"])
+    before = NativeController(load_native(gains), gains)
+    level = np.zeros(10, INPUT)
+    level["attitude"][:, 0] = level["attitude_setpoint"][:, 0] = 1
+    level["armed"][1:] = 1
+    level["attitude_setpoint"][1:] = np.float32([0.995, 0.0998749, 0, 0])
+    before.run(level)
+    assert out["torque"].tobytes() == np.ascontiguousarray(before.run(inputs)["moment"]).tobytes()
+
+
+def test_its_own_last_rate_setpoint_is_not_taken_for_an_off_board_one(program):
+    wanted = off_board(program).out["rates"][-1]
+    assert wanted[0] > 1
+    torque = off_board(program, *[STEP] * 60).out["torque"][9:, 0]
+    assert (torque[:25] > 0.1).all()  # held for 25 samples, as an invalid setpoint is
+    assert (torque[25:] == 0).all()  # the vehicle is at rest: nothing to damp
+    arrived = off_board(program, *[STEP] * 60, "rates_setpoint 0 1 0 0 0 -0.4", STEP)
+    assert arrived.out["torque"][-1, 1] > 0.1
+    assert arrived.out["thrust"][-1, 2] == np.float32(-0.4)
+
+
+def test_an_off_board_rate_that_is_nan_is_not_controlled(program):
+    commands = ["rates_setpoint nan 0.5 nan nan nan -0.4", "gyro 4000 0.7 0.1 -0.3"]
+    out = off_board(program, *commands).out[-1]
+    assert np.isfinite(out["torque"]).all()
+    plain = off_board(program, "rates_setpoint 0.7 0.5 -0.3 0 0 -0.4", commands[1]).out[-1]
+    assert out["torque"].tobytes() == plain["torque"].tobytes()
+    assert out["thrust"].tolist() == plain["thrust"].tolist()
+
+
+def test_the_attitude_is_flown_again_after_a_rate_mode(program):
+    back = [f"mode 1 0 1 1 {HOLD}", TILTED, STEP]
+    result = off_board(program, "rates_setpoint 0 0 0 0 0 -0.5", *[STEP] * 50, *back)
+    np.testing.assert_allclose(result.out["rates"][-1], result.out["rates"][8], atol=1e-6)
 
 
 # Torque and thrust after the controller.

@@ -33,7 +33,20 @@ def quaternion(roll, pitch, yaw):
 
 def native_outputs(gains, inputs):
     """Outputs of a controller that has run at rest before, as the module does while PX4's own controllers fly."""
-    return NativeController(load_native(gains), gains).run(np.concatenate([np.zeros(1, INPUT), inputs]))[1:]
+    return NativeController(load_native(gains), gains).run(np.concatenate([AT_REST, inputs]))[1:]
+
+
+def level_inputs(count, **values):
+    """Armed rows at the attitude and the setpoint of `AIRBORNE`."""
+    inputs = np.zeros(count, INPUT)
+    inputs["attitude"][:, 0] = inputs["attitude_setpoint"][:, 0] = inputs["armed"] = 1
+    for name, value in values.items():
+        inputs[name] = value
+    return inputs
+
+
+#: While PX4's own controllers fly.
+AT_REST = level_inputs(1, armed=0)
 
 
 def assert_same_bits(got, expected):
@@ -70,39 +83,20 @@ def test_a_random_flight_gives_the_same_bits_as_the_native_library(program, flow
             row["landed"] = landed or maybe
         row["rates"] = rng.normal(size=3) * 1.5
         commands.append(f"gyro 4000 {text(*row['rates'])}")
-        rows.append((row.copy(), np.float32(move), np.isnan(wanted_q[0])))
+        rows.append(row.copy())
     out = drive(program, commands).out
     assert len(out) == 1500
-    inputs = np.array([r for r, _, _ in rows], INPUT)
-    inputs["attitude"], inputs["attitude_setpoint"] = out["angles"], out["wanted"]
-    for k, (_, rate, _) in enumerate(rows):
-        offset = np.float32(0) if np.isnan(rate) else np.clip(rate / np.float32(gains.yaw.Kp_o), -1.5, 1.5)
-        inputs["attitude_setpoint"][k, 2] += np.float32(offset)
+    inputs = np.array(rows, INPUT)
+    inputs["attitude"], inputs["attitude_setpoint"] = out["attitude"], out["q_d"]
+    inputs["yaw_rate_setpoint"] = out["yaw_rate"][:, 0]
     expected = native_outputs(gains, inputs)
     assert_same_bits(out["torque"], expected["moment"])
     assert_same_bits(out["rates"], expected["rates_setpoint"])
     # Saturation, invalid setpoints and unallocated torque occur.
     assert (np.abs(expected["moment"]) >= [1.0, 0.9, 0.8]).any(axis=1).sum() > 20
-    assert np.isnan(out["wanted"]).any(axis=1).sum() > 20
+    assert np.isnan(out["q_d"]).any(axis=1).sum() > 20
     assert np.isfinite(out["torque"]).all()
     assert len(np.unique(inputs["saturation"], axis=0)) > 20
-
-
-def test_the_angles_match_the_quaternions(program):
-    rng = np.random.default_rng(3)
-    commands, expected = list(AIRBORNE), []
-    for _ in range(200):
-        vehicle, wanted = rng.uniform([-2, -1.4, -3], [2, 1.4, 3]), rng.uniform([-1, -1, -3], [1, 1, 3])
-        commands += [f"attitude {text(*quaternion(*vehicle))} 0 1 0 0 0"]
-        commands += [f"setpoint {text(*quaternion(*wanted), 0, 0, 0, -0.5)}", STEP]
-        expected.append((vehicle, wanted))
-    out = drive(program, commands).out
-    for row, (vehicle, wanted) in zip(out, expected[1:], strict=True):
-        np.testing.assert_allclose(row["angles"], vehicle, atol=2e-6)
-        assert row["wanted"][2] == pytest.approx(wanted[2], abs=2e-6)
-        # The thrust axis is the setpoint's, at the vehicle's own heading.
-        axis = Rotation.from_euler("ZYX", [vehicle[2], row["wanted"][1], row["wanted"][0]]).apply([0, 0, 1])
-        np.testing.assert_allclose(axis, Rotation.from_euler("ZYX", wanted[::-1]).apply([0, 0, 1]), atol=2e-6)
 
 
 def test_fields_that_are_nan_leave_the_output_finite(program):
@@ -172,13 +166,12 @@ def test_new_gains_take_effect_within_a_second_without_a_jump(program, gains):
         rates.append(rng.normal(size=3) * 0.05)
         commands.append(f"gyro 4000 {text(*rates[-1])}")
     out = drive(program, commands).out
-    inputs = np.zeros(400, INPUT)
-    inputs["rates"], inputs["armed"] = rates, 1
+    inputs = level_inputs(400, rates=rates)
     unchanged = native_outputs(gains, inputs)["moment"]
     change = int(np.flatnonzero((unchanged != out["torque"]).any(axis=1))[0])
     assert 100 <= change <= 350
     controller = NativeController(load_native(gains), gains)
-    controller.run(np.zeros(1, INPUT))
+    controller.run(AT_REST)
     before = controller.run(inputs[:change])
     controller.set_gains(changed)
     assert_same_bits(out["torque"], np.concatenate([before, controller.run(inputs[change:])])["moment"])
@@ -187,8 +180,7 @@ def test_new_gains_take_effect_within_a_second_without_a_jump(program, gains):
 def test_gains_out_of_range_are_refused_by_name_and_the_old_ones_stay(program, gains):
     wrong = ["param MIMO_RP_RR 99", "param MIMO_RP_PP 0.2"]
     result = drive(program, [*AIRBORNE, STEP, *wrong, *["gyro 4000 0.1 0.1 0.1"] * 300])
-    inputs = np.zeros(300, INPUT)
-    inputs["rates"], inputs["armed"] = 0.1, 1
+    inputs = level_inputs(300, rates=0.1)
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
     assert any("MIMO_RP_RR is out of its range" in line for line in result.log)
 
@@ -237,10 +229,32 @@ def test_the_excitation_runs_once_on_roll_then_pitch_and_is_published(program, g
     assert set(np.abs(y[pitch])) == {amplitude} and not y[np.setdiff1d(np.arange(len(y)), pitch)].any()
     assert set(code) == {-1, 0, 1, 2}
     assert "finished" in last_end(result)
+    # The topic speaks from the request, within a second before the start, to the first sample without.
+    told = np.flatnonzero(result.announced)
+    assert np.ptp(told) + 1 == len(told) and told[-1] == pitch[-1] + 1
+    assert roll[0] - 250 <= told[0] < roll[0] or roll[0] == told[0]
     # The core gets the same excitation.
-    inputs = np.zeros(len(x), INPUT)
-    inputs["excitation"], inputs["armed"] = np.column_stack([x, y, 0 * x]), 1
+    inputs = level_inputs(len(x), excitation=np.column_stack([x, y, 0 * x]))
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
+
+
+def test_the_parts_of_the_torque_are_published_fifty_times_a_second(program):
+    gains = coupled_gains()
+    elements = [f"param MIMO_{code} {text(value)}" for code, value in gains.elements().items() if code != "TS"]
+    tilted = f"setpoint {text(*quaternion(0.1, -0.2, 0.3), 0, 0, 0, -0.5)}"
+    rng = np.random.default_rng(5)
+    turning = [f"gyro 4000 {text(*(rng.normal(size=3) * 0.3))}" for _ in range(500)]
+    result = drive(program, [*elements, "param MC_YAW_TQ_CUTOFF 0", *AIRBORNE, tilted, STEP, *turning])
+    lines = [line.split()[1:] for line in result.other if line.startswith("MIMO_PID")]
+    parts = np.array([[int(word, 16) for word in words] for words in lines], np.uint32).view(np.float32)
+    parts = parts.reshape(-1, 5, 3)  # proportional, integral, derivative, feed-forward, cross-axis
+    assert len(parts) == 100
+    torque = result.out["torque"][4::5]
+    free = np.abs(torque) < [1.0, 0.9, 0.8]
+    assert free.mean() > 0.9
+    np.testing.assert_allclose(parts.sum(axis=1)[free], torque[free], atol=2e-6)
+    np.testing.assert_allclose(parts[:, 1], result.out["integral"][4::5])
+    assert (np.abs(parts[:, [0, 1, 2, 4], :2]).max(axis=0) > 1e-3).all() and not parts[:, 4, 2].any()
 
 
 @pytest.mark.parametrize(("axis", "column"), [(1, 0), (2, 1)])
@@ -327,6 +341,5 @@ def test_other_gains_use_their_own_values_and_period(gains, tmp_path):
     other = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, Ts=0.002), moment_scale=None)
     program = build(other, "crtp", tmp_path)
     start = ["gyro_interval 2000", *AIRBORNE, "gyro 2000 0 0 0", *["gyro 2000 0.1 -0.2 0.3"] * 20]
-    inputs = np.zeros(20, INPUT)
-    inputs["rates"], inputs["armed"] = [0.1, -0.2, 0.3], 1
+    inputs = level_inputs(20, rates=[0.1, -0.2, 0.3])
     assert_same_bits(drive(program, start).out["torque"], native_outputs(other, inputs)["moment"])

@@ -9,7 +9,6 @@
 
 #include <px4_platform_common/param.h>
 
-#include "attitude.hpp"
 #include "excitation.hpp"
 #include "mc_mimo_pid.hpp"
 #include "topics.hpp"
@@ -73,20 +72,19 @@ void words(const float *values, int count)
 	}
 }
 
-// torque, rate setpoint, integral, excitation, thrust; then the angles from the module's own functions.
+// torque, rate setpoint, integral, excitation, thrust; then the last attitude and attitude setpoint, of whoever.
 void print_published()
 {
 	const auto torque = last<vehicle_torque_setpoint_s>(ORB_ID(vehicle_torque_setpoint));
 	const auto rates = last<vehicle_rates_setpoint_s>(ORB_ID(vehicle_rates_setpoint));
 	const auto status = last<rate_ctrl_status_s>(ORB_ID(rate_ctrl_status));
-	const auto excitation = last<debug_vect_s>(ORB_ID(debug_vect));
+	auto excitation = last<debug_vect_s>(ORB_ID(debug_vect));
+
+	if (excitation.timestamp != now) { excitation = {0, 0.0F, 0.0F, -1.0F, "silent"}; }
+
 	const auto thrust = last<vehicle_thrust_setpoint_s>(ORB_ID(vehicle_thrust_setpoint));
 	const auto attitude = last<vehicle_attitude_s>(ORB_ID(vehicle_attitude));
 	const auto setpoint = last<vehicle_attitude_setpoint_s>(ORB_ID(vehicle_attitude_setpoint));
-	float angles[3];
-	float wanted[3];
-	mimopilot::angles(attitude.q, angles);
-	mimopilot::setpoint_angles(setpoint.q_d, angles[2], wanted);
 	printf("out %llu", static_cast<unsigned long long>(torque.timestamp_sample));
 	words(torque.xyz, 3);
 	words(&rates.roll, 1);
@@ -99,11 +97,17 @@ void print_published()
 	words(&excitation.y, 1);
 	words(&excitation.z, 1);
 	words(thrust.xyz, 3);
-	words(angles, 3);
-	words(wanted, 3);
+	words(attitude.q, 4);
 	words(setpoint.q_d, 4);
 	words(&setpoint.yaw_sp_move_rate, 1);
 	printf(" %s\n", excitation.name);
+	const auto parts = last<debug_array_s>(ORB_ID(debug_array));
+
+	if (parts.timestamp == now) {
+		printf("%s", parts.name);
+		words(parts.data, 15);
+		printf("\n");
+	}
 }
 
 void module(const char *command)
@@ -283,6 +287,15 @@ void execute(Line &line)
 		setpoint.yaw_sp_move_rate = line.number();
 		line.numbers(setpoint.thrust_body);
 		publish(ORB_ID(vehicle_attitude_setpoint), setpoint);
+
+	} else if (command == "rates_setpoint") {
+		vehicle_rates_setpoint_s setpoint{};
+		setpoint.timestamp = now + 1;  // later than what the module published at `now`
+		setpoint.roll = line.number();
+		setpoint.pitch = line.number();
+		setpoint.yaw = line.number();
+		line.numbers(setpoint.thrust_body);
+		publish(ORB_ID(vehicle_rates_setpoint), setpoint);
 
 	} else if (command == "attitude") {
 		vehicle_attitude_s attitude{};

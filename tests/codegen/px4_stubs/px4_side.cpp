@@ -20,6 +20,7 @@ DEFINE_TOPIC(arming_check_reply);
 DEFINE_TOPIC(arming_check_request);
 DEFINE_TOPIC(battery_status);
 DEFINE_TOPIC(control_allocator_status);
+DEFINE_TOPIC(debug_array);
 DEFINE_TOPIC(debug_vect);
 DEFINE_TOPIC(hover_thrust_estimate);
 DEFINE_TOPIC(manual_control_setpoint);

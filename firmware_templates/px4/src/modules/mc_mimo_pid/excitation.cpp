@@ -113,9 +113,7 @@ Excitation::End Excitation::fault(const ExcitationConditions &conditions) const
 {
 	if (!conditions.ready) { return End::NotReady; }
 
-	for (const float angle : conditions.attitude) {
-		if (!between(angle, -_settings.tilt_max, _settings.tilt_max)) { return End::Tilt; }
-	}
+	if (!between(conditions.tilt, 0.0F, _settings.tilt_max)) { return End::Tilt; }
 
 	for (int i = 0; i < 4; i++) {
 		if (!between(conditions.sticks[i] - _sticks[i], -kStickMove, kStickMove)) { return End::Sticks; }

@@ -31,12 +31,12 @@ struct ExcitationSettings {
 	int32_t duration;   // samples on each axis
 	int32_t pause;      // samples between the axes
 	int32_t seed;
-	float tilt_max;     // rad, on roll and pitch
+	float tilt_max;     // rad
 };
 
 struct ExcitationConditions {
 	bool ready;             // armed, in the air, in the chosen mode, measurements valid
-	float attitude[2];      // rad, roll and pitch
+	float tilt;             // rad
 	float sticks[4];        // -1 to 1; all 0 without a remote control
 };
 

@@ -10,11 +10,6 @@ namespace mimopilot {
 // The longest age of a measurement, us: as long as the controller holds an invalid value.
 constexpr uint64_t kHoldTime = static_cast<uint64_t>(1.0e6F * kHoldSamples * kGains.period);
 
-// Bits of Output::fault.
-constexpr int32_t kSetpointFault = 1;
-constexpr int32_t kAttitudeFault = 2;
-constexpr int32_t kRatesFault = 0x1c;
-
 // Whether a value from `timestamp`, us, is older than `longest`.
 inline bool silent(uint64_t now, uint64_t timestamp, uint64_t longest) { return now > timestamp + longest; }
 
