@@ -44,6 +44,10 @@ def by_sticks(program, *commands, **changed):
     return drive(program, [*prepared, *commands]).out[-count:]
 
 
+def wrap(angle):
+    return np.mod(angle + np.pi, 2 * np.pi) - np.pi
+
+
 def expo(x, share):
     return (1 - share) * x + share * x**3
 
@@ -56,6 +60,9 @@ class Stock:
         self.tilt = np.zeros(2)
         self.rate = 0.0
         self.held = None
+        self.mean_error = None
+        self.error_reference = self.correction = 0.0
+        self.converging = False
         self.minimum = self.maximum = 0.0
         self.hover = self.p["MPC_THR_HOVER"]
         self.estimate = None
@@ -81,18 +88,35 @@ class Stock:
         middle = {1: np.mean(ends), 2: self.p["MPC_THR_HOVER"]}.get(curve, self.hover)
         return min(np.interp(throttle, [-1, 0, 1], [ends[0], middle, ends[1]]), self.maximum)
 
-    def setpoint(self, roll, pitch, yaw, throttle, psi, good):
+    def converge(self, psi, unaided):
+        before, self.correction = self.correction, 0.0
+        if not np.isnan(unaided):
+            error = wrap(psi - unaided)
+            mean = error if self.mean_error is None else self.mean_error
+            self.mean_error = mean + PERIOD / (1 + PERIOD) * (error - mean)
+            was, self.converging = self.converging, abs(wrap(error - mean)) > np.radians(1)
+            if not self.converging:
+                self.error_reference = error
+                if was:
+                    self.held = None
+            self.correction = wrap(error - self.error_reference)
+        return self.correction - before
+
+    def setpoint(self, roll, pitch, yaw, throttle, psi, good, unaided):
         """q_d as a Rotation, and the yaw rate."""
         zone = self.p["MPC_HOLD_DZ"]
         stick = np.sign(yaw) * max(abs(yaw) - zone, 0) / (1 - zone)
         target = np.radians(self.p["MPC_MAN_Y_MAX"]) * expo(stick, self.p["MPC_YAW_EXPO"])
         if (throttle < -0.9 and self.p["MC_AIRMODE"] != 2) or not good:
             self.held = None
+        change = self.converge(psi, unaided)
         self.rate += self.alpha("MPC_MAN_Y_TAU") * (target - self.rate)
         if abs(self.rate) > np.finfo(np.float32).eps:
             self.held = None
         elif self.held is None:
             self.held = psi
+        else:
+            self.held += change
         most = np.radians(self.p["MPC_MAN_TILT_MAX"])
         self.tilt = self.tilt + self.alpha("MC_MAN_TILT_TAU") * (most * np.array([roll, -pitch]) - self.tilt)
         vector = self.tilt * min(1, most / max(np.linalg.norm(self.tilt), 1e-12))
@@ -112,36 +136,39 @@ class Stock:
 def test_a_random_flight_in_stabilized_mode_is_as_with_px4s_controller(program, changed):
     rng, stock = np.random.default_rng(11), Stock(**changed)
     commands = [*parameters(changed), "gyro 0 0 0 0", "start", LEVEL, BY_STICKS]
-    expected, sticks, psi, landed, good = [], np.zeros(4), 0.0, True, True
-    for k in range(3000):
-        if k % 100 == 0:
-            sticks = np.float32(rng.uniform(-1, 1, 4)) * (rng.random(4) < 0.7)
-            sticks[3] = rng.choice([sticks[3], -1.0, 1.0])
+    expected, sticks, psi, landed, good, unaided, converging = [], np.zeros(4), 0.0, True, True, np.nan, 0
+    for k in range(6000):
+        if k % 250 == 0:
+            sticks = np.float32(rng.uniform(-1, 1, 4)) * (rng.random(4) < [0.7, 0.7, 0.2, 0.7])
+            sticks[3] = rng.choice([sticks[3], sticks[3], -1.0, 1.0])
             commands.append(f"sticks 1 {text(*sticks)}")
         if k % 10 == 0:
-            psi = np.mod(psi + rng.normal() * 0.05 + np.pi, 2 * np.pi) - np.pi
+            psi = wrap(psi + rng.normal() * 0.01)
             commands.append(heading(psi))
         if k % 250 == 0:
             landed = k < 500 or rng.random() < 0.2
             commands.append(f"land {int(landed)} 1")  # "maybe landed" does not matter
         if k % 70 == 0:
             good = rng.random() < 0.9
-            commands.append(f"heading {int(good)}")
+            unaided = np.nan if k < 700 or rng.random() < 0.1 else wrap(psi + 3 + rng.normal() * 0.1)
+            commands.append(f"heading {int(good)} {text(unaided)}")
         if k > 1200 and k % 90 == 0:
             valid, hover = rng.random() < 0.7, rng.uniform(0, 1)
             commands.append(f"hover {int(valid)} {text(hover)}")
             stock.hover_message(valid, hover)
         commands.append(STEP)
+        converging += stock.converging and stock.held is not None
         stock.ramps(landed, (k + 1) * PERIOD > stock.p["COM_SPOOLUP_TIME"] + 1e-9)
-        expected.append((*stock.setpoint(*sticks, psi, good), stock.thrust(sticks[3])))
+        expected.append((*stock.setpoint(*sticks, psi, good, unaided), stock.thrust(sticks[3])))
     out = drive(program, commands).out[1:]  # it takes over with the second sample, and publishes with the third
     expected = expected[-len(out) :]
-    assert len(out) == 2998
+    assert len(out) == 5998
     turn = Rotation.from_quat(np.roll(out["q_d"], -1, axis=1)) * Rotation.concatenate([q for q, _, _ in expected]).inv()
-    assert turn.magnitude().max() < 3e-6  # rad, single precision
+    assert turn.magnitude().max() < 5e-6  # rad, single precision
     np.testing.assert_allclose(out["yaw_rate"][:, 0], [rate for _, rate, _ in expected], atol=2e-6)
     np.testing.assert_allclose(-out["thrust"][:, 2], [thrust for _, _, thrust in expected], atol=2e-5)
     assert (out["thrust"][:, :2] == 0).all()
+    assert converging > 100
 
 
 def test_the_thrust_is_ramped_from_zero_after_the_spool_up_time(program):

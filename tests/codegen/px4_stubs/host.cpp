@@ -247,6 +247,7 @@ void execute(Line &line)
 	} else if (command == "heading") {
 		vehicle_local_position_s position{};
 		position.heading_good_for_control = line.flag();
+		position.unaided_heading = line.number();
 		publish(ORB_ID(vehicle_local_position), position);
 
 	} else if (command == "battery") {

@@ -8,6 +8,11 @@ namespace mimopilot {
 namespace {
 
 constexpr float kRadian = 0.017453293F;  // rad/deg
+constexpr float kTurn = 6.2831853F;      // rad
+
+// As in PX4: the heading converges while its error differs from its mean over about a second by more than a degree.
+constexpr float kErrorTime = 1.0F;  // s
+constexpr float kErrorChange = kRadian;
 
 float limit(float value, float low, float high) { return value >= low ? (value <= high ? value : high) : low; }
 
@@ -36,11 +41,50 @@ void filter(float &state, float value, float time_constant, float period)
 	state += period / (fmaxf(time_constant, 0.0F) + period) * (value - state);
 }
 
+float wrap(float angle) { return angle - kTurn * floorf(angle / kTurn + 0.5F); }
+
 }  // namespace
 
-StickSetpoint Sticks::setpoint(const StockSettings &settings, const StickInput &input, float heading, bool good,
+void Sticks::shift(float angle)
+{
+	_heading += angle;
+	_filtered += angle;
+	_reference += angle;
+}
+
+// How far the held heading moves. Forgets it when the estimate has converged.
+float Sticks::converge(const VehicleHeading &vehicle, float period)
+{
+	float correction = 0.0F;
+
+	if (fabsf(vehicle.unaided) <= kTurn) {
+		const float error = wrap(vehicle.angle - vehicle.unaided);
+
+		if (!_started) { _filtered = error; }
+
+		_started = true;
+		const bool converging = fabsf(wrap(error - _filtered)) > kErrorChange;
+		filter(_filtered, error, kErrorTime, period);
+
+		if (!converging) {
+			_reference = error;
+
+			if (_converging) { _holding = false; }
+		}
+
+		_converging = converging;
+		correction = wrap(error - _reference);
+	}
+
+	const float change = correction - _correction;
+	_correction = correction;
+	return change;
+}
+
+StickSetpoint Sticks::setpoint(const StockSettings &settings, const StickInput &input, const VehicleHeading &vehicle,
 			       float period)
 {
+	const float change = converge(vehicle, period);
 	const float yaw = expo(deadzone(stick(input.yaw), settings.yaw_deadzone), settings.yaw_expo);
 	filter(_yaw_rate, kRadian * settings.yaw_rate_max * yaw, settings.yaw_time_constant, period);
 
@@ -48,8 +92,7 @@ StickSetpoint Sticks::setpoint(const StockSettings &settings, const StickInput &
 	const bool gesture = throttle(input) < -0.9F && settings.airmode < 1.5F;
 	const bool turning = fabsf(_yaw_rate) > FLT_EPSILON;
 
-	if (turning || gesture || !good || !_holding) { _heading = heading; }
-
+	_heading = turning || gesture || !vehicle.good || !_holding ? vehicle.angle : _heading + change;
 	_holding = !turning;
 
 	// The stick vector's direction is the direction of tilt, its length the tilt angle.

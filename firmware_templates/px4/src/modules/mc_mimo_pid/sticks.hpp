@@ -17,24 +17,40 @@ struct StickSetpoint {
 	float yaw_rate;  // rad/s
 };
 
+struct VehicleHeading {
+	float angle;    // rad
+	bool good;      // for control
+	float unaided;  // rad, from the gyros alone, with an unknown offset; NaN: none
+};
+
 class Sticks
 {
 public:
-	// The next setpoint() starts level, without yaw rate, at the heading it is given.
+	// The next setpoint() starts level, without yaw rate, at the vehicle's heading.
 	void release() { *this = Sticks{}; }
 
 	// The estimator reset its heading by this, rad.
-	void shift(float angle) { _heading += angle; }
+	void shift(float angle);
 
-	// One period. `heading` is the vehicle's, rad. The setpoint's follows it while turning, at the bottom of the
-	// throttle, or if it is not `good`; else it is held.
-	StickSetpoint setpoint(const StockSettings &settings, const StickInput &input, float heading, bool good, float period);
+	// One period. The setpoint's heading follows the vehicle's while turning, at the bottom of the throttle, or if it
+	// is not good; else it is held. While the estimate converges, the held one moves with it.
+	StickSetpoint setpoint(const StockSettings &settings, const StickInput &input, const VehicleHeading &vehicle,
+			       float period);
 
 private:
+	float converge(const VehicleHeading &vehicle, float period);
+
 	bool _holding{false};
 	float _heading{0.0F};
 	float _yaw_rate{0.0F};  // rad/s, filtered
 	float _tilt[2] {};      // rad about roll and pitch, filtered
+
+	// The error of the heading, against the unaided one.
+	bool _started{false};
+	bool _converging{false};
+	float _filtered{0.0F};
+	float _reference{0.0F};
+	float _correction{0.0F};
 };
 
 // Acro: rate setpoint, rad/s.

@@ -111,7 +111,6 @@ private:
 	manual_control_setpoint_s _manual{};
 	bool _landed{true};     // assumed until known, to be safe
 	bool _on_ground{true};  // landed or maybe landed
-	bool _heading_good{true};
 
 	mimopilot::Parameters _parameters{};
 	mimopilot::StockSettings _settings{};
@@ -119,6 +118,7 @@ private:
 	mimopilot::HandOver _hand_over{};
 	mimopilot::ArmingCheck _arming_check{};
 	mimopilot::Sticks _sticks{};
+	mimopilot::VehicleHeading _heading{0.0F, true, NAN};
 	mimopilot::Throttle _throttle{};
 	mimopilot::Actuation _actuation{};
 	mimopilot::Excitation _excitation{};
@@ -126,7 +126,6 @@ private:
 	mimopilot::Input _input{};
 	mimopilot::Output _output{};
 	float _thrust[3] {};  // body FRD, -1 to 1
-	float _heading{0.0F};  // rad, the last valid one
 	hrt_abstime _setpoint_time{0};
 	hrt_abstime _rates_published{0};
 	uint8_t _quat_reset_counter{0};

@@ -285,7 +285,10 @@ void McMimoPid::update_stock_inputs()
 
 	vehicle_local_position_s position;
 
-	if (_vehicle_local_position_sub.update(&position)) { _heading_good = position.heading_good_for_control; }
+	if (_vehicle_local_position_sub.update(&position)) {
+		_heading.good = position.heading_good_for_control;
+		_heading.unaided = position.unaided_heading;
+	}
 
 	battery_status_s battery;
 
@@ -314,7 +317,7 @@ void McMimoPid::update_attitude()
 	memcpy(_input.attitude, attitude.q, sizeof(_input.attitude));
 	const float angle = heading(attitude.q);
 
-	if (PX4_ISFINITE(angle)) { _heading = angle; }
+	if (PX4_ISFINITE(angle)) { _heading.angle = angle; }
 }
 
 bool McMimoPid::flown_by_sticks() const
@@ -391,7 +394,7 @@ void McMimoPid::set_thrust(const float (&thrust)[3])
 void McMimoPid::make_setpoint_from_sticks()
 {
 	const StickInput input{_manual.roll, _manual.pitch, _manual.yaw, _manual.throttle};
-	const StickSetpoint sticks = _sticks.setpoint(_settings, input, _heading, _heading_good, kGains.period);
+	const StickSetpoint sticks = _sticks.setpoint(_settings, input, _heading, kGains.period);
 	const float thrust[3] = {0.0F, 0.0F, -_throttle.thrust(_settings, _manual.throttle)};
 	memcpy(_input.attitude_setpoint, sticks.q_d, sizeof(_input.attitude_setpoint));
 	_input.yaw_rate_setpoint = sticks.yaw_rate;
