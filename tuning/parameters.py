@@ -134,7 +134,7 @@ ROWS: tuple[Row, ...] = (
         unit="norm",
         minimum=0.01,
         maximum=1.0,
-        description="yaw error in the attitude error, 1: as roll and pitch; no effect on the yaw gain",
+        description="weight of the yaw error beside roll and pitch; yaw gain unchanged",
         comment="weight of the yaw error against roll and pitch",
         default=YAW_WEIGHT,
         valid=Valid(0.0, 1.0, lowest_included=False),
