@@ -61,13 +61,13 @@ STATE = np.dtype(
         ("yaw_rate_setpoint", "<f4"),
         ("attitude", "<f4", 4),
         ("rates", "<f4", 3),
-        ("rates_setpoint", "<f4", 3),
-        ("acceleration", "<f4", 2),
         ("age", "<i4", 5),
         ("missing", "<i4"),
         ("rate_mode", "<i4"),
         ("slewing", "<i4"),
         ("fault_count", "<u4"),
+        ("rates_setpoint", "<f4", 3),
+        ("acceleration", "<f4", 2),
         ("model", MODEL),
     ]
 )

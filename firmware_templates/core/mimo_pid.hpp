@@ -78,6 +78,13 @@ struct Model {
 	int32_t running;                 // 0: starts at the measured attitude
 };
 
+// What is flown in this period.
+struct Flown {
+	float rates[kAxes];              // r_i
+	float acceleration[kModelAxes];  // of the attitude model, in body axes
+	Model model;
+};
+
 struct State {
 	Gains gains;
 	float integral[kAxes];
@@ -86,14 +93,12 @@ struct State {
 	float yaw_rate_setpoint;
 	float attitude[4];           // last valid inputs
 	float rates[kAxes];
-	float rates_setpoint[kAxes];      // r_i
-	float acceleration[kModelAxes];  // of the attitude model, in body axes
 	int32_t age[kInputs];    // samples since the last valid one: setpoint, attitude, rates
 	int32_t missing;         // fault bits of the last sample
 	int32_t rate_mode;
 	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
 	uint32_t fault_count;
-	Model model;
+	Flown flown;
 };
 
 // Resets the controller. Returns false if the gains are refused; the torque then stays 0.
