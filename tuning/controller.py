@@ -355,12 +355,11 @@ class Controller:
             return self._damp_rates(lost, fault, armed)
 
         u_bar = [self._optional(v, MAX_EXCITATION) for v in u_bar]
+        if self.age[0] == 0 and (rate_mode or self.age[1] == 0):
+            self.model = self._advanced_model()
+            self.rates_setpoint, self.acceleration = self._rates_setpoint(self.model)
         if not armed:
             self.model, self.acceleration = None, [f(0)] * 2
-        if self.age[0] == 0 and (rate_mode or self.age[1] == 0):
-            model = self._advanced_model()
-            self.model = model if armed else None
-            self.rates_setpoint, self.acceleration = self._rates_setpoint(model)
         r = self.rates_setpoint
         rest = [a + b for a, b in zip(self._rest(r, self.acceleration), u_bar, strict=True)]
         u = []

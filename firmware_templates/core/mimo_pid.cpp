@@ -125,6 +125,7 @@ struct Quaternion {
 		direction[1] = scale * (y * w + x * z);
 	}
 
+	model.running = 1;
 	const float stiffness = gains.model_omega * gains.model_omega;
 	const float friction = (2.0F * gains.model_damping) * gains.model_omega;
 
@@ -536,6 +537,9 @@ void step(State &state, const Input &input, Output &output)
 {
 	const int32_t failed = accept_inputs(state, input);
 
+	// A setpoint or attitude that is missing now holds the rate setpoint.
+	if ((state.missing & (kSetpointFault | kAttitudeFault)) == 0) { update_rates_setpoint(state); }
+
 	if (unlikely(input.armed == 0)) {
 		for (float &integral : state.integral) { integral = 0.0F; }
 
@@ -546,12 +550,6 @@ void step(State &state, const Input &input, Output &output)
 		damp_rates(state, failed, output.moment);
 
 	} else {
-		// A setpoint or attitude that is missing now holds the rate setpoint.
-		if ((state.missing & (kSetpointFault | kAttitudeFault)) == 0) {
-			update_rates_setpoint(state);
-			state.flown.model.running = input.rate_mode != 0 ? 0 : input.armed;
-		}
-
 		inner_loop(state, input, output.moment);
 	}
 
