@@ -93,7 +93,7 @@ struct Quaternion {
 [[gnu::always_inline]] inline bool follows(const Gains &gains) { return !within(gains.model_omega, 0.0F); }
 
 // One period of the attitude model, semi-implicit Euler. Returns the setpoint's heading, then the model's tilt.
-[[gnu::noinline]] Quaternion advance(State &state)
+[[gnu::always_inline]] inline Quaternion advance(State &state)
 {
 	// Cosine and sine of half the heading.
 	const Gains &gains = state.gains;
@@ -129,6 +129,7 @@ struct Quaternion {
 	const float stiffness = gains.model_omega * gains.model_omega;
 	const float friction = (2.0F * gains.model_damping) * gains.model_omega;
 
+#pragma GCC unroll 2
 	for (int j = 0; j < kModelAxes; j++) {
 		float rate = 0.0F;
 		float acceleration = 0.0F;
@@ -158,10 +159,15 @@ struct Quaternion {
 }
 
 // Attitude controller: the flown rate setpoint, and the acceleration of the attitude model in body axes.
-[[gnu::noinline]] void outer_loop(State &state, Quaternion target)
+// In rate mode, r_i is given.
+[[gnu::noinline]] void outer_loop(State &state)
 {
+	if (unlikely(state.rate_mode != 0)) { return; }
+
 	// conj(q) target: the rotation from q to the target, in the axes of q.
 	const Gains &gains = state.gains;
+	const bool following = follows(gains);
+	const Quaternion target = unlikely(following) ? advance(state) : load(state.attitude_setpoint);
 	const Quaternion q = load(state.attitude);
 	float w = ((q.w * target.w + q.x * target.x) + q.y * target.y) + q.z * target.z;
 	float x = ((q.w * target.x - q.x * target.w) - q.y * target.z) + q.z * target.y;
@@ -200,7 +206,7 @@ struct Quaternion {
 	float pitch_rate = row(gains.kp_o[1], roll, pitch) + yaw_rate * (q.y * q.z + q.w * q.x);
 	const float turn_rate = gains.yaw_kp_o * yaw + yaw_rate * (0.5F - (q.x * q.x + q.y * q.y));
 
-	if (follows(gains)) {
+	if (unlikely(following)) {
 		const Model &model = state.flown.model;
 		float turn_cosine = 1.0F;
 		float turn_sine = 0.0F;
@@ -223,21 +229,12 @@ struct Quaternion {
 	state.flown.rates[2] = clamp(turn_rate, gains.rate_max[2]);
 }
 
-// Rate setpoint of the present mode. The attitude model moves one period ahead.
-void update_rates_setpoint(State &state)
-{
-	if (state.rate_mode == 0) {
-		outer_loop(state, follows(state.gains) ? advance(state) : load(state.attitude_setpoint));
-	}
-}
-
 // v without the integral, and the integral's slope.
 struct Torque {
 	float rest[kAxes];
 	float slope[kAxes];
 };
 
-// `stop`: the rate setpoint is zero.
 [[gnu::noinline]] void rate_controller(const State &state, Torque &torque)
 {
 	const Gains &gains = state.gains;
@@ -272,36 +269,37 @@ struct Torque {
 	state.flown.acceleration[0] = state.flown.acceleration[1] = 0.0F;
 }
 
-// Counts invalid samples, and the samples since the last valid one. `missing` and the result are fault bits; the latter
+// Counts invalid samples, and those for which an input is still held. `missing` and the result are fault bits; the latter
 // of inputs that are invalid for too long. The derivative of a rate starts again after that.
 [[gnu::cold, gnu::noinline]] int32_t count_missing(State &state, int32_t missing, int32_t silent)
 {
-	int32_t failed = 0;
-	uint32_t bits = static_cast<uint32_t>(missing | state.missing);
-	state.missing = missing;
+	int32_t expired = 0;
 
-	for (; bits != 0U; bits &= bits - 1U) {
-		const int i = __builtin_ctz(bits);
-		const int32_t before = state.age[i];
-		int32_t age = 0;
+	for (uint32_t left = static_cast<uint32_t>(missing); left != 0U; left &= left - 1U) {
+		const int i = __builtin_ctz(left);
+		const int32_t bit = 1 << i;
+		int32_t hold = (state.missing & bit) != 0 ? state.hold[i] : kHoldSamples;
+		state.fault_count++;
 
-		if ((missing >> i & 1) != 0) {
-			state.fault_count++;
-			age = before > kHoldSamples || (silent >> i & 1) != 0 ? kHoldSamples + 1 : before + 1;
+		if (hold == 0 || (silent & bit) != 0) {
+			expired |= bit;
+			hold = 1;
 		}
 
-		state.age[i] = age;
+		state.hold[i] = hold - 1;
+	}
 
-		if (age > kHoldSamples) { failed |= 1 << i; }
+	for (int i = 0; i < kAxes; i++) {
+		if (((expired | state.expired) >> i & kRateFault) != 0) {
+			state.derivative[i] = 0.0F;
 
-		if (i >= 2 && (before > kHoldSamples || age > kHoldSamples)) {
-			state.derivative[i - 2] = 0.0F;
-
-			if (age > kHoldSamples) { state.rates[i - 2] = 0.0F; }
+			if ((expired >> i & kRateFault) != 0) { state.rates[i] = 0.0F; }
 		}
 	}
 
-	return state.rate_mode != 0 ? failed & ~kAttitudeFault : failed;
+	state.missing = missing;
+	state.expired = expired;
+	return state.rate_mode != 0 ? expired & ~kAttitudeFault : expired;
 }
 
 // NaN means none; any other value out of range is a fault. Returns 0 for both.
@@ -430,8 +428,9 @@ struct Torque {
 }
 
 // Torque u, and the integrals, which do not grow further into saturation. An integral is within its limit from the last
-// period and is never -0, so a zero increment keeps its bits.
-[[gnu::always_inline]] inline void inner_loop(State &state, const Input &input, float (&u)[kAxes])
+// period and is never -0, so a zero increment keeps its bits. If an input was invalid for too long, r = 0, and the
+// integrals and the excitation are left out; then an axis without a valid rate, whose y_i is 0, gets no torque.
+[[gnu::always_inline]] inline void inner_loop(State &state, const Input &input, int32_t failed, float (&u)[kAxes])
 {
 	const Gains &gains = state.gains;
 	Torque torque;
@@ -439,9 +438,15 @@ struct Torque {
 	const float period = input.armed != 0 && input.landed == 0 ? gains.period : 0.0F;
 
 	for (int j = 0; j < kAxes; j++) {
+		const float limit = gains.moment_max[j];
+
+		if (unlikely(failed != 0)) {
+			u[j] = (failed >> j & kRateFault) != 0 ? 0.0F : clamp(torque.rest[j], limit);
+			continue;
+		}
+
 		const float rest = torque.rest[j] + optional(input.excitation[j], kMaxExcitation, state.fault_count);
 		const float increment = period * torque.slope[j];
-		const float limit = gains.moment_max[j];
 		float integral = state.integral[j] + increment;
 		float moment = rest + integral;
 		const bool limited = __builtin_fabsf(moment) > limit;
@@ -460,32 +465,11 @@ struct Torque {
 	}
 }
 
-// An input was invalid for too long: r = 0, and the integrals and the excitation are left out. An axis without a valid
-// rate, whose y_i is 0, gets no torque.
-[[gnu::cold, gnu::noinline]] void damp_rates(State &state, int32_t failed, float (&u)[kAxes])
+// v without the integral in the next period, if the inputs stay as they are. Changes what is flown.
+[[gnu::cold, gnu::noinline]] void look_ahead(State &state, Torque &torque)
 {
-	release_setpoint(state);
-
-	for (float &rate : state.flown.rates) { rate = 0.0F; }
-
-	Torque torque;
+	outer_loop(state);
 	rate_controller(state, torque);
-
-	for (int j = 0; j < kAxes; j++) {
-		u[j] = (failed & (kRateFault << j)) != 0 ? 0.0F : clamp(torque.rest[j], state.gains.moment_max[j]);
-	}
-}
-
-// Moves the integrals by the rest of v in the next period, if the inputs stay as they are, times `sign`.
-[[gnu::cold, gnu::noinline]] void move_integrals(State &state, float sign)
-{
-	const Flown flown = state.flown;
-	Torque torque;
-	update_rates_setpoint(state);
-	rate_controller(state, torque);
-	state.flown = flown;
-
-	for (int j = 0; j < kAxes; j++) { state.integral[j] += sign * torque.rest[j]; }
 }
 
 }  // namespace
@@ -494,9 +478,7 @@ struct Torque {
 {
 	state = State{};
 
-	for (int32_t &age : state.age) { age = kHoldSamples + 1; }
-
-	state.missing = kAllFaults;
+	state.missing = state.expired = kAllFaults;
 	state.attitude[0] = state.attitude_setpoint[0] = 1.0F;
 
 	const bool accepted = acceptable(gains);
@@ -515,14 +497,20 @@ struct Torque {
 {
 	if (!acceptable(gains)) { return false; }
 
-	move_integrals(state, 1.0F);
+	const Flown flown = state.flown;
+	Torque before;
+	Torque after;
+	look_ahead(state, before);
+	state.flown = flown;
 	state.gains = gains;
-	move_integrals(state, -1.0F);
+	look_ahead(state, after);
+	state.flown = flown;
 
 	for (int j = 0; j < kAxes; j++) {
 		const bool unused = j == 2 ? within(gains.yaw_ki_i, 0.0F)
 				    : within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F);
-		state.integral[j] = unused ? 0.0F : clamp(state.integral[j], gains.integral_max[j]);
+		const float integral = (before.rest[j] + state.integral[j]) - after.rest[j];
+		state.integral[j] = unused ? 0.0F : clamp(integral, gains.integral_max[j]);
 	}
 
 	if (!follows(gains)) {
@@ -538,7 +526,7 @@ void step(State &state, const Input &input, Output &output)
 	const int32_t failed = accept_inputs(state, input);
 
 	// A setpoint or attitude that is missing now holds the rate setpoint.
-	if ((state.missing & (kSetpointFault | kAttitudeFault)) == 0) { update_rates_setpoint(state); }
+	if ((state.missing & (kSetpointFault | kAttitudeFault)) == 0) { outer_loop(state); }
 
 	if (unlikely(input.armed == 0)) {
 		for (float &integral : state.integral) { integral = 0.0F; }
@@ -547,11 +535,12 @@ void step(State &state, const Input &input, Output &output)
 	}
 
 	if (unlikely(failed != 0)) {
-		damp_rates(state, failed, output.moment);
+		release_setpoint(state);
 
-	} else {
-		inner_loop(state, input, output.moment);
+		for (float &rate : state.flown.rates) { rate = 0.0F; }
 	}
+
+	inner_loop(state, input, failed, output.moment);
 
 	output.rates_setpoint[0] = state.flown.rates[0];
 	output.rates_setpoint[1] = state.flown.rates[1];

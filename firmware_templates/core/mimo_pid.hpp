@@ -93,8 +93,9 @@ struct State {
 	float yaw_rate_setpoint;
 	float attitude[4];           // last valid inputs
 	float rates[kAxes];
-	int32_t age[kInputs];    // samples since the last valid one: setpoint, attitude, rates
+	int32_t hold[kInputs];   // samples for which an invalid input is still held: setpoint, attitude, rates
 	int32_t missing;         // fault bits of the last sample
+	int32_t expired;         // of these, those held for too long
 	int32_t rate_mode;
 	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
 	uint32_t fault_count;
