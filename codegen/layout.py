@@ -55,6 +55,7 @@ MODEL = np.dtype(
 STATE = np.dtype(
     [
         ("gains", "<f4", len(PARAMETERS)),
+        ("derivative_gain", "<f4"),
         ("integral", "<f4", 3),
         ("derivative", "<f4", 3),
         ("attitude_setpoint", "<f4", 4),

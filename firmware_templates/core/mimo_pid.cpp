@@ -289,12 +289,12 @@ struct Torque {
 		state.hold[i] = hold - 1;
 	}
 
-	for (int i = 0; i < kAxes; i++) {
-		if (((expired | state.expired) >> i & kRateFault) != 0) {
-			state.derivative[i] = 0.0F;
+	uint32_t restarted = static_cast<uint32_t>(expired | state.expired) / kRateFault;
 
-			if ((expired >> i & kRateFault) != 0) { state.rates[i] = 0.0F; }
-		}
+	for (int i = 0; restarted != 0U; i++, restarted >>= 1) {
+		if ((restarted & 1U) != 0U) { state.derivative[i] = 0.0F; }
+
+		if ((expired >> i & kRateFault) != 0) { state.rates[i] = 0.0F; }
 	}
 
 	state.missing = missing;
@@ -405,9 +405,6 @@ struct Torque {
 
 	state.yaw_rate_setpoint = optional(input.yaw_rate_setpoint, kMaxRate, state.fault_count);
 
-	const float pole = state.gains.derivative_pole;
-	const float filter_gain = (1.0F - pole) / state.gains.period;
-
 #pragma GCC unroll 3
 	for (int i = 0; i < kAxes; i++) {
 		const float before = state.rates[i];
@@ -418,7 +415,7 @@ struct Torque {
 			rate = before;
 		}
 
-		state.derivative[i] = pole * state.derivative[i] + filter_gain * (rate - before);
+		state.derivative[i] = state.gains.derivative_pole * state.derivative[i] + state.derivative_gain * (rate - before);
 		state.rates[i] = rate;
 	}
 
@@ -472,6 +469,12 @@ struct Torque {
 	rate_controller(state, torque);
 }
 
+[[gnu::cold]] void load(State &state, const Gains &gains)
+{
+	state.gains = gains;
+	state.derivative_gain = (1.0F - gains.derivative_pole) / gains.period;
+}
+
 }  // namespace
 
 [[gnu::cold]] bool initialise(State &state, const Gains &gains)
@@ -483,12 +486,7 @@ struct Torque {
 
 	const bool accepted = acceptable(gains);
 
-	if (accepted) {
-		state.gains = gains;
-
-	} else {
-		state.gains.period = 1.0F;  // all other gains and limits are 0, so the torque is 0
-	}
+	if (accepted) { load(state, gains); }  // else all gains and limits are 0, so the torque is 0
 
 	return accepted;
 }
@@ -502,7 +500,7 @@ struct Torque {
 	Torque after;
 	look_ahead(state, before);
 	state.flown = flown;
-	state.gains = gains;
+	load(state, gains);
 	look_ahead(state, after);
 	state.flown = flown;
 
@@ -526,7 +524,7 @@ void step(State &state, const Input &input, Output &output)
 	const int32_t failed = accept_inputs(state, input);
 
 	// A setpoint or attitude that is missing now holds the rate setpoint.
-	if ((state.missing & (kSetpointFault | kAttitudeFault)) == 0) { outer_loop(state); }
+	if (failed == 0 && (state.missing & (kSetpointFault | kAttitudeFault)) == 0) { outer_loop(state); }
 
 	if (unlikely(input.armed == 0)) {
 		for (float &integral : state.integral) { integral = 0.0F; }
@@ -542,9 +540,8 @@ void step(State &state, const Input &input, Output &output)
 
 	inner_loop(state, input, failed, output.moment);
 
-	output.rates_setpoint[0] = state.flown.rates[0];
-	output.rates_setpoint[1] = state.flown.rates[1];
-	output.rates_setpoint[2] = state.flown.rates[2];
+	static_assert(sizeof(output.rates_setpoint) == sizeof(state.flown.rates), "both are of all axes");
+	__builtin_memcpy(output.rates_setpoint, state.flown.rates, sizeof(output.rates_setpoint));
 	output.fault = failed;
 	output.fault_count = state.fault_count;
 }

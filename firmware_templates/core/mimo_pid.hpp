@@ -87,6 +87,7 @@ struct Flown {
 
 struct State {
 	Gains gains;
+	float derivative_gain;  // (1 - a) / Ts
 	float integral[kAxes];
 	float derivative[kAxes];
 	float attitude_setpoint[4];  // flown, within the slew limit
