@@ -139,7 +139,8 @@ class Controller:
             scale * (pitch * along - roll * across),
             scale * (square * z),
         ]
-        return AttitudeError(error, ((w * w - z * z) / square, (f(2) * (w * z)) / square))
+        share = f(2) * z / square
+        return AttitudeError(error, (f(1) - share * z, share * w))
 
     def _heading(self) -> tuple[Any, Any]:
         """Cosine and sine of half the heading of the setpoint."""

@@ -78,18 +78,6 @@ struct Quaternion {
 	return within(length_squared(q) - 1.0F, kMaxNormError);
 }
 
-[[gnu::cold, gnu::noinline]] bool acceptable(const Gains &gains)
-{
-	static_assert(sizeof(Gains) == kGainCount * sizeof(float), "Gains is a row of floats");
-	const float *const values = reinterpret_cast<const float *>(&gains);
-
-	for (int i = 0; i < kGainCount; i++) {
-		if (!within(values[i], kMaxGain)) { return false; }
-	}
-
-	return valid(gains);
-}
-
 [[gnu::always_inline]] inline bool follows(const Gains &gains) { return !within(gains.model_omega, 0.0F); }
 
 // One period of the attitude model, semi-implicit Euler. Returns the setpoint's heading, then the model's tilt.
@@ -208,14 +196,9 @@ struct Quaternion {
 
 	if (unlikely(following)) {
 		const Model &model = state.flown.model;
-		float turn_cosine = 1.0F;
-		float turn_sine = 0.0F;
-
-		if (!unlikely(cosine < kInverted)) {
-			turn_cosine = (w * w - z * z) / square;
-			turn_sine = (2.0F * (w * z)) / square;
-		}
-
+		const float share = unlikely(cosine < kInverted) ? 0.0F : (2.0F * z) / square;
+		const float turn_cosine = 1.0F - share * z;
+		const float turn_sine = share * w;
 		const float roll_ahead = turn_cosine * model.rate[0] - turn_sine * model.rate[1];
 		const float pitch_ahead = turn_sine * model.rate[0] + turn_cosine * model.rate[1];
 		state.flown.acceleration[0] = turn_cosine * model.acceleration[0] - turn_sine * model.acceleration[1];
@@ -314,10 +297,14 @@ struct Torque {
 	return value;
 }
 
-// Turns q towards `target` by at most half of `angle` of rotation; both are unit quaternions.
-[[gnu::cold, gnu::noinline]] void slew(const float (&target)[4], float angle, float (&q)[4])
+// Turns the attitude setpoint towards the given one, within the slew limit. It starts at the measured attitude.
+[[gnu::cold, gnu::noinline]] void slew(State &state, const Input &input)
 {
+	const float(&target)[4] = input.attitude_setpoint;
+	const float(&q)[4] = state.slewing != 0 ? state.attitude_setpoint : state.attitude;
+	const float angle = 0.5F * (state.gains.setpoint_slew * state.gains.period);  // quaternions turn by half angles
 	float along = 0.0F;
+	state.slewing = input.armed;
 
 	for (int i = 0; i < 4; i++) { along += q[i] * target[i]; }
 
@@ -333,8 +320,7 @@ struct Torque {
 	const float distance = __builtin_sqrtf(square);
 
 	if (distance <= angle) {
-		for (int i = 0; i < 4; i++) { q[i] = target[i]; }
-
+		store(load(target), state.attitude_setpoint);
 		return;
 	}
 
@@ -342,13 +328,13 @@ struct Torque {
 	square = 0.0F;
 
 	for (int i = 0; i < 4; i++) {
-		q[i] += step * across[i];
-		square += q[i] * q[i];
+		across[i] = q[i] + step * across[i];
+		square += across[i] * across[i];
 	}
 
 	const float scale = 1.0F / __builtin_sqrtf(square);
 
-	for (int i = 0; i < 4; i++) { q[i] *= scale; }
+	for (int i = 0; i < 4; i++) { state.attitude_setpoint[i] = scale * across[i]; }
 }
 
 // Takes over an attitude setpoint, within the slew limit. Returns false if it is invalid.
@@ -359,10 +345,7 @@ struct Torque {
 	if (unlikely(!is_rotation(given))) { return false; }
 
 	if (unlikely(!within(state.gains.setpoint_slew, 0.0F))) {
-		if (state.slewing == 0) { store(load(state.attitude), state.attitude_setpoint); }
-
-		state.slewing = input.armed;
-		slew(input.attitude_setpoint, 0.5F * (state.gains.setpoint_slew * state.gains.period), state.attitude_setpoint);
+		slew(state, input);
 
 	} else {
 		store(given, state.attitude_setpoint);
@@ -462,14 +445,19 @@ struct Torque {
 	}
 }
 
-// v without the integral in the next period, if the inputs stay as they are. Changes what is flown.
-[[gnu::cold, gnu::noinline]] void look_ahead(State &state, Torque &torque)
+// Adds to the integrals `sign` times the rest of v in the next period, if the inputs stay as they are.
+[[gnu::cold, gnu::noinline]] void add_next_rest(State &state, float sign)
 {
+	const Flown flown = state.flown;
+	Torque torque;
 	outer_loop(state);
 	rate_controller(state, torque);
+	state.flown = flown;
+
+	for (int j = 0; j < kAxes; j++) { state.integral[j] += sign * torque.rest[j]; }
 }
 
-[[gnu::cold]] void load(State &state, const Gains &gains)
+[[gnu::cold, gnu::noinline]] void load(State &state, const Gains &gains)
 {
 	state.gains = gains;
 	state.derivative_gain = (1.0F - gains.derivative_pole) / gains.period;
@@ -484,7 +472,7 @@ struct Torque {
 	state.missing = state.expired = kAllFaults;
 	state.attitude[0] = state.attitude_setpoint[0] = 1.0F;
 
-	const bool accepted = acceptable(gains);
+	const bool accepted = valid(gains);
 
 	if (accepted) { load(state, gains); }  // else all gains and limits are 0, so the torque is 0
 
@@ -493,22 +481,16 @@ struct Torque {
 
 [[gnu::cold]] bool set_gains(State &state, const Gains &gains)
 {
-	if (!acceptable(gains)) { return false; }
+	if (!valid(gains)) { return false; }
 
-	const Flown flown = state.flown;
-	Torque before;
-	Torque after;
-	look_ahead(state, before);
-	state.flown = flown;
+	add_next_rest(state, 1.0F);
 	load(state, gains);
-	look_ahead(state, after);
-	state.flown = flown;
+	add_next_rest(state, -1.0F);
 
 	for (int j = 0; j < kAxes; j++) {
 		const bool unused = j == 2 ? within(gains.yaw_ki_i, 0.0F)
 				    : within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F);
-		const float integral = (before.rest[j] + state.integral[j]) - after.rest[j];
-		state.integral[j] = unused ? 0.0F : clamp(integral, gains.integral_max[j]);
+		state.integral[j] = unused ? 0.0F : clamp(state.integral[j], gains.integral_max[j]);
 	}
 
 	if (!follows(gains)) {

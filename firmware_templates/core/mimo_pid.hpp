@@ -41,7 +41,6 @@ constexpr int32_t kHoldSamples = 25;  // an invalid input is held at its last va
 constexpr float kMaxRate = 100.0F;    // rad/s, a larger rate is invalid
 constexpr float kMaxNormError = 0.02F;  // a quaternion is invalid if its squared length differs more from 1
 constexpr float kMaxExcitation = 1.0F;  // a larger excitation is invalid
-constexpr float kMaxGain = 1.0e6F;      // no gain or limit may be larger
 
 // Bits of Output::fault and Input::silent.
 constexpr int32_t kSetpointFault = 1;
