@@ -156,8 +156,10 @@ class Controller:
             return None
         zero, two = self.f(0), self.f(2)
         if self.model is None:
-            return ModelState(self._direction(self.attitude), [zero, zero], [zero, zero])
-        wanted = self._direction(self.setpoint)
+            return ModelState(self._measured_direction(), [zero, zero], [zero, zero])
+        cosine, sine = self._heading()
+        _, x, y, _ = self.setpoint
+        wanted = [two * (cosine * x + sine * y), two * (cosine * y - sine * x)]
         stiffness, friction = self.omega * self.omega, two * self.damping * self.omega
         angle, rate, acceleration = [], [], []
         for j in range(2):
@@ -166,9 +168,9 @@ class Controller:
             angle.append(self.model.angle[j] + self.period * rate[j])
         return ModelState(angle, rate, acceleration)
 
-    def _direction(self, q: list[Any]) -> list[Any]:
-        """Direction of body z of an attitude: 2 imag of the tilt, in the axes of the setpoint's heading."""
-        two, (cosine, sine) = self.f(2), self._heading()
+    def _measured_direction(self) -> list[Any]:
+        """Measured direction of body z: 2 imag of the tilt, in the axes of the setpoint's heading."""
+        q, two, (cosine, sine) = self.attitude, self.f(2), self._heading()
         w, x = cosine * q[0] + sine * q[3], cosine * q[1] + sine * q[2]
         y, z = cosine * q[2] - sine * q[1], cosine * q[3] - sine * q[0]
         length = self._root(w * w + z * z)

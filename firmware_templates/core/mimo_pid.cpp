@@ -100,17 +100,20 @@ struct Quaternion {
 	// The direction of body z that is wanted, or measured: 2 imag of the tilt in the axes of that heading.
 	const bool running = model.running != 0;
 	const float(&q)[4] = running ? state.attitude_setpoint : state.attitude;
-	const float w = cosine * q[0] + sine * q[3];
 	const float x = cosine * q[1] + sine * q[2];
 	const float y = cosine * q[2] - sine * q[1];
-	const float z = cosine * q[3] - sine * q[0];
-	const float upright = __builtin_sqrtf(w * w + z * z);
 	float direction[kModelAxes] = {2.0F * x, 2.0F * y};
 
-	if (!unlikely(upright < kInverted)) {
-		const float scale = 2.0F / upright;
-		direction[0] = scale * (x * w - y * z);
-		direction[1] = scale * (y * w + x * z);
+	if (!running) {  // the measured heading may differ
+		const float w = cosine * q[0] + sine * q[3];
+		const float z = cosine * q[3] - sine * q[0];
+		const float upright = __builtin_sqrtf(w * w + z * z);
+
+		if (!unlikely(upright < kInverted)) {
+			const float scale = 2.0F / upright;
+			direction[0] = scale * (x * w - y * z);
+			direction[1] = scale * (y * w + x * z);
+		}
 	}
 
 	model.running = 1;
@@ -244,12 +247,24 @@ struct Torque {
 	torque.slope[2] = gains.yaw_ki_i * yaw_error;
 }
 
-// Ends what depends on the past attitude setpoint.
+// Ends what depends on past attitude setpoints.
 [[gnu::cold, gnu::noinline]] void release_setpoint(State &state)
 {
 	state.slewing = 0;
 	state.flown.model.running = 0;
 	state.flown.acceleration[0] = state.flown.acceleration[1] = 0.0F;
+}
+
+// The integrals, if disarmed, and the rate setpoint, if an input failed, are zero.
+[[gnu::cold, gnu::noinline]] void rest(State &state, int32_t armed, int32_t failed)
+{
+	release_setpoint(state);
+
+	for (int j = 0; j < kAxes; j++) {
+		if (armed == 0) { state.integral[j] = 0.0F; }
+
+		if (failed != 0) { state.flown.rates[j] = 0.0F; }
+	}
 }
 
 // Counts invalid samples, and those for which an input is still held. `missing` and the result are fault bits; the latter
@@ -407,26 +422,26 @@ struct Torque {
 	return 0;
 }
 
+// Torque u if an input was invalid for too long: without the integrals and the excitation. An axis without a valid rate,
+// whose y_i is 0, gets none.
+[[gnu::cold, gnu::noinline]] void damp(const Gains &gains, const Torque &torque, int32_t failed, float (&u)[kAxes])
+{
+	for (int j = 0; j < kAxes; j++) {
+		u[j] = (failed >> j & kRateFault) != 0 ? 0.0F : clamp(torque.rest[j], gains.moment_max[j]);
+	}
+}
+
 // Torque u, and the integrals, which do not grow further into saturation. An integral is within its limit from the last
-// period and is never -0, so a zero increment keeps its bits. If an input was invalid for too long, r = 0, and the
-// integrals and the excitation are left out; then an axis without a valid rate, whose y_i is 0, gets no torque.
-[[gnu::always_inline]] inline void inner_loop(State &state, const Input &input, int32_t failed, float (&u)[kAxes])
+// period and is never -0, so a zero increment keeps its bits.
+[[gnu::always_inline]] inline void integrate(State &state, const Input &input, const Torque &torque, float (&u)[kAxes])
 {
 	const Gains &gains = state.gains;
-	Torque torque;
-	rate_controller(state, torque);
 	const float period = input.armed != 0 && input.landed == 0 ? gains.period : 0.0F;
 
 	for (int j = 0; j < kAxes; j++) {
-		const float limit = gains.moment_max[j];
-
-		if (unlikely(failed != 0)) {
-			u[j] = (failed >> j & kRateFault) != 0 ? 0.0F : clamp(torque.rest[j], limit);
-			continue;
-		}
-
 		const float rest = torque.rest[j] + optional(input.excitation[j], kMaxExcitation, state.fault_count);
 		const float increment = period * torque.slope[j];
+		const float limit = gains.moment_max[j];
 		float integral = state.integral[j] + increment;
 		float moment = rest + integral;
 		const bool limited = __builtin_fabsf(moment) > limit;
@@ -508,19 +523,17 @@ void step(State &state, const Input &input, Output &output)
 	// A setpoint or attitude that is missing now holds the rate setpoint.
 	if (failed == 0 && (state.missing & (kSetpointFault | kAttitudeFault)) == 0) { outer_loop(state); }
 
-	if (unlikely(input.armed == 0)) {
-		for (float &integral : state.integral) { integral = 0.0F; }
+	if (unlikely(input.armed == 0 || failed != 0)) { rest(state, input.armed, failed); }
 
-		release_setpoint(state);
-	}
+	Torque torque;
+	rate_controller(state, torque);
 
 	if (unlikely(failed != 0)) {
-		release_setpoint(state);
+		damp(state.gains, torque, failed, output.moment);
 
-		for (float &rate : state.flown.rates) { rate = 0.0F; }
+	} else {
+		integrate(state, input, torque, output.moment);
 	}
-
-	inner_loop(state, input, failed, output.moment);
 
 	static_assert(sizeof(output.rates_setpoint) == sizeof(state.flown.rates), "both are of all axes");
 	__builtin_memcpy(output.rates_setpoint, state.flown.rates, sizeof(output.rates_setpoint));

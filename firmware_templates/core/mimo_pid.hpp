@@ -84,22 +84,23 @@ struct Flown {
 	Model model;
 };
 
+// What changes often is at small offsets, which take shorter instructions.
 struct State {
-	Gains gains;
-	float derivative_gain;  // (1 - a) / Ts
-	float integral[kAxes];
-	float derivative[kAxes];
+	int32_t missing;         // fault bits of the last sample
+	int32_t expired;         // of these, those held for too long
+	int32_t hold[kInputs];   // samples for which an invalid input is still held: setpoint, attitude, rates
+	uint32_t fault_count;
+	int32_t rate_mode;
+	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
+	Flown flown;
 	float attitude_setpoint[4];  // flown, within the slew limit
 	float yaw_rate_setpoint;
 	float attitude[4];           // last valid inputs
 	float rates[kAxes];
-	int32_t hold[kInputs];   // samples for which an invalid input is still held: setpoint, attitude, rates
-	int32_t missing;         // fault bits of the last sample
-	int32_t expired;         // of these, those held for too long
-	int32_t rate_mode;
-	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
-	uint32_t fault_count;
-	Flown flown;
+	float derivative[kAxes];
+	float integral[kAxes];
+	float derivative_gain;  // (1 - a) / Ts
+	Gains gains;
 };
 
 // Resets the controller. Returns false if the gains are refused; the torque then stays 0.
