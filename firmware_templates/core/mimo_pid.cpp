@@ -260,11 +260,9 @@ struct Torque {
 {
 	release_setpoint(state);
 
-	for (int j = 0; j < kAxes; j++) {
-		if (armed == 0) { state.integral[j] = 0.0F; }
+	if (armed == 0) { state.integral[0] = state.integral[1] = state.integral[2] = 0.0F; }
 
-		if (failed != 0) { state.flown.rates[j] = 0.0F; }
-	}
+	if (failed != 0) { state.flown.rates[0] = state.flown.rates[1] = state.flown.rates[2] = 0.0F; }
 }
 
 // Counts invalid samples, and those for which an input is still held. `missing` and the result are fault bits; the latter
@@ -335,7 +333,7 @@ struct Torque {
 	const float distance = __builtin_sqrtf(square);
 
 	if (distance <= angle) {
-		store(load(target), state.attitude_setpoint);
+		__builtin_memcpy(state.attitude_setpoint, target, sizeof(target));
 		return;
 	}
 
@@ -422,13 +420,20 @@ struct Torque {
 	return 0;
 }
 
+[[gnu::cold, gnu::noinline]] void clamp_axes(float (&values)[kAxes], const float (&limits)[kAxes])
+{
+	for (int j = 0; j < kAxes; j++) { values[j] = clamp(values[j], limits[j]); }
+}
+
 // Torque u if an input was invalid for too long: without the integrals and the excitation. An axis without a valid rate,
 // whose y_i is 0, gets none.
 [[gnu::cold, gnu::noinline]] void damp(const Gains &gains, const Torque &torque, int32_t failed, float (&u)[kAxes])
 {
 	for (int j = 0; j < kAxes; j++) {
-		u[j] = (failed >> j & kRateFault) != 0 ? 0.0F : clamp(torque.rest[j], gains.moment_max[j]);
+		u[j] = (failed >> j & kRateFault) != 0 ? 0.0F : torque.rest[j];
 	}
+
+	clamp_axes(u, gains.moment_max);
 }
 
 // Torque u, and the integrals, which do not grow further into saturation. An integral is within its limit from the last
@@ -460,8 +465,8 @@ struct Torque {
 	}
 }
 
-// Adds to the integrals `sign` times the rest of v in the next period, if the inputs stay as they are.
-[[gnu::cold, gnu::noinline]] void add_next_rest(State &state, float sign)
+// Adds to the integrals, or subtracts, the rest of v in the next period, if the inputs stay as they are.
+[[gnu::cold, gnu::noinline]] void add_next_rest(State &state, bool subtract)
 {
 	const Flown flown = state.flown;
 	Torque torque;
@@ -469,7 +474,7 @@ struct Torque {
 	rate_controller(state, torque);
 	state.flown = flown;
 
-	for (int j = 0; j < kAxes; j++) { state.integral[j] += sign * torque.rest[j]; }
+	for (int j = 0; j < kAxes; j++) { state.integral[j] += subtract ? -torque.rest[j] : torque.rest[j]; }
 }
 
 [[gnu::cold, gnu::noinline]] void load(State &state, const Gains &gains)
@@ -498,15 +503,18 @@ struct Torque {
 {
 	if (!valid(gains)) { return false; }
 
-	add_next_rest(state, 1.0F);
+	add_next_rest(state, false);
 	load(state, gains);
-	add_next_rest(state, -1.0F);
+	add_next_rest(state, true);
 
-	for (int j = 0; j < kAxes; j++) {
-		const bool unused = j == 2 ? within(gains.yaw_ki_i, 0.0F)
-				    : within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F);
-		state.integral[j] = unused ? 0.0F : clamp(state.integral[j], gains.integral_max[j]);
+	clamp_axes(state.integral, gains.integral_max);
+
+	// An axis without integral gains has no integral.
+	for (int j = 0; j < kModelAxes; j++) {
+		if (within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F)) { state.integral[j] = 0.0F; }
 	}
+
+	if (within(gains.yaw_ki_i, 0.0F)) { state.integral[2] = 0.0F; }
 
 	if (!follows(gains)) {
 		state.flown.model.running = 0;
