@@ -358,7 +358,7 @@ class Controller:
             return self._damp_rates(lost, fault, armed)
 
         u_bar = [self._optional(v, MAX_EXCITATION) for v in u_bar]
-        if self.age[0] == 0 and (rate_mode or self.age[1] == 0):
+        if not any(self.age):
             self.model = self._advanced_model()
             self.rates_setpoint, self.acceleration = self._rates_setpoint(self.model)
         if not armed:

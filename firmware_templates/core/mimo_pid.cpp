@@ -46,6 +46,11 @@ constexpr float kInverted = 0.0045F;  // cosine of half the tilt below which, as
 	return value;
 }
 
+[[gnu::noinline]] void clamp_axes(float (&values)[kAxes], const float (&limits)[kAxes])
+{
+	for (int j = 0; j < kAxes; j++) { values[j] = clamp(values[j], limits[j]); }
+}
+
 [[gnu::always_inline]] inline float row(const float (&gain)[2], float roll, float pitch)
 {
 	return gain[0] * roll + gain[1] * pitch;
@@ -210,9 +215,10 @@ struct Quaternion {
 		pitch_rate += row(gains.kff_o[1], roll_ahead, pitch_ahead);
 	}
 
-	state.flown.rates[0] = clamp(roll_rate, gains.rate_max[0]);
-	state.flown.rates[1] = clamp(pitch_rate, gains.rate_max[1]);
-	state.flown.rates[2] = clamp(turn_rate, gains.rate_max[2]);
+	state.flown.rates[0] = roll_rate;
+	state.flown.rates[1] = pitch_rate;
+	state.flown.rates[2] = turn_rate;
+	clamp_axes(state.flown.rates, gains.rate_max);
 }
 
 // v without the integral, and the integral's slope.
@@ -420,11 +426,6 @@ struct Torque {
 	return 0;
 }
 
-[[gnu::cold, gnu::noinline]] void clamp_axes(float (&values)[kAxes], const float (&limits)[kAxes])
-{
-	for (int j = 0; j < kAxes; j++) { values[j] = clamp(values[j], limits[j]); }
-}
-
 // Torque u if an input was invalid for too long: without the integrals and the excitation. An axis without a valid rate,
 // whose y_i is 0, gets none.
 [[gnu::cold, gnu::noinline]] void damp(const Gains &gains, const Torque &torque, int32_t failed, float (&u)[kAxes])
@@ -528,8 +529,8 @@ void step(State &state, const Input &input, Output &output)
 {
 	const int32_t failed = accept_inputs(state, input);
 
-	// A setpoint or attitude that is missing now holds the rate setpoint.
-	if (failed == 0 && (state.missing & (kSetpointFault | kAttitudeFault)) == 0) { outer_loop(state); }
+	// An input that is missing now holds the rate setpoint.
+	if (state.missing == 0) { outer_loop(state); }
 
 	if (unlikely(input.armed == 0 || failed != 0)) { rest(state, input.armed, failed); }
 
