@@ -327,12 +327,11 @@ struct Torque {
 
 	for (int i = 0; i < 4; i++) { along += q[i] * target[i]; }
 
-	const float sign = along < 0.0F ? -1.0F : 1.0F;
 	float across[4];
 	float square = 0.0F;
 
 	for (int i = 0; i < 4; i++) {
-		across[i] = sign * (target[i] - along * q[i]);
+		across[i] = target[i] - along * q[i];
 		square += across[i] * across[i];
 	}
 
@@ -343,7 +342,7 @@ struct Torque {
 		return;
 	}
 
-	const float step = angle / distance;
+	const float step = (along < 0.0F ? -angle : angle) / distance;
 	square = 0.0F;
 
 	for (int i = 0; i < 4; i++) {
@@ -466,14 +465,17 @@ struct Torque {
 	}
 }
 
+[[gnu::cold, gnu::noinline]] void copy(const Flown &from, Flown &to) { to = from; }
+
 // Adds to the integrals, or subtracts, the rest of v in the next period, if the inputs stay as they are.
 [[gnu::cold, gnu::noinline]] void add_next_rest(State &state, bool subtract)
 {
-	const Flown flown = state.flown;
+	Flown flown;
 	Torque torque;
+	copy(state.flown, flown);
 	outer_loop(state);
 	rate_controller(state, torque);
-	state.flown = flown;
+	copy(flown, state.flown);
 
 	for (int j = 0; j < kAxes; j++) { state.integral[j] += subtract ? -torque.rest[j] : torque.rest[j]; }
 }
