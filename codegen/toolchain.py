@@ -11,7 +11,7 @@ from pathlib import Path
 from mimopilot.codegen.errors import CodegenError
 
 #: Flags of every build, also in the emitted Makefiles. No contraction: the result must equal the reference bit for bit.
-CXX_FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fno-exceptions", "-fno-rtti")
+CXX_FLAGS = ("-std=c++17", "-Os", "-ffp-contract=off", "-fno-math-errno", "-fno-exceptions", "-fno-rtti")
 WARNINGS = (
     "-Wall",
     "-Wextra",

@@ -41,7 +41,6 @@ constexpr int32_t kHoldSamples = 25;  // an invalid input is held at its last va
 constexpr float kMaxRate = 100.0F;    // rad/s, a larger rate is invalid
 constexpr float kMaxNormError = 0.02F;  // a quaternion is invalid if its squared length differs more from 1
 constexpr float kMaxExcitation = 1.0F;  // a larger excitation is invalid
-constexpr float kMaxGain = 1.0e6F;      // no gain or limit may be larger
 
 // Bits of Output::fault and Input::silent.
 constexpr int32_t kSetpointFault = 1;
@@ -78,22 +77,30 @@ struct Model {
 	int32_t running;                 // 0: starts at the measured attitude
 };
 
+// What is flown in this period.
+struct Flown {
+	float rates[kAxes];              // r_i
+	float acceleration[kModelAxes];  // of the attitude model, in body axes
+	Model model;
+};
+
+// What changes often is at small offsets, which take shorter instructions.
 struct State {
-	Gains gains;
-	float integral[kAxes];
-	float derivative[kAxes];
+	int32_t missing;         // fault bits of the last sample
+	int32_t expired;         // of these, those held for too long
+	int32_t hold[kInputs];   // samples for which an invalid input is still held: setpoint, attitude, rates
+	uint32_t fault_count;
+	int32_t rate_mode;
+	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
+	Flown flown;
 	float attitude_setpoint[4];  // flown, within the slew limit
 	float yaw_rate_setpoint;
 	float attitude[4];           // last valid inputs
 	float rates[kAxes];
-	float rates_setpoint[kAxes];      // r_i
-	float acceleration[kModelAxes];  // of the attitude model, in body axes
-	int32_t age[kInputs];    // samples since the last valid one: setpoint, attitude, rates
-	int32_t missing;         // fault bits of the last sample
-	int32_t rate_mode;
-	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
-	uint32_t fault_count;
-	Model model;
+	float derivative[kAxes];
+	float integral[kAxes];
+	float derivative_gain;  // (1 - a) / Ts
+	Gains gains;
 };
 
 // Resets the controller. Returns false if the gains are refused; the torque then stays 0.
