@@ -48,7 +48,9 @@ constexpr float kInverted = 0.0045F;  // cosine of half the tilt below which, as
 
 [[gnu::noinline]] void clamp_axes(float (&values)[kAxes], const float (&limits)[kAxes])
 {
-	for (int j = 0; j < kAxes; j++) { values[j] = clamp(values[j], limits[j]); }
+	for (int j = 0; j < kAxes; j++) {
+		if (__builtin_fabsf(values[j]) > limits[j]) { values[j] = values[j] > 0.0F ? limits[j] : -limits[j]; }
+	}
 }
 
 [[gnu::always_inline]] inline float row(const float (&gain)[2], float roll, float pitch)
