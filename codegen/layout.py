@@ -54,9 +54,9 @@ MODEL = np.dtype(
 
 STATE = np.dtype(
     [
+        ("hold", "<i4", 5),
         ("missing", "<i4"),
         ("expired", "<i4"),
-        ("hold", "<i4", 5),
         ("fault_count", "<u4"),
         ("rate_mode", "<i4"),
         ("slewing", "<i4"),

@@ -17,7 +17,7 @@ namespace mimopilot {
 
 namespace {
 
-// Code size and step time have a budget: the attributes below keep step() fast and the rest small.
+// Code size, stack and step time have a budget, with -Os: the attributes below keep step() fast and the rest small.
 
 constexpr float kInverted = 0.0045F;  // cosine of half the tilt below which, as in PX4, the error has no turn
 
@@ -48,7 +48,9 @@ constexpr float kInverted = 0.0045F;  // cosine of half the tilt below which, as
 
 [[gnu::noinline]] void clamp_axes(float (&values)[kAxes], const float (&limits)[kAxes])
 {
-	for (int j = 0; j < kAxes; j++) { values[j] = clamp(values[j], limits[j]); }
+	for (int j = 0; j < kAxes; j++) {
+		if (__builtin_fabsf(values[j]) > limits[j]) { values[j] = values[j] > 0.0F ? limits[j] : -limits[j]; }
+	}
 }
 
 [[gnu::always_inline]] inline float row(const float (&gain)[2], float roll, float pitch)
@@ -88,12 +90,11 @@ struct Quaternion {
 // One period of the attitude model, semi-implicit Euler. Returns the setpoint's heading, then the model's tilt.
 [[gnu::always_inline]] inline Quaternion advance(State &state)
 {
-	// Cosine and sine of half the heading.
 	const Gains &gains = state.gains;
 	Model &model = state.flown.model;
 	const float(&target)[4] = state.attitude_setpoint;
 	const float length = __builtin_sqrtf(target[0] * target[0] + target[3] * target[3]);
-	float cosine = 1.0F;
+	float cosine = 1.0F;  // of half the heading
 	float sine = 0.0F;
 
 	if (!unlikely(length < kInverted)) {
@@ -154,7 +155,7 @@ struct Quaternion {
 	};
 }
 
-// Attitude controller: the flown rate setpoint, and the acceleration of the attitude model in body axes.
+// Attitude controller. The attitude model moves one period ahead. Sets the flown rate setpoint, and the acceleration of the attitude model in body axes.
 // In rate mode, r_i is given.
 [[gnu::noinline]] void outer_loop(State &state)
 {
@@ -253,18 +254,18 @@ struct Torque {
 	torque.slope[2] = gains.yaw_ki_i * yaw_error;
 }
 
-// Ends what depends on past attitude setpoints.
-[[gnu::cold, gnu::noinline]] void release_setpoint(State &state)
+[[gnu::always_inline]] inline void stop_model(Flown &flown)
 {
-	state.slewing = 0;
-	state.flown.model.running = 0;
-	state.flown.acceleration[0] = state.flown.acceleration[1] = 0.0F;
+	flown.model.running = 0;
+	flown.acceleration[0] = flown.acceleration[1] = 0.0F;
 }
 
-// The integrals, if disarmed, and the rate setpoint, if an input failed, are zero.
-[[gnu::cold, gnu::noinline]] void rest(State &state, int32_t armed, int32_t failed)
+// Ends what depends on past attitude setpoints. If disarmed, the integrals are zero; if an input failed, the rate
+// setpoint.
+[[gnu::cold, gnu::noinline]] void settle(State &state, int32_t armed, int32_t failed)
 {
-	release_setpoint(state);
+	state.slewing = 0;
+	stop_model(state.flown);
 
 	if (armed == 0) { state.integral[0] = state.integral[1] = state.integral[2] = 0.0F; }
 
@@ -286,6 +287,8 @@ struct Torque {
 		if (hold == 0 || (silent & bit) != 0) {
 			expired |= bit;
 			hold = 1;
+
+			if (bit >= kRateFault) { state.rates[i - 2] = 0.0F; }
 		}
 
 		state.hold[i] = hold - 1;
@@ -295,8 +298,6 @@ struct Torque {
 
 	for (int i = 0; restarted != 0U; i++, restarted >>= 1) {
 		if ((restarted & 1U) != 0U) { state.derivative[i] = 0.0F; }
-
-		if ((expired >> i & kRateFault) != 0) { state.rates[i] = 0.0F; }
 	}
 
 	state.missing = missing;
@@ -375,7 +376,7 @@ struct Torque {
 // Takes over a rate setpoint. Returns false if it is invalid.
 [[gnu::cold, gnu::noinline]] bool accept_rates_setpoint(State &state, const Input &input)
 {
-	release_setpoint(state);
+	settle(state, 1, 0);
 
 	for (float rate : input.rates_setpoint) {
 		if (!within(rate, kMaxRate)) { return false; }
@@ -480,7 +481,7 @@ struct Torque {
 	for (int j = 0; j < kAxes; j++) { state.integral[j] += subtract ? -torque.rest[j] : torque.rest[j]; }
 }
 
-[[gnu::cold, gnu::noinline]] void load(State &state, const Gains &gains)
+[[gnu::cold, gnu::noinline]] void take_over(const Gains &gains, State &state)
 {
 	state.gains = gains;
 	state.derivative_gain = (1.0F - gains.derivative_pole) / gains.period;
@@ -497,7 +498,7 @@ struct Torque {
 
 	const bool accepted = valid(gains);
 
-	if (accepted) { load(state, gains); }  // else all gains and limits are 0, so the torque is 0
+	if (accepted) { take_over(gains, state); }  // else all gains and limits are 0, so the torque is 0
 
 	return accepted;
 }
@@ -507,9 +508,8 @@ struct Torque {
 	if (!valid(gains)) { return false; }
 
 	add_next_rest(state, false);
-	load(state, gains);
+	take_over(gains, state);
 	add_next_rest(state, true);
-
 	clamp_axes(state.integral, gains.integral_max);
 
 	// An axis without integral gains has no integral.
@@ -519,10 +519,7 @@ struct Torque {
 
 	if (within(gains.yaw_ki_i, 0.0F)) { state.integral[2] = 0.0F; }
 
-	if (!follows(gains)) {
-		state.flown.model.running = 0;
-		state.flown.acceleration[0] = state.flown.acceleration[1] = 0.0F;
-	}
+	if (!follows(gains)) { stop_model(state.flown); }
 
 	return true;
 }
@@ -534,7 +531,7 @@ void step(State &state, const Input &input, Output &output)
 	// An input that is missing now holds the rate setpoint.
 	if (state.missing == 0) { outer_loop(state); }
 
-	if (unlikely(input.armed == 0 || failed != 0)) { rest(state, input.armed, failed); }
+	if (unlikely(input.armed == 0 || failed != 0)) { settle(state, input.armed, failed); }
 
 	Torque torque;
 	rate_controller(state, torque);

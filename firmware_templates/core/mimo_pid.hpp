@@ -86,9 +86,9 @@ struct Flown {
 
 // What changes often is at small offsets, which take shorter instructions.
 struct State {
+	int32_t hold[kInputs];   // samples for which an invalid input is still held: setpoint, attitude, rates
 	int32_t missing;         // fault bits of the last sample
 	int32_t expired;         // of these, those held for too long
-	int32_t hold[kInputs];   // samples for which an invalid input is still held: setpoint, attitude, rates
 	uint32_t fault_count;
 	int32_t rate_mode;
 	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
@@ -111,8 +111,9 @@ bool initialise(State &state, const Gains &gains);
 // Returns false and changes nothing if a value is not finite, too large, or out of its range.
 bool set_gains(State &state, const Gains &gains);
 
-// One control period. If an input is invalid for more than kHoldSamples, the controller only damps the measured
-// rates, u = -Kp y_i - Kd d, and holds the integrators. An axis without a valid rate gets 0.
+// One control period. While an input is missing, the rate setpoint of the attitude controller is held. If one is invalid
+// for more than kHoldSamples, the controller only damps the measured rates, u = -Kp y_i - Kd d, and holds the integrators.
+// An axis without a valid rate gets 0.
 void step(State &state, const Input &input, Output &output);
 
 }  // namespace mimopilot
