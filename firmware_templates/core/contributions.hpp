@@ -3,7 +3,8 @@
 
 #include "mimo_pid.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // v = proportional + integral + derivative + feedforward + cross, to rounding. The first four are those of an axis' own
 // signals; cross is what the signals of the other axis add through off-diagonal gains, apart from the integral.

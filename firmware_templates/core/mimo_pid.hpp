@@ -32,7 +32,8 @@
 
 #include "gains_struct.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 constexpr int kAxes = 3;            // roll, pitch, yaw
 constexpr int kModelAxes = 2;       // roll, pitch

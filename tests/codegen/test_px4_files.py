@@ -25,7 +25,7 @@ GOLDEN = Path(__file__).parent / "golden"
 MODULE = "px4/src/modules/mc_mimo_pid"
 PLAIN = ("actuation", "attitude", "excitation", "sticks", "throttle")
 #: Units that PX4's validator accepts and we could need.
-PX4_UNITS = {"1/s", "s", "rad", "rad/s", "rad/s^2", "deg", "deg/s", "Hz", "Nm", "norm"}
+PX4_UNITS = {"s", "rad", "rad/s", "rad/s^2", "deg", "deg/s", "Hz", "Nm", "norm"}
 
 
 def test_the_yaml_has_every_parameter_with_the_gains_as_defaults(gains):

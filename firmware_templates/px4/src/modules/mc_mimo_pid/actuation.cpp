@@ -2,7 +2,8 @@
 
 #include <math.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 void Actuation::apply(const StockSettings &settings, float period, float (&torque)[3], float (&thrust)[3])
 {

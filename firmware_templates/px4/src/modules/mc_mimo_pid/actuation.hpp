@@ -3,7 +3,8 @@
 
 #include "stock_settings.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 class Actuation
 {

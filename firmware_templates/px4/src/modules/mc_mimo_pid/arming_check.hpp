@@ -9,7 +9,8 @@
 #include <uORB/topics/register_ext_component_request.h>
 #include <uORB/topics/unregister_ext_component.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // Null: this module could fly.
 struct Obstacle {

@@ -2,7 +2,8 @@
 
 #include <math.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 float heading(const float (&q)[4])
 {

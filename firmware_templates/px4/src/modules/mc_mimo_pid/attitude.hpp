@@ -1,7 +1,8 @@
 // Quaternions w, x, y, z; body FRD to earth NED.
 #pragma once
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // rad, from north to east
 float heading(const float (&q)[4]);

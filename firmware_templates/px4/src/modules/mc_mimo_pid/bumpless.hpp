@@ -5,7 +5,8 @@
 
 #include "mimo_pid.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // The integrators start with `torque`, what is missing without them, within their limits. One that the gains do not use
 // would stay for ever: it starts with zero.

@@ -1,8 +1,10 @@
 #include "excitation.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 constexpr float kStickMove = 0.1F;       // of -1 to 1
 constexpr float kMaxAmplitude = 0.5F;

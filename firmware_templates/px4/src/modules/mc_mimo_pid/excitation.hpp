@@ -4,7 +4,8 @@
 
 #include <stdint.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // Alternates between +1 and -1, each held for a random number of samples from hold_min to hold_max inclusive.
 class Prbs
@@ -69,7 +70,7 @@ private:
 	bool _configured{false};
 	int32_t _chosen{0};  // axis of the last configure()
 	int32_t _left{0};    // samples, this phase
-	float _sticks[4]{};  // at the start
+	float _sticks[4] {}; // at the start
 };
 
 }  // namespace mimopilot

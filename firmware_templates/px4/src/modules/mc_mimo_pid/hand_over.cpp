@@ -1,6 +1,7 @@
 #include "hand_over.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 HandOver::Action HandOver::step(uint64_t now, const Conditions &conditions)
 {

@@ -3,7 +3,8 @@
 
 #include <stdint.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 class HandOver
 {

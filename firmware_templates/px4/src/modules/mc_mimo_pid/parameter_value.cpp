@@ -1,10 +1,13 @@
 #include "parameter_value.hpp"
 
-namespace mimopilot {
-
-float parameter_value(px4::params name)
+namespace mimopilot
 {
-	const param_t handle = param_handle(name);
+
+namespace
+{
+
+float value_of(param_t handle)
+{
 	float number = 0.0F;
 
 	if (param_type(handle) == PARAM_TYPE_FLOAT) {
@@ -17,6 +20,16 @@ float parameter_value(px4::params name)
 	}
 
 	return number;
+}
+
+}  // namespace
+
+float parameter_value(px4::params name) { return value_of(param_handle(name)); }
+
+float parameter_value(const char *name, float fallback)
+{
+	const param_t handle = param_find(name);
+	return handle == PARAM_INVALID ? fallback : value_of(handle);
 }
 
 }  // namespace mimopilot

@@ -3,7 +3,8 @@
 
 #include <stdint.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // True if the mean of `samples` intervals from `first` to `last` (us) is one period (s), to 5 %.
 inline bool keeps_period(uint64_t first, uint64_t last, uint32_t samples, float period)

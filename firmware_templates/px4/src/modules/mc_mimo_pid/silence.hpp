@@ -5,10 +5,11 @@
 
 #include "gains.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // The longest age of a measurement, us: as long as the controller holds an invalid value.
-constexpr uint64_t kHoldTime = static_cast<uint64_t>(1.0e6F * kHoldSamples * kGains.period);
+constexpr uint64_t kHoldTime = static_cast<uint64_t>(1.0e6F * kHoldSamples *kGains.period);
 
 // Whether a value from `timestamp`, us, is older than `longest`.
 inline bool silent(uint64_t now, uint64_t timestamp, uint64_t longest) { return now > timestamp + longest; }

@@ -3,9 +3,11 @@
 #include <float.h>
 #include <math.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 constexpr float kRadian = 0.017453293F;  // rad/deg
 constexpr float kTurn = 6.2831853F;      // rad

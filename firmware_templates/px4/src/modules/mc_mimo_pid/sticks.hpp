@@ -3,7 +3,8 @@
 
 #include "stock_settings.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 struct StickInput {
 	float roll;      // -1 to 1, right positive; NaN counts as centred

@@ -7,9 +7,11 @@
 extern "C" int mc_att_control_main(int argc, char *argv[]);
 extern "C" int mc_rate_control_main(int argc, char *argv[]);
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 px4::atomic<bool> busy{false};
 char start[] = "start";

@@ -4,20 +4,22 @@
 
 #include "parameter_value.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 void read(StockSettings &settings)
 {
 	using px4::params;
 	static constexpr params kNames[] = {
 		params::MPC_MAN_TILT_MAX, params::MC_MAN_TILT_TAU, params::MPC_MAN_Y_MAX, params::MPC_MAN_Y_TAU,
-		params::MPC_YAW_EXPO, params::MPC_HOLD_DZ, params::MC_AIRMODE, params::MPC_THR_CURVE, params::MPC_MANTHR_MIN,
+		params::MC_AIRMODE, params::MPC_THR_CURVE, params::MPC_MANTHR_MIN,
 		params::MPC_THR_HOVER, params::MPC_THR_MAX, params::COM_SPOOLUP_TIME, params::MC_ACRO_R_MAX,
 		params::MC_ACRO_P_MAX, params::MC_ACRO_Y_MAX, params::MC_ACRO_EXPO, params::MC_ACRO_EXPO,
 		params::MC_ACRO_EXPO_Y, params::MC_ACRO_SUPEXPO, params::MC_ACRO_SUPEXPO, params::MC_ACRO_SUPEXPOY,
-		params::MC_BAT_SCALE_EN, params::MC_YAW_TQ_CUTOFF, params::COM_OF_LOSS_T, params::COM_RC_LOSS_T,
+		params::MC_BAT_SCALE_EN, params::COM_OF_LOSS_T, params::COM_RC_LOSS_T,
 	};
-	static_assert(offsetof(StockSettings, autotune) / sizeof(float) == sizeof(kNames) / sizeof(kNames[0]), "one float a parameter");
+	static_assert(offsetof(StockSettings, yaw_expo) / sizeof(float) == sizeof(kNames) / sizeof(kNames[0]),
+		      "one float a parameter");
 	float *value = &settings.tilt_max;
 
 	for (const params name : kNames) {
@@ -26,10 +28,10 @@ void read(StockSettings &settings)
 		value++;
 	}
 
-	// By name, because some boards are without it.
-	const param_t autotune = param_find("MC_AT_EN");
-	int32_t enabled = 0;
-	settings.autotune = autotune != PARAM_INVALID && param_get(autotune, &enabled) == 0 && enabled > 0;
+	settings.yaw_expo = parameter_value("MPC_YAW_EXPO", 0.6F);
+	settings.yaw_deadzone = parameter_value("MPC_HOLD_DZ", parameter_value("MAN_DEADZONE", 0.1F));
+	settings.yaw_torque_cutoff = parameter_value("MC_YAW_TQ_CUTOFF", 0.0F);
+	settings.autotune = parameter_value("MC_AT_EN", 0.0F);
 }
 
 }  // namespace mimopilot

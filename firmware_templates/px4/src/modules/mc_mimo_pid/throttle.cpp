@@ -2,9 +2,11 @@
 
 #include <math.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 // PX4's slew rates, 1/s: 1.6 s from 0 to MPC_MANTHR_MIN's default, 2 s to full thrust.
 constexpr float kSlow = 0.05F;

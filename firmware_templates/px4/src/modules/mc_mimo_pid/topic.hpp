@@ -1,7 +1,8 @@
 // A topic that another module publishes while this one does not.
 #pragma once
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // P: uORB::Publication or uORB::PublicationMulti. PX4 marks a topic as not advertised as soon as one of its publishers
 // stops, also for all others.

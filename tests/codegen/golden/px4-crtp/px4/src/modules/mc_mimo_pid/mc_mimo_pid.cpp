@@ -15,7 +15,8 @@
 
 using namespace mimopilot;
 
-namespace {
+namespace
+{
 
 constexpr char kExcitationName[] = "MIMO_EXC";
 constexpr char kPartsName[] = "MIMO_PID";
@@ -159,7 +160,7 @@ Obstacle McMimoPid::obstacle() const
 
 	if (_status.is_vtol || _status.vehicle_type != vehicle_status_s::VEHICLE_TYPE_ROTARY_WING) { return wrong_vehicle(); }
 
-	if (_settings.autotune) { return autotune_enabled(); }
+	if (_settings.autotune > 0.5F) { return autotune_enabled(); }
 
 	if (_clock.rate() == SampleClock::Rate::Wrong) { return wrong_gyro_rate(); }
 
@@ -420,7 +421,8 @@ void McMimoPid::update_silence(hrt_abstime now)
 	if (sticks) {
 		source.loss_time = _settings.sticks_loss_time;
 
-	} else if (_control_mode.flag_control_offboard_enabled || _status.nav_state >= vehicle_status_s::NAVIGATION_STATE_EXTERNAL1) {
+	} else if (_control_mode.flag_control_offboard_enabled
+		   || _status.nav_state >= vehicle_status_s::NAVIGATION_STATE_EXTERNAL1) {
 		source.loss_time = _settings.offboard_loss_time;
 	}
 

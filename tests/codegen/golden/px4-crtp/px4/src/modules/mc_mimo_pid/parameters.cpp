@@ -3,9 +3,11 @@
 
 #include "parameter_value.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 struct Range {
 	float minimum;

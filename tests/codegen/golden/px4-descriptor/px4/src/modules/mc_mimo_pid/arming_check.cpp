@@ -4,9 +4,11 @@
 #include <px4_platform_common/events.h>
 #include <string.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 constexpr char kName[] = "mc_mimo_pid";
 constexpr uint64_t kRetry = 2000000;  // us
@@ -24,7 +26,8 @@ Obstacle wrong_vehicle()
 	 * @description
 	 * Set <param>MIMO_EN</param> to 0.
 	 */
-	return reporter.armingCheckFailureExt(events::ID("mimo_vehicle"), events::Log::Error, "MIMO flies multicopters only, no VTOL");
+	return reporter.armingCheckFailureExt(events::ID("mimo_vehicle"), events::Log::Error,
+					      "MIMO flies multicopters only, no VTOL");
 }
 
 Obstacle autotune_enabled()
@@ -33,7 +36,8 @@ Obstacle autotune_enabled()
 	 * @description
 	 * It would tune gains that are not flown. Set <param>MC_AT_EN</param> to 0 and reboot.
 	 */
-	return reporter.armingCheckFailureExt(events::ID("mimo_autotune"), events::Log::Error, "MIMO: set MC_AT_EN to 0 and reboot");
+	return reporter.armingCheckFailureExt(events::ID("mimo_autotune"), events::Log::Error,
+					      "MIMO: set MC_AT_EN to 0 and reboot");
 }
 
 Obstacle wrong_gyro_rate()
@@ -42,7 +46,8 @@ Obstacle wrong_gyro_rate()
 	 * @description
 	 * The gains need this gyro rate. Set <param>IMU_GYRO_RATEMAX</param> and reboot.
 	 */
-	return reporter.armingCheckFailureExt(events::ID("mimo_gyro_rate"), events::Log::Error, "MIMO: gyro rate is not 250 Hz");
+	return reporter.armingCheckFailureExt(events::ID("mimo_gyro_rate"), events::Log::Error,
+					      "MIMO: gyro rate is not 250 Hz");
 }
 
 Obstacle wrong_parameter()
@@ -51,7 +56,8 @@ Obstacle wrong_parameter()
 	 * @description
 	 * The console names the parameter.
 	 */
-	return reporter.armingCheckFailureExt(events::ID("mimo_parameter"), events::Log::Error, "MIMO: a gain is out of its range");
+	return reporter.armingCheckFailureExt(events::ID("mimo_parameter"), events::Log::Error,
+					      "MIMO: a gain is out of its range");
 }
 
 void ArmingCheck::ask(uint64_t now)

@@ -5,7 +5,8 @@
 #include "excitation.hpp"
 #include "gains.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 class Parameters
 {
