@@ -54,21 +54,23 @@ MODEL = np.dtype(
 
 STATE = np.dtype(
     [
-        ("gains", "<f4", len(PARAMETERS)),
-        ("integral", "<f4", 3),
-        ("derivative", "<f4", 3),
+        ("hold", "<i4", 5),
+        ("missing", "<i4"),
+        ("expired", "<i4"),
+        ("fault_count", "<u4"),
+        ("rate_mode", "<i4"),
+        ("slewing", "<i4"),
+        ("rates_setpoint", "<f4", 3),
+        ("acceleration", "<f4", 2),
+        ("model", MODEL),
         ("attitude_setpoint", "<f4", 4),
         ("yaw_rate_setpoint", "<f4"),
         ("attitude", "<f4", 4),
         ("rates", "<f4", 3),
-        ("rates_setpoint", "<f4", 3),
-        ("acceleration", "<f4", 2),
-        ("age", "<i4", 5),
-        ("missing", "<i4"),
-        ("rate_mode", "<i4"),
-        ("slewing", "<i4"),
-        ("fault_count", "<u4"),
-        ("model", MODEL),
+        ("derivative", "<f4", 3),
+        ("integral", "<f4", 3),
+        ("derivative_gain", "<f4"),
+        ("gains", "<f4", len(PARAMETERS)),
     ]
 )
 

@@ -41,7 +41,8 @@ def random_inputs(rows: int, generator: np.random.Generator) -> NDArray[Any]:
     turns = generator.standard_normal((rows, 3)) * np.clip(scale, 0, 1)
     for name, share in (("attitude", 1.0), ("attitude_setpoint", generator.choice([0.0, 1.0, 1.3], (rows, 1)))):
         inputs[name] = _quaternions(turns * share + 0.3 * generator.standard_normal((rows, 3)) * scale, generator)
-    inputs["attitude_setpoint"][:: rows // 4] = inputs["attitude"][:: rows // 4][:, [1, 0, 3, 2]]  # about half a turn
+    some = slice(None, None, max(1, rows // 4))
+    inputs["attitude_setpoint"][some] = inputs["attitude"][some][:, [1, 0, 3, 2]]  # about half a turn
     inputs["yaw_rate_setpoint"] = generator.choice([np.nan, 0.0, 0.5, -2.0], rows)
     inputs["saturation"] = generator.choice([-1, 0, 0, 0, 1], (rows, 3))
     inputs["armed"] = generator.random(rows) > 0.02

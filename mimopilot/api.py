@@ -136,7 +136,12 @@ def tune(
 
 @reproducible
 def certify(
-    log: Log, gains: GainSet, *, spec: PathLike | TuningSpec | None = None, columns: PathLike | None = None
+    log: Log,
+    gains: GainSet,
+    *,
+    rate: float | None = None,
+    spec: PathLike | TuningSpec | None = None,
+    columns: PathLike | None = None,
 ) -> Gains:
     """Check the stability of the closed loop, from a flight of the vehicle with any gains.
 
@@ -145,6 +150,8 @@ def certify(
     log : str, Path or Experiment
     gains : str, Path or Gains
         Set to examine.
+    rate : float, optional, Hz
+        Carry the gains to this control rate first. None: their own. Either may differ from that of the log.
     spec : str, Path or TuningSpec, optional
         Whose ``certificate`` says which margins are needed.
     columns : str or Path, optional
@@ -153,16 +160,17 @@ def certify(
     Returns
     -------
     Gains
-        The same set with its new certificate: see `Gains.verdict` and `Gains.certificate`.
+        The set with its new certificate: see `Gains.verdict` and `Gains.certificate`.
 
     Raises
     ------
     Error
         When the log or the gains cannot be read, or do not belong together.
     """
-    from mimopilot.tuning.design.cascade import certify_from_log
+    from mimopilot.tuning.design.cascade import at_rate, certify_from_log
 
-    return certify_from_log(_experiment(log, columns), _gains(gains), _spec(spec, {}))
+    examined = _gains(gains) if rate is None else at_rate(_gains(gains), rate)
+    return certify_from_log(_experiment(log, columns), examined, _spec(spec, {}))
 
 
 @reproducible
@@ -327,14 +335,16 @@ def generate(
     Raises
     ------
     Error
-        When the target or an option is unknown, a gain is out of its range, the gains are not certified, or the folder
-        holds files of somebody else.
+        When the target or an option is unknown, a gain is out of its range, the gains are not certified, or are
+        for a control rate that PX4 does not have (target ``px4``), or the folder holds files of somebody else.
     """
     from mimopilot.codegen.render import render, write_tree
-    from mimopilot.tuning.acceptance import check_verdict
+    from mimopilot.tuning.acceptance import check_px4_rate, check_verdict
 
     loaded = _gains(gains)
     warning = check_verdict(loaded, allow=uncertified)
+    if target == "px4":
+        check_px4_rate(loaded)
     files = render(loaded, target, **options)
     written = write_tree(files, Path(out), force)
     return GeneratedTree([Path(out) / name for name in files], [Path(out) / name for name in written], warning)

@@ -129,7 +129,7 @@ class Controller:
             w, x, y, z = -w, -x, -y, -z
         square = w * w + z * z
         cosine = self._root(square)
-        if not cosine > f(INVERTED):
+        if cosine < f(INVERTED):
             return AttitudeError([f(2) * x, f(2) * y, f(0)], (f(1), f(0)))
         along, across = cosine - weight * (cosine - w), weight * z
         scale = f(2) / (cosine * self._root(along * along + across * across))
@@ -139,7 +139,8 @@ class Controller:
             scale * (pitch * along - roll * across),
             scale * (square * z),
         ]
-        return AttitudeError(error, ((w * w - z * z) / square, (f(2) * (w * z)) / square))
+        share = f(2) * z / square
+        return AttitudeError(error, (f(1) - share * z, share * w))
 
     def _heading(self) -> tuple[Any, Any]:
         """Cosine and sine of half the heading of the setpoint."""
@@ -154,9 +155,9 @@ class Controller:
         if self.omega == 0 or self.rate_mode:
             return None
         zero, two = self.f(0), self.f(2)
-        cosine, sine = self._heading()
         if self.model is None:
-            return ModelState(self._direction(cosine, sine), [zero, zero], [zero, zero])
+            return ModelState(self._measured_direction(), [zero, zero], [zero, zero])
+        cosine, sine = self._heading()
         _, x, y, _ = self.setpoint
         wanted = [two * (cosine * x + sine * y), two * (cosine * y - sine * x)]
         stiffness, friction = self.omega * self.omega, two * self.damping * self.omega
@@ -167,15 +168,16 @@ class Controller:
             angle.append(self.model.angle[j] + self.period * rate[j])
         return ModelState(angle, rate, acceleration)
 
-    def _direction(self, cosine: Any, sine: Any) -> list[Any]:
-        """Tilt of the measured attitude, in the axes of a heading (cosine and sine of half the angle)."""
-        f = self.f
-        w, x, y, z = self.attitude
+    def _measured_direction(self) -> list[Any]:
+        """Measured direction of body z: 2 imag of the tilt, in the axes of the setpoint's heading."""
+        q, two, (cosine, sine) = self.attitude, self.f(2), self._heading()
+        w, x = cosine * q[0] + sine * q[3], cosine * q[1] + sine * q[2]
+        y, z = cosine * q[2] - sine * q[1], cosine * q[3] - sine * q[0]
         length = self._root(w * w + z * z)
-        scale = f(0) if length < f(INVERTED) else f(2) / length
-        east, north = scale * (x * w - y * z), scale * (x * z + y * w)
-        c, s = f(1) - f(2) * (sine * sine), f(2) * (sine * cosine)
-        return [c * east + s * north, c * north - s * east]
+        if length < self.f(INVERTED):
+            return [two * x, two * y]
+        scale = two / length
+        return [scale * (x * w - y * z), scale * (y * w + x * z)]
 
     def _model_attitude(self, model: ModelState) -> list[Any]:
         """Quaternion with the setpoint's heading and the model's tilt."""
@@ -352,16 +354,15 @@ class Controller:
             filtered = self.pole * self.derivative[i] + slope * (self.rates[i] - before)
             self.derivative[i] = f(0) if lost[i] or first else filtered
             self.rates[i] = f(0) if lost[i] else self.rates[i]
-        u_bar = [self._optional(v, MAX_EXCITATION) for v in u_bar]
         if fault:
             return self._damp_rates(lost, fault, armed)
 
+        u_bar = [self._optional(v, MAX_EXCITATION) for v in u_bar]
+        if not any(self.age):
+            self.model = self._advanced_model()
+            self.rates_setpoint, self.acceleration = self._rates_setpoint(self.model)
         if not armed:
-            self.model = None
-        if self.age[0] == 0 and (rate_mode or self.age[1] == 0):
-            model = self._advanced_model()
-            self.model = model if armed else None
-            self.rates_setpoint, self.acceleration = self._rates_setpoint(model)
+            self.model, self.acceleration = None, [f(0)] * 2
         r = self.rates_setpoint
         rest = [a + b for a, b in zip(self._rest(r, self.acceleration), u_bar, strict=True)]
         u = []

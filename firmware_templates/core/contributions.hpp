@@ -20,10 +20,10 @@ struct Contributions {
 inline void contributions(const State &state, const Output &output, Contributions &parts)
 {
 	const Gains &gains = state.gains;
-	const float *const r = state.rates_setpoint;
+	const float *const r = state.flown.rates;
 	const float *const d = state.derivative;
 	const float e[kAxes] = {r[0] - state.rates[0], r[1] - state.rates[1], r[2] - state.rates[2]};
-	const float *const al = state.acceleration;
+	const float *const al = state.flown.acceleration;
 
 	for (int j = 0; j < kModelAxes; j++) {
 		const int other = 1 - j;

@@ -13,13 +13,11 @@
 
 #include "mimo_pid.hpp"
 
-namespace mimopilot
-{
+namespace mimopilot {
 
-namespace
-{
+namespace {
 
-// Code size and step time have a budget: the attributes below keep step() fast and the rest small.
+// Code size, stack and step time have a budget, with -Os: the attributes below keep step() fast and the rest small.
 
 constexpr float kInverted = 0.0045F;  // cosine of half the tilt below which, as in PX4, the error has no turn
 
@@ -28,123 +26,150 @@ constexpr float kInverted = 0.0045F;  // cosine of half the tilt below which, as
 	return __builtin_expect(static_cast<long>(condition), 0L) != 0L;
 }
 
-// Compares bit patterns: there, infinity and NaN exceed every number, whatever the optimisation flags.
-bool within(float value, float limit)
+[[gnu::always_inline]] inline int32_t bits_of(float value)
 {
-	uint32_t bits;
-	uint32_t limit_bits;
+	int32_t bits;
 	__builtin_memcpy(&bits, &value, sizeof(bits));
-	__builtin_memcpy(&limit_bits, &limit, sizeof(limit_bits));
-	return bits << 1 <= limit_bits << 1;
+	return bits;
 }
 
-float clamp(float value, float limit)
+// Compares bit patterns: there, infinity and NaN exceed every number, whatever the optimisation flags.
+[[gnu::always_inline]] inline bool within(float value, float limit)
 {
-	if (__builtin_fabsf(value) > limit) { value = value > 0.0F ? limit : -limit; }
+	return static_cast<uint32_t>(bits_of(value)) << 1 <= static_cast<uint32_t>(bits_of(limit)) << 1;
+}
+
+[[gnu::always_inline]] inline float clamp(float value, float limit)
+{
+	if (unlikely(__builtin_fabsf(value) > limit)) { value = value > 0.0F ? limit : -limit; }
 
 	return value;
 }
 
-float row(const float (&gain)[2], float roll, float pitch) { return gain[0] * roll + gain[1] * pitch; }
-
-float root(float square) { return square > 0.0F ? __builtin_sqrtf(square) : 0.0F; }
-
-float length_squared(const float (&q)[4]) { return ((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3]; }
-
-template<typename Array> [[gnu::always_inline]] inline void copy(const Array &from, Array &to)
+[[gnu::noinline]] void clamp_axes(float (&values)[kAxes], const float (&limits)[kAxes])
 {
-	__builtin_memcpy(&to, &from, sizeof(to));
-}
-
-[[gnu::cold, gnu::noinline]] bool acceptable(const Gains &gains)
-{
-	static_assert(sizeof(Gains) == kGainCount * sizeof(float), "Gains is a row of floats");
-	const float *const values = reinterpret_cast<const float *>(&gains);
-
-	for (int i = 0; i < kGainCount; i++) {
-		if (!within(values[i], kMaxGain)) { return false; }
+	for (int j = 0; j < kAxes; j++) {
+		if (__builtin_fabsf(values[j]) > limits[j]) { values[j] = values[j] > 0.0F ? limits[j] : -limits[j]; }
 	}
-
-	return valid(gains);
 }
 
-bool follows(const Gains &gains) { return !within(gains.model_omega, 0.0F); }
+[[gnu::always_inline]] inline float row(const float (&gain)[2], float roll, float pitch)
+{
+	return gain[0] * roll + gain[1] * pitch;
+}
 
-// Heading of the setpoint: cosine and sine of half the angle.
-struct Heading {
-	float cosine;
-	float sine;
+struct Quaternion {
+	float w;
+	float x;
+	float y;
+	float z;
 };
 
-[[gnu::always_inline]] inline Heading heading_of(const float (&q)[4])
+[[gnu::always_inline]] inline Quaternion load(const float (&q)[4]) { return {q[0], q[1], q[2], q[3]}; }
+
+[[gnu::always_inline]] inline void store(const Quaternion &q, float (&to)[4])
 {
-	const float cosine = root(q[0] * q[0] + q[3] * q[3]);
-
-	if (unlikely(cosine < kInverted)) { return {1.0F, 0.0F}; }
-
-	const float inverse = 1.0F / cosine;
-	return {q[0] *inverse, q[3] *inverse};
+	to[0] = q.w;
+	to[1] = q.x;
+	to[2] = q.y;
+	to[3] = q.z;
 }
 
-// The model at rest, with the measured direction of body z.
-[[gnu::cold, gnu::noinline]] void start(const Heading &heading, const float (&q)[4], Model &model)
+[[gnu::always_inline]] inline float length_squared(const Quaternion &q)
 {
-	const float cosine = root(q[0] * q[0] + q[3] * q[3]);
-	const float scale = unlikely(cosine < kInverted) ? 0.0F : 2.0F / cosine;
-	const float east = scale * (q[1] * q[0] - q[2] * q[3]);
-	const float north = scale * (q[1] * q[3] + q[2] * q[0]);
-	const float c = 1.0F - 2.0F * (heading.sine * heading.sine);
-	const float s = 2.0F * (heading.sine * heading.cosine);
-	model = Model{};
-	model.angle[0] = c * east + s * north;
-	model.angle[1] = c * north - s * east;
+	return ((q.w * q.w + q.x * q.x) + q.y * q.y) + q.z * q.z;
 }
 
-// One period of the attitude model, semi-implicit Euler. Attitude: the setpoint's heading, then the model's tilt.
-[[gnu::noinline]] void advance(const Gains &gains, const State &state, Model &model, float (&attitude)[4])
+[[gnu::always_inline]] inline bool is_rotation(const Quaternion &q)
 {
-	const float(&q)[4] = state.attitude_setpoint;
-	const Heading heading = heading_of(q);
+	return within(length_squared(q) - 1.0F, kMaxNormError);
+}
 
-	if (model.running != 0) {
-		const float omega = gains.model_omega;
-		const float stiffness = omega * omega;
-		const float friction = (2.0F * gains.model_damping) * omega;
-		const float wanted[kModelAxes] = {
-			2.0F * (heading.cosine *q[1] + heading.sine *q[2]),
-			2.0F * (heading.cosine *q[2] - heading.sine *q[1]),
-		};
+[[gnu::always_inline]] inline bool follows(const Gains &gains) { return !within(gains.model_omega, 0.0F); }
 
-		for (int j = 0; j < kModelAxes; j++) {
-			const float acceleration = stiffness * (wanted[j] - model.angle[j]) - friction * model.rate[j];
-			model.acceleration[j] = acceleration;
-			model.rate[j] += gains.period * acceleration;
-			model.angle[j] += gains.period * model.rate[j];
+// One period of the attitude model, semi-implicit Euler. Returns the setpoint's heading, then the model's tilt.
+[[gnu::always_inline]] inline Quaternion advance(State &state)
+{
+	const Gains &gains = state.gains;
+	Model &model = state.flown.model;
+	const float(&target)[4] = state.attitude_setpoint;
+	const float length = __builtin_sqrtf(target[0] * target[0] + target[3] * target[3]);
+	float cosine = 1.0F;  // of half the heading
+	float sine = 0.0F;
+
+	if (!unlikely(length < kInverted)) {
+		const float inverse = 1.0F / length;
+		cosine = target[0] * inverse;
+		sine = target[3] * inverse;
+	}
+
+	// The direction of body z that is wanted, or measured: 2 imag of the tilt in the axes of that heading.
+	const bool running = model.running != 0;
+	const float(&q)[4] = running ? state.attitude_setpoint : state.attitude;
+	const float x = cosine * q[1] + sine * q[2];
+	const float y = cosine * q[2] - sine * q[1];
+	float direction[kModelAxes] = {2.0F * x, 2.0F * y};
+
+	if (!running) {  // the measured heading may differ
+		const float w = cosine * q[0] + sine * q[3];
+		const float z = cosine * q[3] - sine * q[0];
+		const float upright = __builtin_sqrtf(w * w + z * z);
+
+		if (!unlikely(upright < kInverted)) {
+			const float scale = 2.0F / upright;
+			direction[0] = scale * (x * w - y * z);
+			direction[1] = scale * (y * w + x * z);
+		}
+	}
+
+	model.running = 1;
+	const float stiffness = gains.model_omega * gains.model_omega;
+	const float friction = (2.0F * gains.model_damping) * gains.model_omega;
+
+#pragma GCC unroll 2
+	for (int j = 0; j < kModelAxes; j++) {
+		float rate = 0.0F;
+		float acceleration = 0.0F;
+		float angle = direction[j];
+
+		if (running) {
+			acceleration = stiffness * (angle - model.angle[j]) - friction * model.rate[j];
+			rate = model.rate[j] + gains.period * acceleration;
+			angle = model.angle[j] + gains.period * rate;
 		}
 
-	} else {
-		start(heading, state.attitude, model);
+		model.acceleration[j] = acceleration;
+		model.rate[j] = rate;
+		model.angle[j] = angle;
 	}
 
 	const float roll = 0.5F * model.angle[0];
 	const float pitch = 0.5F * model.angle[1];
-	const float tilt = root(1.0F - (roll * roll + pitch * pitch));
-	attitude[0] = heading.cosine * tilt;
-	attitude[1] = heading.cosine * roll - heading.sine * pitch;
-	attitude[2] = heading.cosine * pitch + heading.sine * roll;
-	attitude[3] = heading.sine * tilt;
+	const float square = 1.0F - (roll * roll + pitch * pitch);
+	const float tilt = square > 0.0F ? __builtin_sqrtf(square) : 0.0F;
+	return {
+		cosine * tilt,
+		cosine * roll - sine * pitch,
+		cosine * pitch + sine * roll,
+		sine * tilt,
+	};
 }
 
-// Attitude controller: rate setpoint r. `acceleration`: of the attitude model, in body axes, rad/s^2.
-[[gnu::noinline]] void outer_loop(const Gains &gains, const State &state, const Model &model, const float (&target)[4],
-				  float (&r)[kAxes], float (&acceleration)[kModelAxes])
+// Attitude controller. The attitude model moves one period ahead. Sets the flown rate setpoint, and the acceleration of the attitude model in body axes.
+// In rate mode, r_i is given.
+[[gnu::noinline]] void outer_loop(State &state)
 {
+	if (unlikely(state.rate_mode != 0)) { return; }
+
 	// conj(q) target: the rotation from q to the target, in the axes of q.
-	const float(&q)[4] = state.attitude;
-	float w = ((q[0] * target[0] + q[1] * target[1]) + q[2] * target[2]) + q[3] * target[3];
-	float x = ((q[0] * target[1] - q[1] * target[0]) - q[2] * target[3]) + q[3] * target[2];
-	float y = ((q[0] * target[2] + q[1] * target[3]) - q[2] * target[0]) - q[3] * target[1];
-	float z = ((q[0] * target[3] - q[1] * target[2]) + q[2] * target[1]) - q[3] * target[0];
+	const Gains &gains = state.gains;
+	const bool following = follows(gains);
+	const Quaternion target = unlikely(following) ? advance(state) : load(state.attitude_setpoint);
+	const Quaternion q = load(state.attitude);
+	float w = ((q.w * target.w + q.x * target.x) + q.y * target.y) + q.z * target.z;
+	float x = ((q.w * target.x - q.x * target.w) - q.y * target.z) + q.z * target.y;
+	float y = ((q.w * target.y + q.x * target.z) - q.y * target.w) - q.z * target.x;
+	float z = ((q.w * target.z - q.x * target.y) + q.y * target.x) - q.z * target.w;
 
 	if (w < 0.0F) {
 		w = -w;
@@ -156,15 +181,15 @@ struct Heading {
 	// It is a tilt (cosine, roll, pitch, 0), then a turn (w, 0, 0, z) / cosine; all are of half angles. The turn is
 	// weighted: (turn, 0, 0, weight z) / length.
 	const float square = w * w + z * z;
-	const float cosine = root(square);
+	const float cosine = __builtin_sqrtf(square);
 	float roll = 2.0F * x;
 	float pitch = 2.0F * y;
 	float yaw = 0.0F;
 
-	if (cosine > kInverted) {
+	if (!unlikely(cosine < kInverted)) {
 		const float turn = cosine - gains.yaw_weight * (cosine - w);
 		const float weighted = gains.yaw_weight * z;
-		const float scale = 2.0F / (cosine * root(turn * turn + weighted * weighted));
+		const float scale = 2.0F / (cosine * __builtin_sqrtf(turn * turn + weighted * weighted));
 		const float tilt_roll = x * w - y * z;
 		const float tilt_pitch = y * w + x * z;
 		roll = scale * (tilt_roll * turn + tilt_pitch * weighted);
@@ -174,209 +199,151 @@ struct Heading {
 
 	// Earth's z axis in body axes, times the setpoint's yaw rate.
 	const float yaw_rate = 2.0F * state.yaw_rate_setpoint;
-	float roll_rate = row(gains.kp_o[0], roll, pitch) + yaw_rate * (q[1] * q[3] - q[0] * q[2]);
-	float pitch_rate = row(gains.kp_o[1], roll, pitch) + yaw_rate * (q[2] * q[3] + q[0] * q[1]);
-	const float turn_rate = gains.yaw_kp_o * yaw + yaw_rate * (0.5F - (q[1] * q[1] + q[2] * q[2]));
+	float roll_rate = row(gains.kp_o[0], roll, pitch) + yaw_rate * (q.x * q.z - q.w * q.y);
+	float pitch_rate = row(gains.kp_o[1], roll, pitch) + yaw_rate * (q.y * q.z + q.w * q.x);
+	const float turn_rate = gains.yaw_kp_o * yaw + yaw_rate * (0.5F - (q.x * q.x + q.y * q.y));
 
-	if (unlikely(follows(gains))) {
-		float turn_cosine = 1.0F;
-		float turn_sine = 0.0F;
+	if (unlikely(following)) {
+		const Model &model = state.flown.model;
+		const float share = unlikely(cosine < kInverted) ? 0.0F : (2.0F * z) / square;
+		const float turn_cosine = 1.0F - share * z;
+		const float turn_sine = share * w;
+		const float roll_ahead = turn_cosine * model.rate[0] - turn_sine * model.rate[1];
+		const float pitch_ahead = turn_sine * model.rate[0] + turn_cosine * model.rate[1];
+		state.flown.acceleration[0] = turn_cosine * model.acceleration[0] - turn_sine * model.acceleration[1];
+		state.flown.acceleration[1] = turn_sine * model.acceleration[0] + turn_cosine * model.acceleration[1];
+		roll_rate += row(gains.kff_o[0], roll_ahead, pitch_ahead);
+		pitch_rate += row(gains.kff_o[1], roll_ahead, pitch_ahead);
+	}
 
-		if (cosine > kInverted) {
-			turn_cosine = (w * w - z * z) / square;
-			turn_sine = (2.0F * (w * z)) / square;
+	state.flown.rates[0] = roll_rate;
+	state.flown.rates[1] = pitch_rate;
+	state.flown.rates[2] = turn_rate;
+	clamp_axes(state.flown.rates, gains.rate_max);
+}
+
+// v without the integral, and the integral's slope.
+struct Torque {
+	float rest[kAxes];
+	float slope[kAxes];
+};
+
+[[gnu::noinline]] void rate_controller(const State &state, Torque &torque)
+{
+	const Gains &gains = state.gains;
+	const float roll = state.flown.rates[0];
+	const float pitch = state.flown.rates[1];
+	const float yaw = state.flown.rates[2];
+	const float roll_error = roll - state.rates[0];
+	const float pitch_error = pitch - state.rates[1];
+	const float yaw_error = yaw - state.rates[2];
+
+	for (int j = 0; j < kModelAxes; j++) {
+		float feedforward = row(gains.kff_i[j], roll, pitch);
+
+		if (follows(gains)) {
+			feedforward += row(gains.kaff_i[j], state.flown.acceleration[0], state.flown.acceleration[1]);
 		}
 
-		const float rate[kModelAxes] = {
-			turn_cosine *model.rate[0] - turn_sine *model.rate[1],
-			turn_sine *model.rate[0] + turn_cosine *model.rate[1],
-		};
-		acceleration[0] = turn_cosine * model.acceleration[0] - turn_sine * model.acceleration[1];
-		acceleration[1] = turn_sine * model.acceleration[0] + turn_cosine * model.acceleration[1];
-		roll_rate += row(gains.kff_o[0], rate[0], rate[1]);
-		pitch_rate += row(gains.kff_o[1], rate[0], rate[1]);
+		torque.rest[j] = (row(gains.kp_i[j], roll_error, pitch_error)
+				  - row(gains.kd_i[j], state.derivative[0], state.derivative[1])) + feedforward;
+		torque.slope[j] = row(gains.ki_i[j], roll_error, pitch_error);
 	}
 
-	r[0] = clamp(roll_rate, gains.rate_max[0]);
-	r[1] = clamp(pitch_rate, gains.rate_max[1]);
-	r[2] = clamp(turn_rate, gains.rate_max[2]);
+	torque.rest[2] = (gains.yaw_kp_i * yaw_error - gains.yaw_kd_i * state.derivative[2]) + gains.yaw_kff_i * yaw;
+	torque.slope[2] = gains.yaw_ki_i * yaw_error;
 }
 
-// Rate setpoint r of the present mode. The attitude model moves one period ahead.
-[[gnu::always_inline]] inline void update_rates_setpoint(const Gains &gains, const State &state, Model &model,
-		float (&r)[kAxes], float (&acceleration)[kModelAxes])
+[[gnu::always_inline]] inline void stop_model(Flown &flown)
 {
-	if (unlikely(state.rate_mode != 0)) {
-		if (&r != &state.rates_setpoint) { copy(state.rates_setpoint, r); }
-
-	} else if (unlikely(follows(gains))) {
-		float attitude[4];
-		advance(gains, state, model, attitude);
-		outer_loop(gains, state, model, attitude, r, acceleration);
-
-	} else {
-		outer_loop(gains, state, model, state.attitude_setpoint, r, acceleration);
-	}
+	flown.model.running = 0;
+	flown.acceleration[0] = flown.acceleration[1] = 0.0F;
 }
 
-struct Axes {
-	float roll;
-	float pitch;
-	float yaw;
-};
-
-// Inputs of the rate controller.
-struct Signals {
-	Axes rates_setpoint;
-	Axes error;
-	Axes derivative;
-	bool following;
-	float roll_acceleration;  // of the attitude model
-	float pitch_acceleration;
-};
-
-[[gnu::always_inline]] inline Signals signals(const Gains &gains, const State &state,
-		const float (&acceleration)[kModelAxes], const float (&r)[kAxes])
+// Ends what depends on past attitude setpoints. If disarmed, the integrals are zero; if an input failed, the rate
+// setpoint.
+[[gnu::cold, gnu::noinline]] void settle(State &state, int32_t armed, int32_t failed)
 {
-	return {
-		{r[0], r[1], r[2]},
-		{r[0] - state.rates[0], r[1] - state.rates[1], r[2] - state.rates[2]},
-		{state.derivative[0], state.derivative[1], state.derivative[2]},
-		follows(gains),
-		acceleration[0],
-		acceleration[1],
-	};
-}
-
-// Terms of v on one axis.
-struct Terms {
-	float proportional;
-	float derivative;
-	float feedforward;
-	float slope;  // Ki e
-};
-
-[[gnu::always_inline]] inline Terms rate_terms(const Gains &gains, const Signals &x, int j)
-{
-	if (j == 2) {
-		return {
-			gains.yaw_kp_i * x.error.yaw,
-			gains.yaw_kd_i * x.derivative.yaw,
-			gains.yaw_kff_i * x.rates_setpoint.yaw,
-			gains.yaw_ki_i * x.error.yaw,
-		};
-	}
-
-	float feedforward = row(gains.kff_i[j], x.rates_setpoint.roll, x.rates_setpoint.pitch);
-
-	if (unlikely(x.following)) { feedforward += row(gains.kaff_i[j], x.roll_acceleration, x.pitch_acceleration); }
-
-	return {
-		row(gains.kp_i[j], x.error.roll, x.error.pitch),
-		row(gains.kd_i[j], x.derivative.roll, x.derivative.pitch),
-		feedforward,
-		row(gains.ki_i[j], x.error.roll, x.error.pitch),
-	};
-}
-
-// v without the integral.
-float sum(const Terms &terms) { return (terms.proportional - terms.derivative) + terms.feedforward; }
-
-[[gnu::cold, gnu::noinline]] void clear(State &state)
-{
-	for (float &integral : state.integral) { integral = 0.0F; }
-
-	state.model.running = 0;
 	state.slewing = 0;
+	stop_model(state.flown);
+
+	if (armed == 0) { state.integral[0] = state.integral[1] = state.integral[2] = 0.0F; }
+
+	if (failed != 0) { state.flown.rates[0] = state.flown.rates[1] = state.flown.rates[2] = 0.0F; }
 }
 
-// v of each axis without its integral.
-[[gnu::cold, gnu::noinline]] void torque_of(const Gains &gains, const State &state, const float (&r)[kAxes],
-		const float (&acceleration)[kModelAxes], float (&v)[kAxes])
-{
-	const Signals x = signals(gains, state, acceleration, r);
-
-	for (int j = 0; j < kAxes; j++) { v[j] = sum(rate_terms(gains, x, j)); }
-}
-
-// The same with the rate setpoint of the next period, if the inputs stay as they are.
-[[gnu::cold, gnu::noinline]] void next_torque(const Gains &gains, const State &state, float (&v)[kAxes])
-{
-	float r[kAxes];
-	float acceleration[kModelAxes] = {};
-	Model model = state.model;
-	update_rates_setpoint(gains, state, model, r, acceleration);
-	torque_of(gains, state, r, acceleration, v);
-}
-
-// Counts invalid samples, and the samples since the last valid one. `missing` and the result are fault bits; the latter
+// Counts invalid samples, and those for which an input is still held. `missing` and the result are fault bits; the latter
 // of inputs that are invalid for too long. The derivative of a rate starts again after that.
 [[gnu::cold, gnu::noinline]] int32_t count_missing(State &state, int32_t missing, int32_t silent)
 {
-	int32_t failed = 0;
+	int32_t expired = 0;
 
-	for (uint32_t bits = static_cast<uint32_t>(missing | state.missing); bits != 0U; bits &= bits - 1U) {
-		const int i = __builtin_ctz(bits);
-		int32_t &age = state.age[i];
-		const bool first = age > kHoldSamples;
+	for (uint32_t left = static_cast<uint32_t>(missing); left != 0U; left &= left - 1U) {
+		const int i = __builtin_ctz(left);
+		const int32_t bit = 1 << i;
+		int32_t hold = (state.missing & bit) != 0 ? state.hold[i] : kHoldSamples;
+		state.fault_count++;
 
-		if ((missing >> i & 1) == 0) {
-			age = 0;
+		if (hold == 0 || (silent & bit) != 0) {
+			expired |= bit;
+			hold = 1;
 
-		} else {
-			state.fault_count++;
-			age = first || (silent >> i & 1) != 0 ? kHoldSamples + 1 : age + 1;
+			if (bit >= kRateFault) { state.rates[i - 2] = 0.0F; }
 		}
 
-		const bool expired = age > kHoldSamples;
+		state.hold[i] = hold - 1;
+	}
 
-		if (expired) { failed |= 1 << i; }
+	uint32_t restarted = static_cast<uint32_t>(expired | state.expired) / kRateFault;
 
-		if (i >= 2 && (first || expired)) {
-			state.derivative[i - 2] = 0.0F;
-
-			if (expired) { state.rates[i - 2] = 0.0F; }
-		}
+	for (int i = 0; restarted != 0U; i++, restarted >>= 1) {
+		if ((restarted & 1U) != 0U) { state.derivative[i] = 0.0F; }
 	}
 
 	state.missing = missing;
-	return state.rate_mode != 0 ? failed & ~kAttitudeFault : failed;
+	state.expired = expired;
+	return state.rate_mode != 0 ? expired & ~kAttitudeFault : expired;
 }
 
 // NaN means none; any other value out of range is a fault. Returns 0 for both.
-[[gnu::cold, gnu::noinline]] float optional(float value, float limit, uint32_t &fault_count)
+[[gnu::always_inline]] inline float optional(float value, float limit, uint32_t &fault_count)
 {
-	if (within(value, limit)) { return value; }
+	if (unlikely(!within(value, limit))) {
+		if (within(value, __builtin_inff())) { fault_count++; }
 
-	if (within(value, __builtin_inff())) { fault_count++; }
+		value = 0.0F;
+	}
 
-	return 0.0F;
+	return value;
 }
 
-// Turns q towards `target` by at most half of `angle` of rotation; both are unit quaternions.
-[[gnu::cold, gnu::noinline]] void slew(const float (&target)[4], float angle, float (&q)[4])
+// Turns the attitude setpoint towards the given one, within the slew limit. It starts at the measured attitude.
+[[gnu::cold, gnu::noinline]] void slew(State &state, const Input &input)
 {
+	const float(&target)[4] = input.attitude_setpoint;
+	const float(&q)[4] = state.slewing != 0 ? state.attitude_setpoint : state.attitude;
+	const float angle = 0.5F * (state.gains.setpoint_slew * state.gains.period);  // quaternions turn by half angles
 	float along = 0.0F;
+	state.slewing = input.armed;
 
 	for (int i = 0; i < 4; i++) { along += q[i] * target[i]; }
 
-	const float sign = along < 0.0F ? -1.0F : 1.0F;
 	float across[4];
 	float square = 0.0F;
 
 	for (int i = 0; i < 4; i++) {
-		across[i] = sign * (target[i] - along * q[i]);
+		across[i] = target[i] - along * q[i];
 		square += across[i] * across[i];
 	}
 
-	const float distance = root(square);
+	const float distance = __builtin_sqrtf(square);
 
 	if (distance <= angle) {
-		copy(target, q);
+		__builtin_memcpy(state.attitude_setpoint, target, sizeof(target));
 		return;
 	}
 
-	const float step = angle / distance;
+	const float step = (along < 0.0F ? -angle : angle) / distance;
 	square = 0.0F;
 
 	for (int i = 0; i < 4; i++) {
@@ -384,108 +351,74 @@ float sum(const Terms &terms) { return (terms.proportional - terms.derivative) +
 		square += across[i] * across[i];
 	}
 
-	const float scale = 1.0F / root(square);
+	const float scale = 1.0F / __builtin_sqrtf(square);
 
-	for (int i = 0; i < 4; i++) { q[i] = scale * across[i]; }
+	for (int i = 0; i < 4; i++) { state.attitude_setpoint[i] = scale * across[i]; }
 }
 
-[[gnu::always_inline]] inline bool is_rotation(const float (&q)[4])
+// Takes over an attitude setpoint, within the slew limit. Returns false if it is invalid.
+[[gnu::always_inline]] inline bool accept_attitude_setpoint(State &state, const Input &input)
 {
-	return within(length_squared(q) - 1.0F, kMaxNormError);
-}
+	const Quaternion given = load(input.attitude_setpoint);
 
-// Takes over an attitude setpoint, within the slew limit.
-[[gnu::always_inline]] inline void move_setpoint(State &state, const Input &input)
-{
-	float(&q)[4] = state.attitude_setpoint;
+	if (unlikely(!is_rotation(given))) { return false; }
 
 	if (unlikely(!within(state.gains.setpoint_slew, 0.0F))) {
-		if (state.slewing == 0) { copy(state.attitude, q); }
-
-		state.slewing = input.armed;
-		slew(input.attitude_setpoint, 0.5F * (state.gains.setpoint_slew * state.gains.period), q);
+		slew(state, input);
 
 	} else {
-		copy(input.attitude_setpoint, q);
+		store(given, state.attitude_setpoint);
 	}
+
+	return true;
 }
 
+// Takes over a rate setpoint. Returns false if it is invalid.
 [[gnu::cold, gnu::noinline]] bool accept_rates_setpoint(State &state, const Input &input)
 {
-	state.slewing = 0;
-	state.model.running = 0;
-	state.acceleration[0] = state.acceleration[1] = 0.0F;
+	settle(state, 1, 0);
 
 	for (float rate : input.rates_setpoint) {
 		if (!within(rate, kMaxRate)) { return false; }
 	}
 
-	copy(input.rates_setpoint, state.rates_setpoint);
+	for (int i = 0; i < kAxes; i++) { state.flown.rates[i] = input.rates_setpoint[i]; }
+
 	return true;
-}
-
-// Replaces invalid rates by the last valid ones. Returns their fault bits.
-[[gnu::cold, gnu::noinline]] int32_t check_rates(const State &state, float (&rates)[kAxes])
-{
-	int32_t missing = 0;
-
-	for (int i = 0; i < kAxes; i++) {
-		if (!within(rates[i], kMaxRate)) {
-			missing |= kRateFault << i;
-			rates[i] = state.rates[i];
-		}
-	}
-
-	return missing;
 }
 
 // Returns the bits of Output::fault.
 [[gnu::always_inline]] inline int32_t accept_inputs(State &state, const Input &input)
 {
 	int32_t missing = input.silent & kAllFaults;
-	bool wanted = true;
 	state.rate_mode = input.rate_mode;
+	const Quaternion attitude = load(input.attitude);
 
-	if (is_rotation(input.attitude)) {
-		copy(input.attitude, state.attitude);
-
-	} else {
+	if (unlikely(!is_rotation(attitude))) {
 		missing |= kAttitudeFault;
-	}
-
-	if (unlikely(input.rate_mode != 0)) {
-		wanted = accept_rates_setpoint(state, input);
-
-	} else if (is_rotation(input.attitude_setpoint)) {
-		move_setpoint(state, input);
 
 	} else {
-		wanted = false;
+		store(attitude, state.attitude);
 	}
 
-	if (!wanted) { missing |= kSetpointFault; }
-
-	state.yaw_rate_setpoint = input.yaw_rate_setpoint;
-
-	if (unlikely(!within(input.yaw_rate_setpoint, kMaxRate))) {
-		state.yaw_rate_setpoint = optional(input.yaw_rate_setpoint, kMaxRate, state.fault_count);
+	if (!(unlikely(input.rate_mode != 0) ? accept_rates_setpoint(state, input) : accept_attitude_setpoint(state, input))) {
+		missing |= kSetpointFault;
 	}
 
-	const float pole = state.gains.derivative_pole;
-	const float filter_gain = (1.0F - pole) / state.gains.period;
-
-	float rates[kAxes] = {input.rates[0], input.rates[1], input.rates[2]};
-
-	// Each is checked by itself only if their squares are large.
-	if (unlikely(!within((rates[0] * rates[0] + rates[1] * rates[1]) + rates[2] * rates[2], kMaxRate * kMaxRate))) {
-		missing |= check_rates(state, rates);
-	}
+	state.yaw_rate_setpoint = optional(input.yaw_rate_setpoint, kMaxRate, state.fault_count);
 
 #pragma GCC unroll 3
-
 	for (int i = 0; i < kAxes; i++) {
-		state.derivative[i] = pole * state.derivative[i] + filter_gain * (rates[i] - state.rates[i]);
-		state.rates[i] = rates[i];
+		const float before = state.rates[i];
+		float rate = input.rates[i];
+
+		if (unlikely(!within(rate, kMaxRate))) {
+			missing |= kRateFault << i;
+			rate = before;
+		}
+
+		state.derivative[i] = state.gains.derivative_pole * state.derivative[i] + state.derivative_gain * (rate - before);
+		state.rates[i] = rate;
 	}
 
 	if (unlikely((missing | state.missing) != 0)) { return count_missing(state, missing, input.silent); }
@@ -493,71 +426,65 @@ float sum(const Terms &terms) { return (terms.proportional - terms.derivative) +
 	return 0;
 }
 
-// u of an axis at a limit of u or of its integral, or with unallocated torque. The integral does not grow further
-// into saturation.
-[[gnu::noinline]] float limited(float rest, float increment, float limit, float integral_max, int32_t saturation,
-				float &integral)
-{
-	const float grown = integral + increment;
-	const float moment = rest + grown;
-	bool held = false;
-
-	if (increment > 0.0F) {
-		held = moment > limit || saturation > 0;
-
-	} else if (increment < 0.0F) {
-		held = moment < -limit || saturation < 0;
-	}
-
-	if (!held) { integral = clamp(grown, integral_max); }
-
-	return clamp(rest + integral, limit);
-}
-
-// Torque u from the signals x, and the integrals. An integral is within its limit from the last period and is never -0,
-// so a zero increment keeps its bits.
-[[gnu::always_inline]] inline void inner_loop(const Gains &gains, const Input &input, const Signals &x,
-		const float (&excitation)[kAxes], float period,
-		float (&integrals)[kAxes], float (&u)[kAxes])
+// Torque u if an input was invalid for too long: without the integrals and the excitation. An axis without a valid rate,
+// whose y_i is 0, gets none.
+[[gnu::cold, gnu::noinline]] void damp(const Gains &gains, const Torque &torque, int32_t failed, float (&u)[kAxes])
 {
 	for (int j = 0; j < kAxes; j++) {
-		const Terms terms = rate_terms(gains, x, j);
-		const float rest = sum(terms) + excitation[j];
-		const float increment = period * terms.slope;
-		const float grown = integrals[j] + increment;
-		const float moment = rest + grown;
-		const float limit = gains.moment_max[j];
-		const float integral_max = gains.integral_max[j];
-
-		if (unlikely(__builtin_fabsf(moment) > limit || __builtin_fabsf(grown) > integral_max
-			     || input.saturation[j] != 0)) {
-			u[j] = limited(rest, increment, limit, integral_max, input.saturation[j], integrals[j]);
-
-		} else {
-			integrals[j] = grown;
-			u[j] = moment;
-		}
+		u[j] = (failed >> j & kRateFault) != 0 ? 0.0F : torque.rest[j];
 	}
+
+	clamp_axes(u, gains.moment_max);
 }
 
-// An input was invalid for too long: r = 0, and the integrals and the excitation are left out. An axis without a valid
-// rate, whose y_i is 0, gets no torque.
-[[gnu::cold, gnu::noinline]] void damp_rates(State &state, int32_t failed, Output &output)
+// Torque u, and the integrals, which do not grow further into saturation. An integral is within its limit from the last
+// period and is never -0, so a zero increment keeps its bits.
+[[gnu::always_inline]] inline void integrate(State &state, const Input &input, const Torque &torque, float (&u)[kAxes])
 {
 	const Gains &gains = state.gains;
-	state.model.running = 0;
-	state.slewing = 0;
-
-	for (float &rate : state.rates_setpoint) { rate = 0.0F; }
-
-	state.acceleration[0] = state.acceleration[1] = 0.0F;
-	copy(state.rates_setpoint, output.rates_setpoint);
-	torque_of(gains, state, state.rates_setpoint, state.acceleration, output.moment);
+	const float period = input.armed != 0 && input.landed == 0 ? gains.period : 0.0F;
 
 	for (int j = 0; j < kAxes; j++) {
-		const bool lost = (failed & (kRateFault << j)) != 0;
-		output.moment[j] = lost ? 0.0F : clamp(output.moment[j], gains.moment_max[j]);
+		const float rest = torque.rest[j] + optional(input.excitation[j], kMaxExcitation, state.fault_count);
+		const float increment = period * torque.slope[j];
+		const float limit = gains.moment_max[j];
+		float integral = state.integral[j] + increment;
+		float moment = rest + integral;
+		const bool limited = __builtin_fabsf(moment) > limit;
+		const int32_t saturation = input.saturation[j];
+
+		if (unlikely(limited || saturation != 0 || __builtin_fabsf(integral) > gains.integral_max[j])) {
+			const int32_t direction = bits_of(increment);
+			const bool held = (limited && (direction ^ bits_of(moment)) >= 0)
+					  || (saturation != 0 && (direction ^ saturation) >= 0);
+			integral = held ? state.integral[j] : clamp(integral, gains.integral_max[j]);
+			moment = clamp(rest + integral, limit);
+		}
+
+		state.integral[j] = integral;
+		u[j] = moment;
 	}
+}
+
+[[gnu::cold, gnu::noinline]] void copy(const Flown &from, Flown &to) { to = from; }
+
+// Adds to the integrals, or subtracts, the rest of v in the next period, if the inputs stay as they are.
+[[gnu::cold, gnu::noinline]] void add_next_rest(State &state, bool subtract)
+{
+	Flown flown;
+	Torque torque;
+	copy(state.flown, flown);
+	outer_loop(state);
+	rate_controller(state, torque);
+	copy(flown, state.flown);
+
+	for (int j = 0; j < kAxes; j++) { state.integral[j] += subtract ? -torque.rest[j] : torque.rest[j]; }
+}
+
+[[gnu::cold, gnu::noinline]] void take_over(const Gains &gains, State &state)
+{
+	state.gains = gains;
+	state.derivative_gain = (1.0F - gains.derivative_pole) / gains.period;
 }
 
 }  // namespace
@@ -566,80 +493,58 @@ float sum(const Terms &terms) { return (terms.proportional - terms.derivative) +
 {
 	state = State{};
 
-	for (int32_t &age : state.age) { age = kHoldSamples + 1; }
-
-	state.missing = kAllFaults;
+	state.missing = state.expired = kAllFaults;
 	state.attitude[0] = state.attitude_setpoint[0] = 1.0F;
 
-	const bool accepted = acceptable(gains);
+	const bool accepted = valid(gains);
 
-	if (accepted) {
-		state.gains = gains;
-
-	} else {
-		state.gains.period = 1.0F;  // all other gains and limits are 0, so the torque is 0
-	}
+	if (accepted) { take_over(gains, state); }  // else all gains and limits are 0, so the torque is 0
 
 	return accepted;
 }
 
 [[gnu::cold]] bool set_gains(State &state, const Gains &gains)
 {
-	if (!acceptable(gains)) { return false; }
+	if (!valid(gains)) { return false; }
 
-	float before[kAxes];
-	float after[kAxes];
-	next_torque(state.gains, state, before);
-	next_torque(gains, state, after);
+	add_next_rest(state, false);
+	take_over(gains, state);
+	add_next_rest(state, true);
+	clamp_axes(state.integral, gains.integral_max);
 
-	for (int j = 0; j < kAxes; j++) {
-		const bool unused = j == 2 ? within(gains.yaw_ki_i, 0.0F)
-				    : within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F);
-		const float integral = (before[j] + state.integral[j]) - after[j];
-		state.integral[j] = unused ? 0.0F : clamp(integral, gains.integral_max[j]);
+	// An axis without integral gains has no integral.
+	for (int j = 0; j < kModelAxes; j++) {
+		if (within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F)) { state.integral[j] = 0.0F; }
 	}
 
-	state.gains = gains;
+	if (within(gains.yaw_ki_i, 0.0F)) { state.integral[2] = 0.0F; }
 
-	if (!follows(gains)) {
-		state.model.running = 0;
-		state.acceleration[0] = state.acceleration[1] = 0.0F;
-	}
+	if (!follows(gains)) { stop_model(state.flown); }
 
 	return true;
 }
 
 void step(State &state, const Input &input, Output &output)
 {
-	const Gains &gains = state.gains;
 	const int32_t failed = accept_inputs(state, input);
-	float excitation[kAxes];
-	copy(input.excitation, excitation);
 
-	// Each is checked by itself only if their squares are large.
-	if (unlikely(!within((excitation[0] * excitation[0] + excitation[1] * excitation[1]) + excitation[2] * excitation[2],
-			     kMaxExcitation * kMaxExcitation))) {
-		for (float &value : excitation) { value = optional(value, kMaxExcitation, state.fault_count); }
-	}
+	// An input that is missing now holds the rate setpoint.
+	if (state.missing == 0) { outer_loop(state); }
 
-	if (input.armed == 0) { clear(state); }
+	if (unlikely(input.armed == 0 || failed != 0)) { settle(state, input.armed, failed); }
+
+	Torque torque;
+	rate_controller(state, torque);
 
 	if (unlikely(failed != 0)) {
-		damp_rates(state, failed, output);
+		damp(state.gains, torque, failed, output.moment);
 
 	} else {
-		// A setpoint or attitude that is missing now holds the rate setpoint.
-		if ((state.missing & (kSetpointFault | kAttitudeFault)) == 0) {
-			update_rates_setpoint(gains, state, state.model, state.rates_setpoint, state.acceleration);
-			state.model.running = input.rate_mode != 0 ? 0 : input.armed;
-		}
-
-		copy(state.rates_setpoint, output.rates_setpoint);
-		const Signals x = signals(gains, state, state.acceleration, state.rates_setpoint);
-		const float period = input.armed != 0 && input.landed == 0 ? gains.period : 0.0F;
-		inner_loop(gains, input, x, excitation, period, state.integral, output.moment);
+		integrate(state, input, torque, output.moment);
 	}
 
+	static_assert(sizeof(output.rates_setpoint) == sizeof(state.flown.rates), "both are of all axes");
+	__builtin_memcpy(output.rates_setpoint, state.flown.rates, sizeof(output.rates_setpoint));
 	output.fault = failed;
 	output.fault_count = state.fault_count;
 }

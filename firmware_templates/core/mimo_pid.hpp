@@ -42,7 +42,6 @@ constexpr int32_t kHoldSamples = 25;  // an invalid input is held at its last va
 constexpr float kMaxRate = 100.0F;    // rad/s, a larger rate is invalid
 constexpr float kMaxNormError = 0.02F;  // a quaternion is invalid if its squared length differs more from 1
 constexpr float kMaxExcitation = 1.0F;  // a larger excitation is invalid
-constexpr float kMaxGain = 1.0e6F;      // no gain or limit may be larger
 
 // Bits of Output::fault and Input::silent.
 constexpr int32_t kSetpointFault = 1;
@@ -79,22 +78,30 @@ struct Model {
 	int32_t running;                 // 0: starts at the measured attitude
 };
 
+// What is flown in this period.
+struct Flown {
+	float rates[kAxes];              // r_i
+	float acceleration[kModelAxes];  // of the attitude model, in body axes
+	Model model;
+};
+
+// What changes often is at small offsets, which take shorter instructions.
 struct State {
-	Gains gains;
-	float integral[kAxes];
-	float derivative[kAxes];
+	int32_t hold[kInputs];   // samples for which an invalid input is still held: setpoint, attitude, rates
+	int32_t missing;         // fault bits of the last sample
+	int32_t expired;         // of these, those held for too long
+	uint32_t fault_count;
+	int32_t rate_mode;
+	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
+	Flown flown;
 	float attitude_setpoint[4];  // flown, within the slew limit
 	float yaw_rate_setpoint;
 	float attitude[4];           // last valid inputs
 	float rates[kAxes];
-	float rates_setpoint[kAxes];      // r_i
-	float acceleration[kModelAxes];  // of the attitude model, in body axes
-	int32_t age[kInputs];    // samples since the last valid one: setpoint, attitude, rates
-	int32_t missing;         // fault bits of the last sample
-	int32_t rate_mode;
-	int32_t slewing;         // 0: the flown setpoint starts at the measured attitude
-	uint32_t fault_count;
-	Model model;
+	float derivative[kAxes];
+	float integral[kAxes];
+	float derivative_gain;  // (1 - a) / Ts
+	Gains gains;
 };
 
 // Resets the controller. Returns false if the gains are refused; the torque then stays 0.
@@ -105,8 +112,9 @@ bool initialise(State &state, const Gains &gains);
 // Returns false and changes nothing if a value is not finite, too large, or out of its range.
 bool set_gains(State &state, const Gains &gains);
 
-// One control period. If an input is invalid for more than kHoldSamples, the controller only damps the measured
-// rates, u = -Kp y_i - Kd d, and holds the integrators. An axis without a valid rate gets 0.
+// One control period. While an input is missing, the rate setpoint of the attitude controller is held. If one is invalid
+// for more than kHoldSamples, the controller only damps the measured rates, u = -Kp y_i - Kd d, and holds the integrators.
+// An axis without a valid rate gets 0.
 void step(State &state, const Input &input, Output &output);
 
 }  // namespace mimopilot

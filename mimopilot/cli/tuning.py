@@ -40,7 +40,10 @@ def register(app: typer.Typer) -> None:
         "mimopilot tune light.ulg heavy.ulg --out both.gains.toml; "
         "mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out thesis.gains.toml"
     )(tune)
-    app.command(epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml")(certify)
+    app.command(
+        epilog="Example: mimopilot certify flight.ulg --gains my.gains.toml; "
+        "mimopilot certify flight.ulg --gains my.gains.toml --rate 400 --out my400.gains.toml"
+    )(certify)
     app.command(epilog="Example: mimopilot advise flight.ulg")(advise)
 
 
@@ -207,6 +210,10 @@ def certify(
     log: LogArgument,
     gains: Annotated[Path, typer.Option(help="Gains file to examine.")],
     out: Annotated[Path | None, typer.Option(help="Write the gains with their certificate to this file.")] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(help="Carry the gains to this control rate, Hz, and examine them there; by default their own."),
+    ] = None,
     spec: Annotated[
         Path | None, typer.Option(help="Specification (TOML) whose [certificate] says what margins are needed.")
     ] = None,
@@ -217,7 +224,7 @@ def certify(
     import mimopilot as mp
     from mimopilot.tuning.certificate import ACCEPTED
 
-    examined = mp.certify(read_warned(log, columns), gains, spec=spec)
+    examined = mp.certify(read_warned(log, columns), gains, rate=rate, spec=spec)
     if out is not None:
         examined.save(out)
     if as_json:

@@ -194,7 +194,7 @@ def test_while_disarmed_the_model_stays_at_the_measured_attitude_and_arming_star
     assert (np.abs(model_of(controller)[0]) > 0.05).all()
     for tilt in (0.1, 0.25, -0.3):
         inputs["attitude"], inputs["armed"] = tilted([tilt, tilt], 0.7), 0
-        controller.run(inputs[:1])
+        controller.run(inputs[:2])
         assert model_of(controller) == pytest.approx(
             np.array([tilt_of(inputs["attitude"][0]), [0, 0], [0, 0]]), abs=1e-7
         )

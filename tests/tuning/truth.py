@@ -61,7 +61,7 @@ def linear_plant(airframe, late=0, Ts=TS):
     M[:6, :6], M[4:6, 6:] = A * Ts, np.eye(2) / tau * Ts
     sampled = expm(M)
     body = StateSpace(sampled[:6, :6], sampled[:6, 6:], np.eye(4, 6), np.zeros((4, 2)), Ts)
-    whole = series(delay(airframe.computing_delay + late), body)
+    whole = series(delay(airframe.computing_delay + late, Ts), body)
     # Structural mode and gyro act on the rates, equally on both axes.
     blocks = []
     for _ in range(2):

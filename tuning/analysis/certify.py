@@ -28,7 +28,7 @@ from mimopilot.tuning.analysis.stability_figures import nominal_and_drawn_loops,
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Certificate, Thresholds, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.plant.frequency_response import DRAWS, MIN_FREQUENCIES, PlantResponse
+from mimopilot.tuning.plant.frequency_response import DRAWS, LATE, MIN_FREQUENCIES, PlantResponse
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody, continued_below, rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
@@ -52,7 +52,8 @@ def certify(
     ----------
     gains : Gains
     plant : PlantResponse
-        Measured response, from `tuning.plant.frequency_response.plant_response`.
+        Measured response, from `tuning.plant.frequency_response.plant_response`. If its period is not that of the
+        gains, it is carried to theirs, see `PlantResponse.at_period`.
     inner, outer : sequence of 2 ReferenceModel
         Of the rate and the attitude loop, roll and pitch; they only normalise the determinants.
     log_sha256 : str
@@ -62,16 +63,19 @@ def certify(
     model : callable, optional
         Returns the plant from torque to body rates, identified from the same log, or None. It cannot certify. Where
         the response leaves the verdict open and the loop around the model is unstable, the verdict is ``unstable``.
+        Not used for another period than that of the response.
     """
+    measured, plant = plant, plant.at_period(gains.Ts)
+    carried = _carried(measured, gains.Ts) if plant is not measured else ""
 
     def verdict(text: Verdict, reason: str, figures: Mapping[str, Any], band: tuple[float, float]) -> Certificate:
-        identified = model() if text == Verdict.NOT_CERTIFIED else None
+        identified = model() if text == Verdict.NOT_CERTIFIED and plant is measured else None
         if identified is not None:
             radius = model_spectral_radius(gains, identified)
             if radius > UNSTABLE_RADIUS:
                 text = Verdict.UNSTABLE
                 reason = f"around the model identified from the log the spectral radius is {radius:.4f}; {reason}"
-        return Certificate(text, reason, figures, band, thresholds.model_dump(), log_sha256)
+        return Certificate(text, reason + carried, figures, band, thresholds.model_dump(), log_sha256)
 
     try:
         body = rigid_body(plant)
@@ -96,7 +100,10 @@ def certify(
     rate_loop, cascade = count.encirclements(nominal)
     if (rate_loop or cascade) and unstable > DRAWS / 2:
         where = "the rate loop alone" if rate_loop else "the whole cascade"
-        return verdict(Verdict.UNSTABLE, f"the determinant encircles 0: {where} is unstable", {}, band)
+        reason = f"the determinant encircles 0: {where} is unstable"
+        if carried and gains.Ts < measured.Ts:
+            return verdict(Verdict.NOT_CERTIFIED, f"{reason} with the delay of the log's slower rate", {}, band)
+        return verdict(Verdict.UNSTABLE, reason, {}, band)
     if beyond:
         return verdict(Verdict.NOT_CERTIFIED, beyond, figures, band)
     doubt = _reason_for_doubt(gains, plant, known, body)
@@ -116,6 +123,14 @@ def certify(
     if too_short:
         return verdict(Verdict.NOT_CERTIFIED, "; ".join(["the margin is too thin", *too_short]), figures, band)
     return verdict(Verdict.THIN, "; ".join([*short, assumed]), figures, band)
+
+
+def _carried(measured: PlantResponse, Ts: float) -> str:
+    """What is assumed of a vehicle whose response was measured at another period."""
+    rates = f"; carried from {1 / measured.Ts:.0f} to {1 / Ts:.0f} Hz: the torque is taken"
+    if Ts < measured.Ts:
+        return f"{rates} as late as in the log, though it is sooner"
+    return f"{rates} {LATE * (Ts - measured.Ts) * 1e3:.1f} ms later, as after one period of computing"
 
 
 def _missed_thresholds(figures: Mapping[str, Any], Ms: float, phase_deg: float) -> list[str]:

@@ -16,11 +16,12 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.plant.frequency_response import SAME_PERIOD
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.spec import TuningSpec
 
-#: Largest relative difference between the periods of a log and of a gain set: loggers' clocks differ by less.
-PERIOD_TOLERANCE = 0.02
+#: Details of a gain set's origin that hold for the control rate of its log only.
+OF_ONE_RATE = ("predicted", "better_than_flown", "keep_flown", "limited_by")
 #: Largest relative difference between the units of torque of a log and of a gain set: rounding in files.
 UNIT_TOLERANCE = 0.01
 
@@ -99,7 +100,7 @@ def _check_one_vehicle(flights: Sequence[Experiment]) -> None:
     """Refuse logs that cannot be of one vehicle: another period or unit of torque."""
     first = flights[0]
     for other in flights[1:]:
-        if abs(other.Ts / first.Ts - 1) > PERIOD_TOLERANCE:
+        if abs(other.Ts / first.Ts - 1) > SAME_PERIOD:
             raise TuningError(f"{other.source}: sampled every {other.Ts:g} s, {first.source} every {first.Ts:g} s")
         ours, theirs = (one.flown.moment_scale if one.flown else None for one in (first, other))
         if ours and theirs and not np.allclose(ours[:2], theirs[:2], rtol=UNIT_TOLERANCE, atol=0):
@@ -114,8 +115,29 @@ def _certified(gains: Gains, measured: PlantEstimates, spec: TuningSpec) -> Gain
     return gains.with_certificate(found)
 
 
+def at_rate(gains: Gains, hertz: float) -> Gains:
+    """The gains for another control rate, without a certificate.
+
+    The law's continuous-time gains and cut-offs stay. What was predicted for the old rate is left out.
+
+    Raises
+    ------
+    TuningError
+        When the law cannot run at this rate, such as an attitude model that is too fast for it.
+    """
+    if not 0 < hertz < np.inf:
+        raise TuningError(f"rate: got {hertz:g} Hz, expected more than 0")
+    details = {name: value for name, value in gains.provenance.details.items() if name not in OF_ONE_RATE}
+    return replace(
+        gains,
+        filters=replace(gains.filters, Ts=1 / hertz),
+        certificate=None,
+        provenance=replace(gains.provenance, details={**details, "carried_from_Ts": gains.Ts}),
+    )
+
+
 def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | None = None) -> Gains:
-    """The gains with a certificate made from a flight of the vehicle, whatever their origin.
+    """The gains with a certificate made from a flight of the vehicle, whatever their origin and control rate.
 
     Parameters
     ----------
@@ -127,14 +149,9 @@ def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | No
     Raises
     ------
     TuningError
-        When the log has no external signal, is too short or not excited, or when its period or its unit of torque
-        differs from that of the gains.
+        When the log has no external signal, is too short or not excited, or when its unit of torque differs from that
+        of the gains.
     """
-    if abs(experiment.Ts / gains.Ts - 1) > PERIOD_TOLERANCE:
-        raise TuningError(
-            f"{experiment.source}: sampled every {experiment.Ts:g} s, the gains are for {gains.Ts:g} s; certify them "
-            "with a log of the same control rate"
-        )
     flown = experiment.flown.moment_scale if experiment.flown else None
     if flown and gains.moment_scale and not np.allclose(flown[:2], gains.moment_scale[:2], rtol=UNIT_TOLERANCE, atol=0):
         theirs, ours = (", ".join(f"{v:.4g}" for v in scale[:2]) for scale in (flown, gains.moment_scale))

@@ -234,6 +234,8 @@ def import_gains(
 def _stock_controller(values: Mapping[str, float], source: ParameterSource) -> StockController:
     """The controller that the parameters belong to; refuses those of other vehicles."""
     no_gains = f"{source.name}: holds no gains of a multirotor (MC_ROLLRATE_P of PX4, ATC_RAT_RLL_P of ArduPilot)"
+    if any(name.startswith(PREFIX) for name in source.values):
+        no_gains += f"; those of our own module ({PREFIX}*) are not imported"
     if any(name in values for name in _PLANE):
         raise TuningError(f"{source.name}: parameters of ArduPlane; gains are for multirotors (ArduCopter, PX4) only")
     if any(name in values for name in _SUB):

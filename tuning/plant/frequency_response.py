@@ -33,6 +33,10 @@ SURE = 0.1
 LAG = 0.05
 #: Known frequencies that smoothing and integration of the rates need.
 MIN_FREQUENCIES = 8
+#: Largest relative difference between two periods that count as the same: loggers' clocks differ by less.
+SAME_PERIOD = 0.02
+#: Periods that the torque is late by: one to compute and half of one in which it is held.
+LATE = 1.5
 #: Number of plants drawn from the error distribution of a response.
 DRAWS = 64
 
@@ -119,6 +123,21 @@ class PlantResponse:
         """The response at some of the frequencies."""
         arrays = {name: value[which] for name, value in vars(self).items() if name != "Ts" and value is not None}
         return PlantResponse(Ts=self.Ts, **arrays)
+
+    def at_period(self, Ts: float) -> PlantResponse:
+        """The response of the same vehicle under a controller with another period, s.
+
+        A longer period delays the torque by `LATE` times the difference, which is exact where the vehicle computes for
+        one period. For a shorter one the measured response stays as it is: its longer delay is on the safe side.
+        Frequencies above half of the lower rate are dropped.
+        """
+        if abs(Ts / self.Ts - 1) <= SAME_PERIOD:
+            return self
+        plant = self.at(self.omega < np.pi / max(Ts, self.Ts))
+        turn = np.exp(-1j * plant.omega * LATE * max(0.0, Ts - self.Ts))[:, None, None]
+        outputs = np.concatenate([plant.root[:, :2], turn * plant.root[:, 2:]], axis=1)
+        angles = None if plant.angle_noise is None else turn * plant.angle_noise
+        return replace(plant, G_i=turn * plant.G_i, G_o=turn * plant.G_o, root=outputs, angle_noise=angles, Ts=Ts)
 
     def extended(self) -> PlantResponse:
         """The response extended below its lowest frequency as a rigid body: 1/w for rates, 1/w^2 for angles.

@@ -12,9 +12,13 @@ from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import MULTIROTORS, des
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.tuning.logs.imported_gains import INTEGERS, ParameterSource, vehicle_names
 from mimopilot.tuning.logs.stock_controllers import ARDUPILOT, PX4
+from mimopilot.tuning.parameter_row import PREFIX
 
 #: MAV_AUTOPILOT -> its controller.
 STOCK = {mavlink.MAV_AUTOPILOT_PX4: PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ARDUPILOT}
+
+#: Tries for a parameter that the gains do not need: 3 s.
+OTHER_TRIES = 6
 
 
 def read_stock_parameters(options: LinkOptions) -> ParameterSource:
@@ -34,9 +38,14 @@ def read_stock_parameters(options: LinkOptions) -> ParameterSource:
                 "with PX4 or ArduPilot"
             )
         needed, others = vehicle_names(stock)
-        values = _read(session, [*needed, *others])
+        values = _read(session, needed)
+        # A vehicle may not answer for what it lacks, and many lack some of these.
+        session.client.tries = min(session.client.tries, OTHER_TRIES)
+        values |= _read(session, others)
+    unknown = [name for name in others if name not in values and not name.startswith(PREFIX)]
+    warnings = (f"not on the vehicle, or not answered: {', '.join(unknown)}",) if unknown else ()
     text = "".join(f"{name} {shortest(value)}\n" for name, value in sorted(values.items()))
-    return ParameterSource(options.connect, "vehicle", values, sha256(text))
+    return ParameterSource(options.connect, "vehicle", values, sha256(text), warnings=warnings)
 
 
 def _read(session: Session, names: list[str]) -> dict[str, float]:

@@ -180,6 +180,7 @@ def test_named_defaults_fill_what_is_missing_and_are_listed(tmp_path):
     ("values", "options", "message"),
     [
         ({"SYS_AUTOSTART": 4001.0}, {}, "holds no gains of a multirotor"),
+        ({"MIMO_RP_RR": 0.15}, {}, r"holds no gains of a multirotor .*; those of our own module \(MIMO_\*\) are not"),
         ({"SYS_AUTOSTART": 4001.0}, {"defaults": "px4-v1.16"}, "holds no gains of a multirotor"),
         (PX4_VALUES | ARDUPILOT_VALUES, {}, "of PX4 and of ArduPilot"),
         (ARDUPILOT_VALUES | {"RLL2SRV_TCONST": 0.5}, {}, "parameters of ArduPlane"),

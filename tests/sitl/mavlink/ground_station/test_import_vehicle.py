@@ -18,6 +18,7 @@ def test_a_vehicle_is_read_and_others_are_refused(tmp_path, quick_mimopilot):
     assert done.returncode == 0, done.stderr
     gains = load_gains(tmp_path / "vehicle.gains.toml")
     assert gains.Kp_i == pytest.approx(np.diag([0.225, 0.32]))
+    assert "not on the vehicle, or not answered: MC_YAW_TQ_CUTOFF" in done.stderr
     assert (vehicle.writes, json.loads(done.stdout)["source"]) == (0, f"PX4, vehicle {link.url}")
     lacking = ScriptedVehicle({name: value for name, value in PX4_VALUES.items() if name != "MC_YAW_P"})
     plane = ScriptedVehicle(ARDUPILOT_VALUES)
