@@ -34,6 +34,8 @@ PX4_FLAGS = (
     "-Wframe-larger-than=2048",
     "-Wno-unused-parameter",
 )
+#: The module's own flags for the core.
+CORE_FLAGS = ("-fno-fast-math", "-fno-reciprocal-math", "-fno-associative-math")
 #: PX4's own parameters that the module reads, with their defaults in PX4 v1.16; int32 where no point is.
 PX4_PARAMETERS = {
     "MPC_MAN_TILT_MAX": 35.0,
@@ -111,25 +113,30 @@ def parameters_header(entries: dict[str, dict]) -> str:
     )
 
 
-def build(gains, api: str, folder: Path) -> Path:
-    """Emit, compile with PX4's flags and warnings as errors, and link with the host program."""
+def emit(gains, api: str, folder: Path) -> tuple[list[Path], list[str]]:
+    """Emit the module; its sources, the core first, and what a compiler must include."""
     files = render(gains, "px4", px4_api=api)
     write_tree(files, folder / "tree")
     (folder / "generated").mkdir(exist_ok=True)
     (folder / "generated" / "generated_parameters.hpp").write_text(parameters_header(definitions(files)))
-    module = folder / "tree/px4/src/modules/mc_mimo_pid"
-    core = folder / "tree/core"
-    includes = [f"-I{module}", f"-I{core}"]
+    module, core = folder / "tree/px4/src/modules/mc_mimo_pid", folder / "tree/core"
+    includes = [f"-I{module}", f"-I{core}", '-DMODULE_NAME="mc_mimo_pid"']
     for path in (folder / "generated", STUBS / api, STUBS / "common"):
         includes += ["-isystem", str(path)]
+    return [core / "mimo_pid.cpp", *sorted(module.glob("*.cpp"))], includes
+
+
+def build(gains, api: str, folder: Path) -> Path:
+    """Emit, compile with PX4's flags and warnings as errors, and link with the host program."""
+    (core, *sources), includes = emit(gains, api, folder)
     common = [find_compiler(), STANDARD[api], *PX4_FLAGS, *includes]
-    jobs = {core / "mimo_pid.cpp": ["-fno-fast-math", "-fno-reciprocal-math", "-fno-associative-math", *WARNINGS]}
-    jobs |= {path: [*WARNINGS, "-Wno-unused-parameter"] for path in sorted(module.glob("*.cpp"))}
+    jobs = {core: [*CORE_FLAGS, *WARNINGS]}
+    jobs |= {path: [*WARNINGS, "-Wno-unused-parameter"] for path in sources}
     jobs |= {path: ["-Wall", "-fexceptions", "-frtti"] for path in sorted(STUBS.glob("*.cpp"))}
     objects = []
     for source, flags in jobs.items():
         objects.append(folder / f"{source.stem}.o")
-        command = [*common, *flags, '-DMODULE_NAME="mc_mimo_pid"', "-c", str(source), "-o", str(objects[-1])]
+        command = [*common, *flags, "-c", str(source), "-o", str(objects[-1])]
         result = subprocess.run(command, capture_output=True, text=True, check=False)
         assert result.returncode == 0, result.stderr
     program = folder / "host"
