@@ -1,6 +1,7 @@
 """The gains that flew, from the vehicle's parameters.
 
-This controller's (``MIMO_``), else those of PX4 (``MC_``) or ArduPilot (``ATC_``).
+This controller's (``MIMO_``), else those of PX4 (``MC_``) or ArduPilot (``ATC_``). Logs with ``MIMO_EN`` 0 were flown by
+the latter.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.stock_controllers import stock_of
 from mimopilot.tuning.parameter_row import AXIS_LETTERS, PREFIX, Row, Shape
-from mimopilot.tuning.parameters import ROWS, SCALE
+from mimopilot.tuning.parameters import ENABLE, ROWS, SCALE
 from mimopilot.tuning.provenance import Provenance
 
 #: The period is that of the log.
@@ -40,6 +41,8 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     """
     # Vehicles store float32: use the shortest decimal that rounds to the same float32.
     values = {name: float(str(np.float32(value))) for name, value in parameters.items()}
+    if values.get(ENABLE.name, 1.0) == 0.0:  # our module waits while the autopilot's own controllers fly
+        values = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
     stock = stock_of(values)
     found: dict[Row, Any] = {_PERIOD: Ts}
     for row in ROWS:

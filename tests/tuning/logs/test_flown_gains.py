@@ -48,6 +48,13 @@ def test_mimo_parameters_take_precedence():
     assert gains.moment_scale == (2.5, 2.5, 2.5)
 
 
+def test_mimo_parameters_do_not_count_while_the_stock_controllers_fly():
+    ours = {"MIMO_RP_RR": 0.12, "MIMO_RP_RP": 0.01, "MIMO_SCALE_R": 2.5}
+    gains = flown_gains(PX4 | ours | {"MIMO_EN": 0}, 0.004)
+    assert gains is not None and gains.Kp_i == pytest.approx(np.eye(2) * 0.30) and gains.moment_scale is None
+    assert flown_gains(PX4 | ours | {"MIMO_EN": 1}, 0.004).Kp_i[0] == pytest.approx([0.12, 0.01])
+
+
 @pytest.mark.parametrize("missing", ["MC_ROLLRATE_P", "MC_YAW_P", "MC_RR_INT_LIM", "MC_ROLLRATE_MAX"])
 def test_parameters_of_an_incomplete_controller_give_no_gains(missing):
     assert flown_gains({k: v for k, v in PX4.items() if k != missing}, 0.004) is None
