@@ -9,7 +9,7 @@ namespace mimopilot
 namespace
 {
 
-struct Bounds {
+struct Limits {
 	float minimum;
 	float maximum;
 };
@@ -78,7 +78,7 @@ constexpr px4::params kNames[] = {
 	px4::params::MIMO_SCALE_Y,
 };
 
-constexpr Bounds kBounds[] = {
+constexpr Limits kLimits[] = {
 	{0.01F, 50.0F},
 	{-50.0F, 50.0F},
 	{1e-04F, 5.0F},
@@ -95,7 +95,7 @@ constexpr Bounds kBounds[] = {
 
 constexpr uint8_t kFixed = 255;
 
-constexpr uint8_t kBoundsOf[] = {
+constexpr uint8_t kLimitsOf[] = {
 	0, 1, 1, 0, 2, 3, 3, 2, 4, 5, 5, 4, 6, 6, 6, 6, 3, 3, 3, 3,
 	3, 3, 3, 3, 6, 6, 6, 6, 0, 2, 4, 6, 3, 0, 0, 0, 7, 7, 7, 8,
 	8, 8, 7, 9, 10, kFixed, 11, 9,
@@ -121,12 +121,12 @@ const char *Parameters::read(Gains &gains)
 	gains = kGains;
 
 	for (int i = 0; i < kGainCount; i++) {
-		if (kBoundsOf[i] == kFixed) { continue; }
+		if (kLimitsOf[i] == kFixed) { continue; }
 
-		const Bounds &bounds = kBounds[kBoundsOf[i]];
+		const Limits &limits = kLimits[kLimitsOf[i]];
 		values[i] = parameter_value(kNames[i]);
 
-		if (!(values[i] >= bounds.minimum && values[i] <= bounds.maximum) && wrong == nullptr) {
+		if (!(values[i] >= limits.minimum && values[i] <= limits.maximum) && wrong == nullptr) {
 			wrong = param_name(param_handle(kNames[i]));
 		}
 	}
