@@ -13,9 +13,11 @@
 
 #include "mimo_pid.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 // Code size, stack and step time have a budget, with -Os: the attributes below keep step() fast and the rest small.
 
@@ -127,6 +129,7 @@ struct Quaternion {
 	const float friction = (2.0F * gains.model_damping) * gains.model_omega;
 
 #pragma GCC unroll 2
+
 	for (int j = 0; j < kModelAxes; j++) {
 		float rate = 0.0F;
 		float acceleration = 0.0F;
@@ -149,8 +152,8 @@ struct Quaternion {
 	const float tilt = square > 0.0F ? __builtin_sqrtf(square) : 0.0F;
 	return {
 		cosine * tilt,
-		cosine * roll - sine * pitch,
-		cosine * pitch + sine * roll,
+		cosine *roll - sine * pitch,
+		cosine *pitch + sine * roll,
 		sine * tilt,
 	};
 }
@@ -408,6 +411,7 @@ struct Torque {
 	state.yaw_rate_setpoint = optional(input.yaw_rate_setpoint, kMaxRate, state.fault_count);
 
 #pragma GCC unroll 3
+
 	for (int i = 0; i < kAxes; i++) {
 		const float before = state.rates[i];
 		float rate = input.rates[i];
