@@ -54,8 +54,8 @@ PERIOD = 4e-3
 #: Limits, all chosen: bytes of code and of stack; instructions of a step and share of a period, without and with model
 #: following.
 MAX_TEXT_BYTES, MAX_STACK_BYTES = 3072, 128
-MAX_STEP = (400, 0.0015)
-MAX_STEP_FOLLOWING = (540, 0.002)
+MAX_STEP = (540, 0.002)
+MAX_STEP_FOLLOWING = (700, 0.0026)
 EMULATORS = ("unicorn", "qemu")
 #: C library functions that the controller may call: copying and filling memory.
 LIBRARY = {"memcpy", "memset", "memmove"}

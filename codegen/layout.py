@@ -20,11 +20,15 @@ GAINS = np.dtype(("<f4", (len(PARAMETERS),)))
 
 INPUT = np.dtype(
     [
-        ("attitude_setpoint", "<f4", 3),
-        ("attitude", "<f4", 3),
+        ("attitude_setpoint", "<f4", 4),
+        ("yaw_rate_setpoint", "<f4"),
+        ("attitude", "<f4", 4),
+        ("rates_setpoint", "<f4", 3),
         ("rates", "<f4", 3),
         ("excitation", "<f4", 3),
         ("saturation", "<i4", 3),
+        ("silent", "<i4"),
+        ("rate_mode", "<i4"),
         ("armed", "<i4"),
         ("landed", "<i4"),
     ]
@@ -50,15 +54,23 @@ MODEL = np.dtype(
 
 STATE = np.dtype(
     [
-        ("gains", "<f4", len(PARAMETERS)),
-        ("integral", "<f4", 3),
-        ("derivative", "<f4", 3),
-        ("setpoint", "<f4", 3),
-        ("attitude", "<f4", 3),
-        ("rates", "<f4", 3),
-        ("age", "<i4", 9),
+        ("hold", "<i4", 5),
+        ("missing", "<i4"),
+        ("expired", "<i4"),
         ("fault_count", "<u4"),
+        ("rate_mode", "<i4"),
+        ("slewing", "<i4"),
+        ("rates_setpoint", "<f4", 3),
+        ("acceleration", "<f4", 2),
         ("model", MODEL),
+        ("attitude_setpoint", "<f4", 4),
+        ("yaw_rate_setpoint", "<f4"),
+        ("attitude", "<f4", 4),
+        ("rates", "<f4", 3),
+        ("derivative", "<f4", 3),
+        ("integral", "<f4", 3),
+        ("derivative_gain", "<f4"),
+        ("gains", "<f4", len(PARAMETERS)),
     ]
 )
 

@@ -12,7 +12,7 @@ from mimopilot.tuning.parameter_row import Parameter
 from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Setting
 
 #: Our unit -> PX4's; PX4 does not list our other units.
-_UNITS = {"1/s": "1/s", "s": "s", "rad": "rad", "rad/s": "rad/s", "norm": "norm", "N m": "Nm"}
+_UNITS = {"s": "s", "rad": "rad", "rad/s": "rad/s", "norm": "norm", "N m": "Nm"}
 
 
 @dataclass(frozen=True)

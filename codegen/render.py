@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
@@ -24,7 +25,7 @@ from mimopilot.common.files import inside, read_text, sha256, write_atomically
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains, gains_to_toml
 from mimopilot.tuning.parameter_row import Row, Shape
-from mimopilot.tuning.parameters import EXCITATION, PARAMETERS, ROWS, check_names
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, PARAMETERS, ROWS, check_names
 
 #: These and the parameter table define the C interface.
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
@@ -114,12 +115,14 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
         "parameters": PARAMETERS,
         "identity": list(gains.identity()),
         "excitation_settings": EXCITATION,
+        "settings": (*EXCITATION, ENABLE),
         "px4_parameters": entries(gains),
         "literal": literal,
         "rows": ROWS,
         "offset": offset,
         "initialiser": initialiser,
-        "validity": list(_validity()),
+        "ranges": _ranges(),
+        "products": list(_products()),
         "float_literal": float_literal,
         "interface_hash": f"0x{interface_hash():08x}",
         "layout": {
@@ -134,18 +137,33 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
     }
 
 
-def _validity() -> Iterator[str]:
-    """C++ conditions of `tuning.parameter_row.Valid`, for every element with a bound."""
+def _ranges() -> list[dict[str, Any]]:
+    """Bounds of the C++ gains, `tuning.parameter_row.Valid`; neighbours with the same bounds are one range."""
+    ranges: list[dict[str, Any]] = []
     for row in ROWS:
-        for i, _ in enumerate(row.codes):
-            member = f"gains.{row.member}" + (f"[{i}]" if row.shape is Shape.AXES else "")
-            low, high = row.valid.lowest, row.valid.highest
-            if math.isfinite(low):
-                yield f"{member} {'>=' if row.valid.lowest_included else '>'} {float_literal(low)}"
-            if math.isfinite(high):
-                yield f"{member} {'<=' if row.valid.highest_included else '<'} {float_literal(high)}"
-            if math.isfinite(row.largest_in_period):
-                yield f"{member} * gains.period <= {float_literal(row.largest_in_period)}"
+        low, high = np.float32(row.valid.lowest), np.float32(row.valid.highest)
+        # C++ includes both bounds: of one that is not valid itself, it gets the neighbour.
+        low = low if row.valid.lowest_included else np.nextafter(low, np.float32(np.inf))
+        high = high if row.valid.highest_included else np.nextafter(high, np.float32(-np.inf))
+        bounds = {
+            "lowest": float_literal(low) if math.isfinite(low) else "-kMaxGain",
+            "highest": float_literal(high) if math.isfinite(high) else "kMaxGain",
+        }
+        if ranges and bounds.items() <= ranges[-1].items():
+            ranges[-1]["count"] += len(row.codes)
+            ranges[-1]["last"] = row.member
+        else:
+            ranges.append({"count": len(row.codes), "first": row.member, "last": row.member, **bounds})
+    for one in ranges:
+        one["members"] = one["first"] if one["first"] == one["last"] else f"{one['first']} to {one['last']}"
+    return ranges
+
+
+def _products() -> Iterator[str]:
+    """C++ conditions of the largest products with the period."""
+    for row in ROWS:
+        if math.isfinite(row.largest_in_period):
+            yield f"gains.{row.member} * gains.period <= {float_literal(row.largest_in_period)}"
 
 
 def _manifest(files: dict[str, str], gains: Gains, target: str) -> str:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.parameter_row import pole_of
+from mimopilot.tuning.parameters import YAW_WEIGHT
 from mimopilot.tuning.reference_model import ReferenceModel, followed_model
 
 Signal = NDArray[np.float64]
@@ -52,12 +53,18 @@ class Filters:
         Natural frequency of the attitude model; 0 means no model following.
     model_damping : float
         Damping ratio of the attitude model.
+    yaw_weight : float
+        Weight of the yaw error in the attitude error, above 0 and at most 1.
+    setpoint_slew : float, rad/s
+        Slew limit of the attitude setpoint; 0 means none.
     """
 
     Ts: float
     derivative_cutoff_hz: float = 0.0
     model_omega: float = 0.0
     model_damping: float = 0.7
+    yaw_weight: float = YAW_WEIGHT
+    setpoint_slew: float = 0.0
 
     @property
     def derivative_pole(self) -> float:

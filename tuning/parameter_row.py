@@ -104,8 +104,8 @@ class Row:
     diagonal_minimum : float or None
         Lower limit of a matrix' diagonal, if it differs from `minimum`.
     default : float or None
-        Value if a gains file lacks the key; None: the key is required. Only the gains of an option have one, which
-        holds only while the option is off.
+        Value if a gains file lacks the key; None: the key is required. A gain has one only if it belongs to an option,
+        and only while that is off.
     option : str
         Key of the row that switches on the option to which this row belongs, 0: off; empty: to none. While the option
         is off, a gains file leaves out the row if it has its default.

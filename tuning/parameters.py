@@ -92,6 +92,12 @@ _GAINS = (
     _gain("Kff_i", "RF", "s", 5.0, "torque from rate setpoint", "s, rate setpoint to torque"),
 )
 
+#: Weight of the yaw error if a gains file has none: PX4's default of MC_YAW_WEIGHT, which means the same.
+YAW_WEIGHT = 0.4
+#: Key of the row that switches on the slew limit of the setpoint.
+SLEW = "setpoint_slew"
+#: Largest slew of the setpoint in one period, rad: half of it stands for its tangent, to 0.1 %.
+SLEW_STEP = 0.1
 #: Key of the row that switches on model following.
 MODEL = "model_omega"
 #: Damping ratios of the attitude model. Below 0.1 it amplifies setpoints at its natural frequency more than five times.
@@ -120,6 +126,34 @@ ROWS: tuple[Row, ...] = (
     _limit("rate_max", "RMAX", "rad/s", 0.01, 50.0, "limit of the rate setpoint", "rad/s"),
     _limit("moment_max", "UMAX", "norm", 0.01, 1.0, "limit of the torque, excitation included", "normalised"),
     _limit("integral_max", "IMAX", "norm", 0.001, 1.0, "limit of the integral term", "normalised"),
+    Row(
+        key="yaw_weight",
+        member="yaw_weight",
+        code="YAW_W",
+        shape=Shape.SCALAR,
+        unit="norm",
+        minimum=0.01,
+        maximum=1.0,
+        description="weight of the yaw error beside roll and pitch; yaw gain unchanged",
+        comment="weight of the yaw error against roll and pitch",
+        default=YAW_WEIGHT,
+        valid=Valid(0.0, 1.0, lowest_included=False),
+    ),
+    Row(
+        key=SLEW,
+        member=SLEW,
+        code="SP_SLEW",
+        shape=Shape.SCALAR,
+        unit="rad/s",
+        minimum=0.0,
+        maximum=50.0,
+        description="slew limit of the attitude setpoint; 0: none",
+        comment="rad/s, slew limit of the attitude setpoint, 0: none",
+        default=0.0,
+        option=SLEW,
+        valid=NOT_NEGATIVE,
+        largest_in_period=SLEW_STEP,
+    ),
     Row(
         key="derivative_cutoff_hz",
         member="derivative_pole",
@@ -241,11 +275,11 @@ EXCITATION: tuple[Setting, ...] = (
     Setting("MIMO_EX_DUR", "s", 16.0, 0.1, 300.0, False, "excitation: time on each axis"),
     Setting("MIMO_EX_SEED", "", 1, 0, 1000000, True, "excitation: seed of the pulses"),
     Setting("MIMO_EX_MODE", "", 4, 0, 30, True, "excitation: only in this nav_state (2 Position, 4 Hold)"),
-    Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stop above this roll or pitch"),
+    Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stop above this tilt"),
 )
 
-#: Whether a vehicle's start-up script starts this controller or that of the flight stack.
-ENABLE = Setting("MIMO_EN", "", 0, 0, 1, True, "1: this controller flies; 0: the stock one (reboot)")
+#: Which controller flies: this one or that of the flight stack; from 2 on, a switch chooses in flight.
+ENABLE = Setting("MIMO_EN", "", 0, 0, 7, True, "1: this controller flies; 0: the stock one; 2-7: RC AUX1-6 chooses")
 
 
 def check_names() -> None:

@@ -17,264 +17,298 @@ namespace mimopilot {
 
 namespace {
 
-// Code size and step time have a budget: the attributes below keep step() fast and the rest small.
+// Code size, stack and step time have a budget, with -Os: the attributes below keep step() fast and the rest small.
 
-constexpr float kTwoPi = 6.2831855F;
-constexpr float kPi = 3.1415927F;
+constexpr float kInverted = 0.0045F;  // cosine of half the tilt below which, as in PX4, the error has no turn
 
 [[gnu::always_inline]] inline bool unlikely(bool condition)
 {
 	return __builtin_expect(static_cast<long>(condition), 0L) != 0L;
 }
 
-// Compares bit patterns: there, infinity and NaN exceed every number, whatever the optimisation flags.
-bool within(float value, float limit)
+[[gnu::always_inline]] inline int32_t bits_of(float value)
 {
-	uint32_t bits;
-	uint32_t limit_bits;
+	int32_t bits;
 	__builtin_memcpy(&bits, &value, sizeof(bits));
-	__builtin_memcpy(&limit_bits, &limit, sizeof(limit_bits));
-	return bits << 1 <= limit_bits << 1;
+	return bits;
 }
 
-float clamp(float value, float limit)
+// Compares bit patterns: there, infinity and NaN exceed every number, whatever the optimisation flags.
+[[gnu::always_inline]] inline bool within(float value, float limit)
 {
-	if (__builtin_fabsf(value) > limit) { value = value > 0.0F ? limit : -limit; }
+	return static_cast<uint32_t>(bits_of(value)) << 1 <= static_cast<uint32_t>(bits_of(limit)) << 1;
+}
+
+[[gnu::always_inline]] inline float clamp(float value, float limit)
+{
+	if (unlikely(__builtin_fabsf(value) > limit)) { value = value > 0.0F ? limit : -limit; }
 
 	return value;
 }
 
-float row(const float (&gain)[2], float roll, float pitch) { return gain[0] * roll + gain[1] * pitch; }
-
-// Wraps to -pi to pi. Two angles within 4 pi differ by at most four turns.
-float wrap(float angle)
+[[gnu::noinline]] void clamp_axes(float (&values)[kAxes], const float (&limits)[kAxes])
 {
-	if (unlikely(__builtin_fabsf(angle) > kPi)) {
-		const float turn = angle > 0.0F ? -kTwoPi : kTwoPi;
-		int turns = 0;
-
-		do {
-			angle += turn;
-			turns++;
-		} while (turns < 4 && __builtin_fabsf(angle) > kPi);
+	for (int j = 0; j < kAxes; j++) {
+		if (__builtin_fabsf(values[j]) > limits[j]) { values[j] = values[j] > 0.0F ? limits[j] : -limits[j]; }
 	}
-
-	return angle;
 }
 
-[[gnu::cold, gnu::noinline]] bool acceptable(const Gains &gains)
+[[gnu::always_inline]] inline float row(const float (&gain)[2], float roll, float pitch)
 {
-	static_assert(sizeof(Gains) == kGainCount * sizeof(float), "Gains is a row of floats");
-	const float *const values = reinterpret_cast<const float *>(&gains);
-
-	for (int i = 0; i < kGainCount; i++) {
-		if (!within(values[i], kMaxGain)) { return false; }
-	}
-
-	return valid(gains);
+	return gain[0] * roll + gain[1] * pitch;
 }
 
-bool follows(const Gains &gains) { return !within(gains.model_omega, 0.0F); }
+struct Quaternion {
+	float w;
+	float x;
+	float y;
+	float z;
+};
 
-// One period of the attitude model: semi-implicit Euler.
-[[gnu::noinline]] void advance(const Gains &gains, const State &state, Model &model)
+[[gnu::always_inline]] inline Quaternion load(const float (&q)[4]) { return {q[0], q[1], q[2], q[3]}; }
+
+[[gnu::always_inline]] inline void store(const Quaternion &q, float (&to)[4])
 {
-	const float omega = gains.model_omega;
-	const float stiffness = omega * omega;
-	const float friction = (2.0F * gains.model_damping) * omega;
+	to[0] = q.w;
+	to[1] = q.x;
+	to[2] = q.y;
+	to[3] = q.z;
+}
 
+[[gnu::always_inline]] inline float length_squared(const Quaternion &q)
+{
+	return ((q.w * q.w + q.x * q.x) + q.y * q.y) + q.z * q.z;
+}
+
+[[gnu::always_inline]] inline bool is_rotation(const Quaternion &q)
+{
+	return within(length_squared(q) - 1.0F, kMaxNormError);
+}
+
+[[gnu::always_inline]] inline bool follows(const Gains &gains) { return !within(gains.model_omega, 0.0F); }
+
+// One period of the attitude model, semi-implicit Euler. Returns the setpoint's heading, then the model's tilt.
+[[gnu::always_inline]] inline Quaternion advance(State &state)
+{
+	const Gains &gains = state.gains;
+	Model &model = state.flown.model;
+	const float(&target)[4] = state.attitude_setpoint;
+	const float length = __builtin_sqrtf(target[0] * target[0] + target[3] * target[3]);
+	float cosine = 1.0F;  // of half the heading
+	float sine = 0.0F;
+
+	if (!unlikely(length < kInverted)) {
+		const float inverse = 1.0F / length;
+		cosine = target[0] * inverse;
+		sine = target[3] * inverse;
+	}
+
+	// The direction of body z that is wanted, or measured: 2 imag of the tilt in the axes of that heading.
+	const bool running = model.running != 0;
+	const float(&q)[4] = running ? state.attitude_setpoint : state.attitude;
+	const float x = cosine * q[1] + sine * q[2];
+	const float y = cosine * q[2] - sine * q[1];
+	float direction[kModelAxes] = {2.0F * x, 2.0F * y};
+
+	if (!running) {  // the measured heading may differ
+		const float w = cosine * q[0] + sine * q[3];
+		const float z = cosine * q[3] - sine * q[0];
+		const float upright = __builtin_sqrtf(w * w + z * z);
+
+		if (!unlikely(upright < kInverted)) {
+			const float scale = 2.0F / upright;
+			direction[0] = scale * (x * w - y * z);
+			direction[1] = scale * (y * w + x * z);
+		}
+	}
+
+	model.running = 1;
+	const float stiffness = gains.model_omega * gains.model_omega;
+	const float friction = (2.0F * gains.model_damping) * gains.model_omega;
+
+#pragma GCC unroll 2
 	for (int j = 0; j < kModelAxes; j++) {
-		float angle = state.attitude[j];
 		float rate = 0.0F;
 		float acceleration = 0.0F;
+		float angle = direction[j];
 
-		if (model.running != 0) {
-			angle = model.angle[j];
-			rate = model.rate[j];
-			acceleration = stiffness * (state.setpoint[j] - angle) - friction * rate;
-			rate += gains.period * acceleration;
-			angle += gains.period * rate;
+		if (running) {
+			acceleration = stiffness * (angle - model.angle[j]) - friction * model.rate[j];
+			rate = model.rate[j] + gains.period * acceleration;
+			angle = model.angle[j] + gains.period * rate;
 		}
 
-		model.angle[j] = angle;
-		model.rate[j] = rate;
 		model.acceleration[j] = acceleration;
+		model.rate[j] = rate;
+		model.angle[j] = angle;
 	}
+
+	const float roll = 0.5F * model.angle[0];
+	const float pitch = 0.5F * model.angle[1];
+	const float square = 1.0F - (roll * roll + pitch * pitch);
+	const float tilt = square > 0.0F ? __builtin_sqrtf(square) : 0.0F;
+	return {
+		cosine * tilt,
+		cosine * roll - sine * pitch,
+		cosine * pitch + sine * roll,
+		sine * tilt,
+	};
 }
 
-// Attitude controller: rate setpoint r.
-[[gnu::always_inline]] inline void outer_loop(const Gains &gains, const State &state, const Model &model,
-					      float (&r)[kAxes])
+// Attitude controller. The attitude model moves one period ahead. Sets the flown rate setpoint, and the acceleration of the attitude model in body axes.
+// In rate mode, r_i is given.
+[[gnu::noinline]] void outer_loop(State &state)
 {
+	if (unlikely(state.rate_mode != 0)) { return; }
+
+	// conj(q) target: the rotation from q to the target, in the axes of q.
+	const Gains &gains = state.gains;
 	const bool following = follows(gains);
-	float roll = state.setpoint[0];
-	float pitch = state.setpoint[1];
+	const Quaternion target = unlikely(following) ? advance(state) : load(state.attitude_setpoint);
+	const Quaternion q = load(state.attitude);
+	float w = ((q.w * target.w + q.x * target.x) + q.y * target.y) + q.z * target.z;
+	float x = ((q.w * target.x - q.x * target.w) - q.y * target.z) + q.z * target.y;
+	float y = ((q.w * target.y + q.x * target.z) - q.y * target.w) - q.z * target.x;
+	float z = ((q.w * target.z - q.x * target.y) + q.y * target.x) - q.z * target.w;
+
+	if (w < 0.0F) {
+		w = -w;
+		x = -x;
+		y = -y;
+		z = -z;
+	}
+
+	// It is a tilt (cosine, roll, pitch, 0), then a turn (w, 0, 0, z) / cosine; all are of half angles. The turn is
+	// weighted: (turn, 0, 0, weight z) / length.
+	const float square = w * w + z * z;
+	const float cosine = __builtin_sqrtf(square);
+	float roll = 2.0F * x;
+	float pitch = 2.0F * y;
+	float yaw = 0.0F;
+
+	if (!unlikely(cosine < kInverted)) {
+		const float turn = cosine - gains.yaw_weight * (cosine - w);
+		const float weighted = gains.yaw_weight * z;
+		const float scale = 2.0F / (cosine * __builtin_sqrtf(turn * turn + weighted * weighted));
+		const float tilt_roll = x * w - y * z;
+		const float tilt_pitch = y * w + x * z;
+		roll = scale * (tilt_roll * turn + tilt_pitch * weighted);
+		pitch = scale * (tilt_pitch * turn - tilt_roll * weighted);
+		yaw = scale * (square * z);
+	}
+
+	// Earth's z axis in body axes, times the setpoint's yaw rate.
+	const float yaw_rate = 2.0F * state.yaw_rate_setpoint;
+	float roll_rate = row(gains.kp_o[0], roll, pitch) + yaw_rate * (q.x * q.z - q.w * q.y);
+	float pitch_rate = row(gains.kp_o[1], roll, pitch) + yaw_rate * (q.y * q.z + q.w * q.x);
+	const float turn_rate = gains.yaw_kp_o * yaw + yaw_rate * (0.5F - (q.x * q.x + q.y * q.y));
 
 	if (unlikely(following)) {
-		roll = model.angle[0];
-		pitch = model.angle[1];
+		const Model &model = state.flown.model;
+		const float share = unlikely(cosine < kInverted) ? 0.0F : (2.0F * z) / square;
+		const float turn_cosine = 1.0F - share * z;
+		const float turn_sine = share * w;
+		const float roll_ahead = turn_cosine * model.rate[0] - turn_sine * model.rate[1];
+		const float pitch_ahead = turn_sine * model.rate[0] + turn_cosine * model.rate[1];
+		state.flown.acceleration[0] = turn_cosine * model.acceleration[0] - turn_sine * model.acceleration[1];
+		state.flown.acceleration[1] = turn_sine * model.acceleration[0] + turn_cosine * model.acceleration[1];
+		roll_rate += row(gains.kff_o[0], roll_ahead, pitch_ahead);
+		pitch_rate += row(gains.kff_o[1], roll_ahead, pitch_ahead);
 	}
 
-	roll -= state.attitude[0];
-	pitch -= state.attitude[1];
-	const float yaw = wrap(state.setpoint[2] - state.attitude[2]);
-	float roll_rate = row(gains.kp_o[0], roll, pitch);
-	float pitch_rate = row(gains.kp_o[1], roll, pitch);
+	state.flown.rates[0] = roll_rate;
+	state.flown.rates[1] = pitch_rate;
+	state.flown.rates[2] = turn_rate;
+	clamp_axes(state.flown.rates, gains.rate_max);
+}
 
-	if (unlikely(following)) {
-		roll_rate += row(gains.kff_o[0], model.rate[0], model.rate[1]);
-		pitch_rate += row(gains.kff_o[1], model.rate[0], model.rate[1]);
+// v without the integral, and the integral's slope.
+struct Torque {
+	float rest[kAxes];
+	float slope[kAxes];
+};
+
+[[gnu::noinline]] void rate_controller(const State &state, Torque &torque)
+{
+	const Gains &gains = state.gains;
+	const float roll = state.flown.rates[0];
+	const float pitch = state.flown.rates[1];
+	const float yaw = state.flown.rates[2];
+	const float roll_error = roll - state.rates[0];
+	const float pitch_error = pitch - state.rates[1];
+	const float yaw_error = yaw - state.rates[2];
+
+	for (int j = 0; j < kModelAxes; j++) {
+		float feedforward = row(gains.kff_i[j], roll, pitch);
+
+		if (follows(gains)) {
+			feedforward += row(gains.kaff_i[j], state.flown.acceleration[0], state.flown.acceleration[1]);
+		}
+
+		torque.rest[j] = (row(gains.kp_i[j], roll_error, pitch_error)
+				  - row(gains.kd_i[j], state.derivative[0], state.derivative[1])) + feedforward;
+		torque.slope[j] = row(gains.ki_i[j], roll_error, pitch_error);
 	}
 
-	r[0] = clamp(roll_rate, gains.rate_max[0]);
-	r[1] = clamp(pitch_rate, gains.rate_max[1]);
-	r[2] = clamp(gains.yaw_kp_o * yaw, gains.rate_max[2]);
+	torque.rest[2] = (gains.yaw_kp_i * yaw_error - gains.yaw_kd_i * state.derivative[2]) + gains.yaw_kff_i * yaw;
+	torque.slope[2] = gains.yaw_ki_i * yaw_error;
 }
 
-struct Axes {
-	float roll;
-	float pitch;
-	float yaw;
-};
-
-// Inputs of the rate controller.
-struct Signals {
-	Axes rates_setpoint;
-	Axes error;
-	Axes derivative;
-	bool following;
-	float roll_acceleration;  // of the attitude model
-	float pitch_acceleration;
-};
-
-[[gnu::always_inline]] inline Signals signals(const Gains &gains, const State &state, const Model &model,
-					      const float (&r)[kAxes])
+[[gnu::always_inline]] inline void stop_model(Flown &flown)
 {
-	return {
-		{r[0], r[1], r[2]},
-		{r[0] - state.rates[0], r[1] - state.rates[1], r[2] - state.rates[2]},
-		{state.derivative[0], state.derivative[1], state.derivative[2]},
-		follows(gains),
-		model.acceleration[0],
-		model.acceleration[1],
-	};
+	flown.model.running = 0;
+	flown.acceleration[0] = flown.acceleration[1] = 0.0F;
 }
 
-// Terms of v on one axis.
-struct Terms {
-	float proportional;
-	float derivative;
-	float feedforward;
-	float slope;  // Ki e
-};
-
-[[gnu::always_inline]] inline Terms inner_loop(const Gains &gains, const Signals &x, int j)
+// Ends what depends on past attitude setpoints. If disarmed, the integrals are zero; if an input failed, the rate
+// setpoint.
+[[gnu::cold, gnu::noinline]] void settle(State &state, int32_t armed, int32_t failed)
 {
-	if (j == 2) {
-		return {
-			gains.yaw_kp_i * x.error.yaw,
-			gains.yaw_kd_i * x.derivative.yaw,
-			gains.yaw_kff_i * x.rates_setpoint.yaw,
-			gains.yaw_ki_i * x.error.yaw,
-		};
+	state.slewing = 0;
+	stop_model(state.flown);
+
+	if (armed == 0) { state.integral[0] = state.integral[1] = state.integral[2] = 0.0F; }
+
+	if (failed != 0) { state.flown.rates[0] = state.flown.rates[1] = state.flown.rates[2] = 0.0F; }
+}
+
+// Counts invalid samples, and those for which an input is still held. `missing` and the result are fault bits; the latter
+// of inputs that are invalid for too long. The derivative of a rate starts again after that.
+[[gnu::cold, gnu::noinline]] int32_t count_missing(State &state, int32_t missing, int32_t silent)
+{
+	int32_t expired = 0;
+
+	for (uint32_t left = static_cast<uint32_t>(missing); left != 0U; left &= left - 1U) {
+		const int i = __builtin_ctz(left);
+		const int32_t bit = 1 << i;
+		int32_t hold = (state.missing & bit) != 0 ? state.hold[i] : kHoldSamples;
+		state.fault_count++;
+
+		if (hold == 0 || (silent & bit) != 0) {
+			expired |= bit;
+			hold = 1;
+
+			if (bit >= kRateFault) { state.rates[i - 2] = 0.0F; }
+		}
+
+		state.hold[i] = hold - 1;
 	}
 
-	float feedforward = row(gains.kff_i[j], x.rates_setpoint.roll, x.rates_setpoint.pitch);
+	uint32_t restarted = static_cast<uint32_t>(expired | state.expired) / kRateFault;
 
-	if (unlikely(x.following)) { feedforward += row(gains.kaff_i[j], x.roll_acceleration, x.pitch_acceleration); }
+	for (int i = 0; restarted != 0U; i++, restarted >>= 1) {
+		if ((restarted & 1U) != 0U) { state.derivative[i] = 0.0F; }
+	}
 
-	return {
-		row(gains.kp_i[j], x.error.roll, x.error.pitch),
-		row(gains.kd_i[j], x.derivative.roll, x.derivative.pitch),
-		feedforward,
-		row(gains.ki_i[j], x.error.roll, x.error.pitch),
-	};
+	state.missing = missing;
+	state.expired = expired;
+	return state.rate_mode != 0 ? expired & ~kAttitudeFault : expired;
 }
 
-float sum(const Terms &terms, float integral)
-{
-	return ((terms.proportional + integral) - terms.derivative) + terms.feedforward;
-}
-
-void clear_integral(State &state)
-{
-	for (int j = 0; j < kAxes; j++) { state.integral[j] = 0.0F; }
-}
-
-// v of each axis, with the attitude model one period ahead.
-[[gnu::cold, gnu::noinline]] void evaluate(const Gains &gains, const State &state, float (&v)[kAxes])
-{
-	float r[kAxes];
-	Model model = state.model;
-
-	if (follows(gains)) { advance(gains, state, model); }
-
-	outer_loop(gains, state, model, r);
-	const Signals x = signals(gains, state, model, r);
-
-	for (int j = 0; j < kAxes; j++) { v[j] = sum(inner_loop(gains, x, j), state.integral[j]); }
-}
-
-// Accepts a value within its range, otherwise holds the last valid one. True: invalid for too long.
-[[gnu::always_inline]] inline bool accept(float value, float limit, float &held, int32_t &age, uint32_t &fault_count)
+// NaN means none; any other value out of range is a fault. Returns 0 for both.
+[[gnu::always_inline]] inline float optional(float value, float limit, uint32_t &fault_count)
 {
 	if (unlikely(!within(value, limit))) {
-		fault_count++;
-
-		if (age <= kHoldSamples) { age++; }
-
-		return age > kHoldSamples;
-	}
-
-	held = value;
-	age = 0;
-	return false;
-}
-
-// Returns the bits of Output::fault.
-[[gnu::always_inline]] inline int32_t accept_inputs(State &state, const Input &input)
-{
-	int32_t failed = 0;
-	const float pole = state.gains.derivative_pole;
-	const float filter_gain = (1.0F - pole) / state.gains.period;
-	uint32_t fault_count = state.fault_count;
-
-	for (int i = 0; i < kAxes; i++) {
-		if (accept(input.attitude_setpoint[i], kMaxAngle, state.setpoint[i], state.age[i], fault_count)) {
-			failed |= 1 << i;
-		}
-
-		if (accept(input.attitude[i], kMaxAngle, state.attitude[i], state.age[kAxes + i], fault_count)) {
-			failed |= 8 << i;
-		}
-
-		int32_t &age = state.age[2 * kAxes + i];
-		const bool first = age > kHoldSamples;
-		const float previous = state.rates[i];
-		float derivative = pole * state.derivative[i];
-
-		if (accept(input.rates[i], kMaxRate, state.rates[i], age, fault_count)) {
-			failed |= 64 << i;
-			derivative = 0.0F;
-
-		} else if (unlikely(first)) {
-			derivative = 0.0F;
-
-		} else {
-			derivative += filter_gain * (state.rates[i] - previous);
-		}
-
-		state.derivative[i] = derivative;
-	}
-
-	state.fault_count = fault_count;
-	return failed;
-}
-
-// NaN means no excitation; any other value out of range is a fault.
-float accept_excitation(float value, uint32_t &fault_count)
-{
-	if (!within(value, kMaxExcitation)) {
 		if (within(value, __builtin_inff())) { fault_count++; }
 
 		value = 0.0F;
@@ -283,68 +317,174 @@ float accept_excitation(float value, uint32_t &fault_count)
 	return value;
 }
 
-// An input was invalid for too long: only damp the rates still measured. An axis without its rate gets no torque.
-[[gnu::cold, gnu::noinline]] void damp_rates(State &state, int32_t failed, const Input &input, Output &output)
+// Turns the attitude setpoint towards the given one, within the slew limit. It starts at the measured attitude.
+[[gnu::cold, gnu::noinline]] void slew(State &state, const Input &input)
 {
-	const Gains &gains = state.gains;
-	const int32_t lost = failed >> (2 * kAxes);
-	state.model.running = 0;
-	const float roll = (lost & 1) != 0 ? 0.0F : state.rates[0];
-	const float pitch = (lost & 2) != 0 ? 0.0F : state.rates[1];
+	const float(&target)[4] = input.attitude_setpoint;
+	const float(&q)[4] = state.slewing != 0 ? state.attitude_setpoint : state.attitude;
+	const float angle = 0.5F * (state.gains.setpoint_slew * state.gains.period);  // quaternions turn by half angles
+	float along = 0.0F;
+	state.slewing = input.armed;
 
-	for (int j = 0; j < kAxes; j++) {
-		float moment = j == 2 ? -(gains.yaw_kp_i * state.rates[2]) - gains.yaw_kd_i * state.derivative[2]
-			       : -row(gains.kp_i[j], roll, pitch) - row(gains.kd_i[j], state.derivative[0], state.derivative[1]);
+	for (int i = 0; i < 4; i++) { along += q[i] * target[i]; }
 
-		if ((lost & (1 << j)) != 0) { moment = 0.0F; }
+	float across[4];
+	float square = 0.0F;
 
-		accept_excitation(input.excitation[j], state.fault_count);
-		output.moment[j] = clamp(moment, gains.moment_max[j]);
-		output.rates_setpoint[j] = 0.0F;
+	for (int i = 0; i < 4; i++) {
+		across[i] = target[i] - along * q[i];
+		square += across[i] * across[i];
 	}
+
+	const float distance = __builtin_sqrtf(square);
+
+	if (distance <= angle) {
+		__builtin_memcpy(state.attitude_setpoint, target, sizeof(target));
+		return;
+	}
+
+	const float step = (along < 0.0F ? -angle : angle) / distance;
+	square = 0.0F;
+
+	for (int i = 0; i < 4; i++) {
+		across[i] = q[i] + step * across[i];
+		square += across[i] * across[i];
+	}
+
+	const float scale = 1.0F / __builtin_sqrtf(square);
+
+	for (int i = 0; i < 4; i++) { state.attitude_setpoint[i] = scale * across[i]; }
 }
 
-// Normal operation, with anti-windup per axis. The integral is within its limit from the last period and is never -0,
-// so a zero increment keeps its bits.
-void control(State &state, const Input &input, Output &output)
+// Takes over an attitude setpoint, within the slew limit. Returns false if it is invalid.
+[[gnu::always_inline]] inline bool accept_attitude_setpoint(State &state, const Input &input)
 {
-	const Gains &gains = state.gains;
-	const bool integrating = input.armed != 0 && input.landed == 0;
-	const float period = integrating ? gains.period : 0.0F;
+	const Quaternion given = load(input.attitude_setpoint);
 
-	if (follows(gains)) {
-		advance(gains, state, state.model);
-		state.model.running = input.armed;
+	if (unlikely(!is_rotation(given))) { return false; }
+
+	if (unlikely(!within(state.gains.setpoint_slew, 0.0F))) {
+		slew(state, input);
+
+	} else {
+		store(given, state.attitude_setpoint);
 	}
 
-	outer_loop(gains, state, state.model, output.rates_setpoint);
-	const Signals x = signals(gains, state, state.model, output.rates_setpoint);
+	return true;
+}
 
-	for (int j = 0; j < kAxes; j++) {
-		const Terms terms = inner_loop(gains, x, j);
-		const float excitation = accept_excitation(input.excitation[j], state.fault_count);
-		const float limit = gains.moment_max[j];
-		const float increment = period * terms.slope;
-		const float before = state.integral[j];
-		float integral = before + increment;
-		float moment = sum(terms, integral) + excitation;
-		bool held = false;
+// Takes over a rate setpoint. Returns false if it is invalid.
+[[gnu::cold, gnu::noinline]] bool accept_rates_setpoint(State &state, const Input &input)
+{
+	settle(state, 1, 0);
 
-		if (increment > 0.0F) {
-			held = moment > limit || input.saturation[j] > 0;
+	for (float rate : input.rates_setpoint) {
+		if (!within(rate, kMaxRate)) { return false; }
+	}
 
-		} else if (increment < 0.0F) {
-			held = moment < -limit || input.saturation[j] < 0;
+	for (int i = 0; i < kAxes; i++) { state.flown.rates[i] = input.rates_setpoint[i]; }
+
+	return true;
+}
+
+// Returns the bits of Output::fault.
+[[gnu::always_inline]] inline int32_t accept_inputs(State &state, const Input &input)
+{
+	int32_t missing = input.silent & kAllFaults;
+	state.rate_mode = input.rate_mode;
+	const Quaternion attitude = load(input.attitude);
+
+	if (unlikely(!is_rotation(attitude))) {
+		missing |= kAttitudeFault;
+
+	} else {
+		store(attitude, state.attitude);
+	}
+
+	if (!(unlikely(input.rate_mode != 0) ? accept_rates_setpoint(state, input) : accept_attitude_setpoint(state, input))) {
+		missing |= kSetpointFault;
+	}
+
+	state.yaw_rate_setpoint = optional(input.yaw_rate_setpoint, kMaxRate, state.fault_count);
+
+#pragma GCC unroll 3
+	for (int i = 0; i < kAxes; i++) {
+		const float before = state.rates[i];
+		float rate = input.rates[i];
+
+		if (unlikely(!within(rate, kMaxRate))) {
+			missing |= kRateFault << i;
+			rate = before;
 		}
 
-		if (unlikely(held || __builtin_fabsf(integral) > gains.integral_max[j])) {
-			integral = held ? before : clamp(integral, gains.integral_max[j]);
-			moment = sum(terms, integral) + excitation;
+		state.derivative[i] = state.gains.derivative_pole * state.derivative[i] + state.derivative_gain * (rate - before);
+		state.rates[i] = rate;
+	}
+
+	if (unlikely((missing | state.missing) != 0)) { return count_missing(state, missing, input.silent); }
+
+	return 0;
+}
+
+// Torque u if an input was invalid for too long: without the integrals and the excitation. An axis without a valid rate,
+// whose y_i is 0, gets none.
+[[gnu::cold, gnu::noinline]] void damp(const Gains &gains, const Torque &torque, int32_t failed, float (&u)[kAxes])
+{
+	for (int j = 0; j < kAxes; j++) {
+		u[j] = (failed >> j & kRateFault) != 0 ? 0.0F : torque.rest[j];
+	}
+
+	clamp_axes(u, gains.moment_max);
+}
+
+// Torque u, and the integrals, which do not grow further into saturation. An integral is within its limit from the last
+// period and is never -0, so a zero increment keeps its bits.
+[[gnu::always_inline]] inline void integrate(State &state, const Input &input, const Torque &torque, float (&u)[kAxes])
+{
+	const Gains &gains = state.gains;
+	const float period = input.armed != 0 && input.landed == 0 ? gains.period : 0.0F;
+
+	for (int j = 0; j < kAxes; j++) {
+		const float rest = torque.rest[j] + optional(input.excitation[j], kMaxExcitation, state.fault_count);
+		const float increment = period * torque.slope[j];
+		const float limit = gains.moment_max[j];
+		float integral = state.integral[j] + increment;
+		float moment = rest + integral;
+		const bool limited = __builtin_fabsf(moment) > limit;
+		const int32_t saturation = input.saturation[j];
+
+		if (unlikely(limited || saturation != 0 || __builtin_fabsf(integral) > gains.integral_max[j])) {
+			const int32_t direction = bits_of(increment);
+			const bool held = (limited && (direction ^ bits_of(moment)) >= 0)
+					  || (saturation != 0 && (direction ^ saturation) >= 0);
+			integral = held ? state.integral[j] : clamp(integral, gains.integral_max[j]);
+			moment = clamp(rest + integral, limit);
 		}
 
 		state.integral[j] = integral;
-		output.moment[j] = clamp(moment, limit);
+		u[j] = moment;
 	}
+}
+
+[[gnu::cold, gnu::noinline]] void copy(const Flown &from, Flown &to) { to = from; }
+
+// Adds to the integrals, or subtracts, the rest of v in the next period, if the inputs stay as they are.
+[[gnu::cold, gnu::noinline]] void add_next_rest(State &state, bool subtract)
+{
+	Flown flown;
+	Torque torque;
+	copy(state.flown, flown);
+	outer_loop(state);
+	rate_controller(state, torque);
+	copy(flown, state.flown);
+
+	for (int j = 0; j < kAxes; j++) { state.integral[j] += subtract ? -torque.rest[j] : torque.rest[j]; }
+}
+
+[[gnu::cold, gnu::noinline]] void take_over(const Gains &gains, State &state)
+{
+	state.gains = gains;
+	state.derivative_gain = (1.0F - gains.derivative_pole) / gains.period;
 }
 
 }  // namespace
@@ -353,39 +493,33 @@ void control(State &state, const Input &input, Output &output)
 {
 	state = State{};
 
-	for (int i = 0; i < 3 * kAxes; i++) { state.age[i] = kHoldSamples + 1; }
+	state.missing = state.expired = kAllFaults;
+	state.attitude[0] = state.attitude_setpoint[0] = 1.0F;
 
-	const bool accepted = acceptable(gains);
+	const bool accepted = valid(gains);
 
-	if (accepted) {
-		state.gains = gains;
-
-	} else {
-		state.gains.period = 1.0F;  // all other gains and limits are 0, so the torque is 0
-	}
+	if (accepted) { take_over(gains, state); }  // else all gains and limits are 0, so the torque is 0
 
 	return accepted;
 }
 
 [[gnu::cold]] bool set_gains(State &state, const Gains &gains)
 {
-	if (!acceptable(gains)) { return false; }
+	if (!valid(gains)) { return false; }
 
-	float before[kAxes];
-	float rest[kAxes];
-	evaluate(state.gains, state, before);
-	clear_integral(state);
-	evaluate(gains, state, rest);
+	add_next_rest(state, false);
+	take_over(gains, state);
+	add_next_rest(state, true);
+	clamp_axes(state.integral, gains.integral_max);
 
-	for (int j = 0; j < kAxes; j++) {
-		const bool unused = j == 2 ? within(gains.yaw_ki_i, 0.0F)
-				    : within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F);
-		state.integral[j] = unused ? 0.0F : clamp(before[j] - rest[j], gains.integral_max[j]);
+	// An axis without integral gains has no integral.
+	for (int j = 0; j < kModelAxes; j++) {
+		if (within(gains.ki_i[j][0], 0.0F) && within(gains.ki_i[j][1], 0.0F)) { state.integral[j] = 0.0F; }
 	}
 
-	state.gains = gains;
+	if (within(gains.yaw_ki_i, 0.0F)) { state.integral[2] = 0.0F; }
 
-	if (!follows(gains)) { state.model.running = 0; }
+	if (!follows(gains)) { stop_model(state.flown); }
 
 	return true;
 }
@@ -394,18 +528,23 @@ void step(State &state, const Input &input, Output &output)
 {
 	const int32_t failed = accept_inputs(state, input);
 
-	if (input.armed == 0) {
-		clear_integral(state);
-		state.model.running = 0;
-	}
+	// An input that is missing now holds the rate setpoint.
+	if (state.missing == 0) { outer_loop(state); }
 
-	if (failed != 0) {
-		damp_rates(state, failed, input, output);
+	if (unlikely(input.armed == 0 || failed != 0)) { settle(state, input.armed, failed); }
+
+	Torque torque;
+	rate_controller(state, torque);
+
+	if (unlikely(failed != 0)) {
+		damp(state.gains, torque, failed, output.moment);
 
 	} else {
-		control(state, input, output);
+		integrate(state, input, torque, output.moment);
 	}
 
+	static_assert(sizeof(output.rates_setpoint) == sizeof(state.flown.rates), "both are of all axes");
+	__builtin_memcpy(output.rates_setpoint, state.flown.rates, sizeof(output.rates_setpoint));
 	output.fault = failed;
 	output.fault_count = state.fault_count;
 }

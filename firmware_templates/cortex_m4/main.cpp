@@ -32,6 +32,7 @@ int main()
 	mimopilot::State state;
 	mimopilot::Input input = {};
 	mimopilot::Output output;
+	input.attitude_setpoint[0] = input.attitude[0] = 1.0F;
 
 	if (!mimopilot::initialise(state, mimopilot::kGains)) { return 1; }
 

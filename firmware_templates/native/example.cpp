@@ -10,7 +10,9 @@ int main()
 	if (!mimopilot::initialise(state, mimopilot::kGains)) { return 1; }
 
 	mimopilot::Input input = {};
-	input.attitude[0] = 0.1F;
+	input.attitude_setpoint[0] = 1.0F;
+	input.attitude[0] = 0.99875026F;  // cosine and sine of 0.05 rad
+	input.attitude[1] = 0.04997917F;
 	input.armed = 1;
 
 	for (int k = 0; k < 10; k++) {

@@ -12,7 +12,7 @@ from mimopilot.cli.options import AirframeArgument, AxisOption, FaultOption, Jso
 
 
 class Study(StrEnum):
-    """What can be reproduced: the benchmarks of chapter 5, the vehicles of chapter 6, ours; two are not part of all."""
+    """What can be reproduced: the thesis' benchmarks and vehicles, and ours; three are not part of all."""
 
     NUMERICAL_EXAMPLE = "numerical-example"
     LV100 = "lv100"
@@ -29,6 +29,7 @@ class Study(StrEnum):
     ALL = "all"
     VEHICLES = "vehicles"
     GAINS = "gains"
+    MANOEUVRES = "manoeuvres"
 
 
 def register(app: typer.Typer) -> None:
@@ -114,6 +115,7 @@ def reproduce(
     """Compute the thesis' tables and figures again, beside its own figures.
 
     vehicles: tune many random vehicles. gains: all gain sets of four vehicles, from the flown ones to the optimum.
+    manoeuvres: turns, flips, recovery and heading steps, beside a law on Euler angles.
     """
     from mimopilot.common.console import print_json
     from mimopilot.common.errors import check_not_given
@@ -126,7 +128,12 @@ def reproduce(
         found = reproduce_vehicles(out, runs or RUNS, first or 0, workers)
     else:
         check_not_given("only for the study vehicles", runs=runs, first=first)
-        if study is Study.GAINS:
+        if study is Study.MANOEUVRES:
+            from mimopilot.sitl.studies.manoeuvres import reproduce_manoeuvres
+
+            check_not_given("the manoeuvres are flown once, without noise", seeds=seeds, workers=workers)
+            found = reproduce_manoeuvres(out)
+        elif study is Study.GAINS:
             from mimopilot.sitl.studies.gains_study import SEEDS as GAINS_SEEDS
             from mimopilot.sitl.studies.gains_study import reproduce_gains
 

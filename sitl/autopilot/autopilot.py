@@ -19,16 +19,19 @@ from mimopilot.sitl.physics.compiled_step import call_step, compiled, inlined
 from mimopilot.sitl.physics.mixer import Allocation, allocate
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS
-from mimopilot.sitl.physics.state_estimate import euler_angles
+from mimopilot.sitl.physics.state_estimate import euler_angles, quaternion_of
 from mimopilot.tuning.gains import Gains
 
 MIN_THRUST_RATIO, MAX_THRUST_RATIO = 0.5, 1.5  # of hover; chosen: altitude hold accelerates by at most half of g
 MIN_TILT_COSINE = 0.5  # 60 degrees, the largest tilt of a setpoint: beyond it thrust is not increased further
 
-#: Inputs and outputs of one period: the signals of a flight log.
+#: Inputs and outputs of one period: the signals of a flight log. The setpoint is roll, pitch, yaw (rad) and its yaw
+#: rate (rad/s) or, in rate mode, the body rates (rad/s).
 RECORD = np.dtype(
     [
         ("setpoint", "f4", 3),
+        ("yaw_rate", "f4"),
+        ("rate_mode", "i4"),
         ("quaternion", "f4", 4),
         ("attitude", "f4", 3),
         ("rates_setpoint", "f4", 3),
@@ -74,14 +77,17 @@ def tick_unpacked(step_address, state, input_rows, output_rows, allocation, coll
     """`tick` for compiled loops: with a tuple, numba counts the references of its arrays in each call."""
     roll, pitch, yaw = euler_angles(measurement[0], measurement[1], measurement[2], measurement[3])
     inputs = input_rows[0]
-    inputs.attitude[0], inputs.attitude[1], inputs.attitude[2] = roll, pitch, yaw
+    row.attitude[0], row.attitude[1], row.attitude[2] = roll, pitch, yaw
+    wanted = quaternion_of(np.float64(row.setpoint[0]), np.float64(row.setpoint[1]), np.float64(row.setpoint[2]))
+    inputs.rate_mode, inputs.yaw_rate_setpoint = row.rate_mode, row.yaw_rate
     for i in range(4):
+        inputs.attitude[i] = measurement[i]
+        inputs.attitude_setpoint[i] = wanted[i]
         row.quaternion[i] = measurement[i]
     for i in range(3):
         inputs.rates[i] = measurement[4 + i]
-        inputs.attitude_setpoint[i] = row.setpoint[i]
+        inputs.rates_setpoint[i] = row.setpoint[i]
         inputs.excitation[i] = row.excitation[i]
-        row.attitude[i] = inputs.attitude[i]
         row.rates[i] = inputs.rates[i]
     call_step(step_address, state.ctypes.data, input_rows.ctypes.data, output_rows.ctypes.data)
     outputs = output_rows[0]
@@ -108,7 +114,7 @@ def tick_unpacked(step_address, state, input_rows, output_rows, allocation, coll
 
 @compiled
 def tick(loop, collective, altitude, measurement, row):  # type: ignore[no-untyped-def]
-    """One control period: `row.setpoint` and `row.excitation` are given, the rest of `row` is filled.
+    """One control period: setpoint, its yaw rate, rate mode and excitation are given, the rest of `row` is filled.
 
     `altitude` is the one to hold (m) and `collective` then the thrust fraction of hover. When `altitude` is NaN, the
     collective is given. Motor commands are 0 while the vehicle is disarmed.

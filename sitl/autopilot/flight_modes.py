@@ -65,11 +65,9 @@ class Failed(Refused):
 
 
 class Demand(NamedTuple):
-    """Demand of one period: angles (rad), altitude to hold (m; NaN: none) and collective (thrust fraction)."""
+    """Demand of one period: setpoint, altitude to hold (m; NaN: none) and collective (thrust fraction)."""
 
-    roll: float
-    pitch: float
-    yaw: float
+    setpoint: AttitudeSetpoint
     altitude: float
     collective: float
 
@@ -260,7 +258,7 @@ class Commander:
         if not self.armed:
             self.vertical.rest(dt, estimate)
             self._reset_manoeuvre()
-            return Demand(0.0, 0.0, estimate.yaw, math.nan, 0.0)
+            return self._at_rest()
         attitude, speed = self._update_setpoint(dt)
         if attitude.thrust is not None:
             altitude, collective = self.vertical.thrust(dt, estimate, attitude.thrust)
@@ -268,12 +266,17 @@ class Commander:
             altitude, collective = self.vertical.climb(dt, estimate, speed)
         if self.mode is Mode.LAND and self.vertical.landed:
             self.disarm(why=": landed")
-            return Demand(0.0, 0.0, estimate.yaw, math.nan, 0.0)
-        return Demand(attitude.roll, attitude.pitch, attitude.yaw, altitude, collective)
+            return self._at_rest()
+        return Demand(attitude, altitude, collective)
+
+    def _at_rest(self) -> Demand:
+        return Demand(AttitudeSetpoint(0.0, 0.0, self.estimate.yaw, None), math.nan, 0.0)
 
     def _stop_when_lost(self, dt: float) -> None:
         """Stop the rotors when the vehicle is lost, see `sitl.autopilot.failure_detector`."""
-        self._tilted = 0.0 if self._within_tilt(MAX_TILT) else self._tilted + dt
+        # As in PX4, any tilt is allowed in rate mode.
+        flies_rates = self.mode is Mode.OFFBOARD and self.attitude.value.rate_mode
+        self._tilted = 0.0 if flies_rates or self._within_tilt(MAX_TILT) else self._tilted + dt
         if self._tilted >= MAX_TILT_SECONDS:
             self.say(Severity.EMERGENCY, f"lost: tilted beyond {math.degrees(MAX_TILT):.0f} degrees, rotors stopped")
             self.disarm(force=True)
@@ -294,13 +297,15 @@ class Commander:
         return AttitudeSetpoint(roll, pitch, self._yaw, None), self._update_climb()
 
     def _follow_attitude(self) -> tuple[AttitudeSetpoint, float]:
-        self._yaw = self.attitude.value.yaw
-        return self.attitude.value, 0.0
+        given = self.attitude.value
+        self._yaw = self.estimate.yaw if given.rate_mode else given.yaw
+        return given, 0.0
 
     def _follow_sticks(self, dt: float) -> tuple[AttitudeSetpoint, float]:
         sticks = self.sticks.value
         self._yaw = math.remainder(self._yaw + dt * STICK_YAW * sticks.yaw, math.tau)
-        setpoint = AttitudeSetpoint(STICK_TILT * sticks.roll, STICK_TILT * sticks.pitch, self._yaw, None)
+        tilt, yaw_rate = STICK_TILT, STICK_YAW * sticks.yaw
+        setpoint = AttitudeSetpoint(tilt * sticks.roll, tilt * sticks.pitch, self._yaw, None, yaw_rate)
         return setpoint, STICK_CLIMB * sticks.climb
 
     def _handle_timeout(self, last: float) -> None:

@@ -11,12 +11,17 @@ T = TypeVar("T")
 
 
 class AttitudeSetpoint(NamedTuple):
-    """Attitude setpoint: angles (rad) and collective (thrust fraction; None: hold the altitude)."""
+    """Angles (rad), collective (thrust fraction; None: hold the altitude) and yaw rate (rad/s).
+
+    In rate mode, body rates (rad/s) take the place of the angles.
+    """
 
     roll: float
     pitch: float
     yaw: float
     thrust: float | None
+    yaw_rate: float = 0.0
+    rate_mode: bool = False
 
 
 class Sticks(NamedTuple):

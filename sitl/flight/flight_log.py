@@ -34,6 +34,11 @@ def quaternions(angles: NDArray[Any]) -> NDArray[np.float32]:
     ).astype(np.float32)
 
 
+def setpoint_quaternions(record: NDArray[Any]) -> NDArray[np.float32]:
+    """Attitude setpoints (N, 4) of a record; in rate mode, which has none, the attitude."""
+    return quaternions(np.where(record["rate_mode"][:, None] != 0, record["attitude"], record["setpoint"]))
+
+
 def flight_log_bytes(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
     """The flight as a ULog file; u is logged with the injected torque, which has its own topic.
 
@@ -108,7 +113,11 @@ def _autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, 
     return {
         "vehicle_angular_velocity": {"xyz": record["rates"]},
         "vehicle_attitude": {"q": record["quaternion"]},
-        "vehicle_attitude_setpoint": {"q_d": quaternions(record["setpoint"]), "thrust_body": thrust},
+        "vehicle_attitude_setpoint": {
+            "q_d": setpoint_quaternions(record),
+            "yaw_sp_move_rate": record["yaw_rate"],
+            "thrust_body": thrust,
+        },
         "vehicle_rates_setpoint": {
             **{name: record["rates_setpoint"][:, i] for i, name in enumerate(("roll", "pitch", "yaw"))},
             "thrust_body": thrust,

@@ -60,6 +60,10 @@ class Scenario:
     window : (start, stop)
         Samples of the manoeuvre, over which performance is computed.
     faults : tuple of Fault
+    yaw_rate : (N,) array, rad/s, optional
+        Yaw rate of the setpoint, fed forward; by default 0.
+    rate_mode : (N,) array of bool, optional
+        Where True, the setpoint is of body rates, rad/s; by default nowhere.
     """
 
     name: str
@@ -69,6 +73,8 @@ class Scenario:
     axis: int
     window: tuple[int, int]
     faults: tuple[Fault, ...] = ()
+    yaw_rate: NDArray[np.float64] | None = None
+    rate_mode: NDArray[np.bool_] | None = None
 
 
 def _axis_index(axis: str) -> int:

@@ -91,7 +91,8 @@ class ScriptedPilot:
 
     def _send_setpoint(self, vehicle: Commander, sample: int) -> None:
         roll, pitch, yaw = self.scenario.setpoint[sample].tolist()
-        vehicle.attitude.put(AttitudeSetpoint(roll, pitch, yaw, None), vehicle.now)
+        yaw_rate = 0.0 if self.scenario.yaw_rate is None else float(self.scenario.yaw_rate[sample])
+        vehicle.attitude.put(AttitudeSetpoint(roll, pitch, yaw, None, yaw_rate), vehicle.now)
         if self.phase is PilotPhase.SCENARIO:
             first, second, third = self.scenario.excitation[sample].tolist()
             self.moment = (first, second, third)

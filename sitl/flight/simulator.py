@@ -109,7 +109,9 @@ class _TickLink(NamedTuple):
 def _repeat_outputs(before, record, k):  # type: ignore[no-untyped-def]
     """Fill a period in which the autopilot did not run: all but the given inputs stay as they were."""
     setpoint, excitation = record[k].setpoint.copy(), record[k].excitation.copy()
+    yaw_rate, rate_mode = record[k].yaw_rate, record[k].rate_mode
     record[k] = before
+    record[k].yaw_rate, record[k].rate_mode = yaw_rate, rate_mode
     for i in range(3):
         record[k].setpoint[i], record[k].excitation[i] = setpoint[i], excitation[i]
 
@@ -172,7 +174,7 @@ class Simulator(SimulatedPlant):
         noise : (N, 6) array
             From `noise`.
         record : (N,) array of `sitl.autopilot.autopilot.RECORD`
-            Setpoints and excitation are given; the rest is filled.
+            Setpoints, their yaw rate and mode, and excitation are given; the rest is filled.
         truth : (N,) array of `TRUTH`
             Filled.
         runs : (N,) array, optional
@@ -224,6 +226,10 @@ def fly(airframe: Airframe, autopilot: Autopilot, scenario: Scenario, seed: int 
     )
     record, truth, runs = np.zeros(samples, RECORD), np.zeros(samples, TRUTH), np.ones(samples, np.int64)
     record["setpoint"], record["excitation"] = injection.setpoints(scenario.setpoint), scenario.excitation
+    if scenario.yaw_rate is not None:
+        record["yaw_rate"] = scenario.yaw_rate
+    if scenario.rate_mode is not None:
+        record["rate_mode"] = scenario.rate_mode
     draws = simulator.noise(samples)
     for piece, ran, delays in injection.segments(0, samples):
         simulator.fly(autopilot, draws[piece], record[piece], truth[piece], ran, delays)

@@ -182,6 +182,19 @@ def measure(state, noise, sensors, measurement):  # type: ignore[no-untyped-def]
 
 
 @inlined
+def quaternion_of(roll, pitch, yaw):  # type: ignore[no-untyped-def]
+    """Quaternion w, x, y, z of angles, rad; inverse of `euler_angles`."""
+    cr, cp, cy = np.cos(roll / 2), np.cos(pitch / 2), np.cos(yaw / 2)
+    sr, sp, sy = np.sin(roll / 2), np.sin(pitch / 2), np.sin(yaw / 2)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
+
+
+@inlined
 def euler_angles(w, x, y, z):  # type: ignore[no-untyped-def]
     """Roll, pitch and yaw (rad) of the aeronautical 3-2-1 sequence."""
     return (

@@ -34,14 +34,32 @@ PX4_FLAGS = (
     "-Wframe-larger-than=2048",
     "-Wno-unused-parameter",
 )
-#: PX4's own parameters that the module reads, with defaults.
+#: PX4's own parameters that the module reads, with their defaults in PX4 v1.16; int32 where no point is.
 PX4_PARAMETERS = {
     "MPC_MAN_TILT_MAX": 35.0,
+    "MC_MAN_TILT_TAU": 0.0,
     "MPC_MAN_Y_MAX": 150.0,
+    "MPC_MAN_Y_TAU": 0.08,
+    "MPC_YAW_EXPO": 0.6,
+    "MPC_HOLD_DZ": 0.1,
+    "MC_AIRMODE": 0,
+    "MPC_THR_CURVE": 0,
     "MPC_MANTHR_MIN": 0.08,
     "MPC_THR_HOVER": 0.5,
     "MPC_THR_MAX": 1.0,
     "COM_SPOOLUP_TIME": 1.0,
+    "MC_ACRO_R_MAX": 100.0,
+    "MC_ACRO_P_MAX": 100.0,
+    "MC_ACRO_Y_MAX": 100.0,
+    "MC_ACRO_EXPO": 0.0,
+    "MC_ACRO_EXPO_Y": 0.0,
+    "MC_ACRO_SUPEXPO": 0.0,
+    "MC_ACRO_SUPEXPOY": 0.0,
+    "MC_BAT_SCALE_EN": 0,
+    "MC_YAW_TQ_CUTOFF": 2.0,
+    "COM_OF_LOSS_T": 1.0,
+    "COM_RC_LOSS_T": 0.5,
+    "MC_AT_EN": 0,
 }
 WORDS = {
     "torque": 3,
@@ -49,9 +67,9 @@ WORDS = {
     "integral": 3,
     "excitation": 3,
     "thrust": 3,
-    "angles": 3,
-    "wanted": 3,
+    "attitude": 4,
     "q_d": 4,
+    "yaw_rate": 1,
 }
 OUT = np.dtype([(name, "<f4", count) for name, count in WORDS.items()])
 
@@ -64,32 +82,30 @@ def definitions(files: dict[str, str]) -> dict[str, dict]:
 
 def parameters_header(entries: dict[str, dict]) -> str:
     """What PX4's build generates from module.yaml: an enum, types and defaults."""
-    kinds = {name: entry["type"] == "float" for name, entry in entries.items()} | dict.fromkeys(PX4_PARAMETERS, True)
+    kinds = {name: entry["type"] == "float" for name, entry in entries.items()}
+    kinds |= {name: isinstance(value, float) for name, value in PX4_PARAMETERS.items()}
     values = {name: entry["default"] for name, entry in entries.items()} | PX4_PARAMETERS
     names = list(kinds)
-    apply = [f"#define APPLY_{n}(m, x, ...) m(x) APPLY_{n - 1}(m, __VA_ARGS__)" for n in range(2, len(names) + 1)]
-    places = ", ".join(f"_{n}" for n in range(len(names)))
-    counts = ", ".join(f"APPLY_{n}" for n in range(len(names), 0, -1))
     return "\n".join(
         [
             "#pragma once",
+            "#include <stdint.h>",
             "#include <stdlib.h>",
             "#include <string.h>",
             "namespace px4 {",
-            f"enum class params {{ {', '.join(names)} }};",
+            f"enum class params : uint16_t {{ {', '.join(names)} }};",
             "constexpr bool kFloat[] = {" + ", ".join("true" if kinds[n] else "false" for n in names) + "};",
-            "constexpr bool is_float(params p) { return kFloat[static_cast<int>(p)]; }",
             "inline double *values() {",
             "static double v[] = {" + ", ".join(repr(float(values[n])) for n in names) + "}; return v; }",
-            "inline void set_value(const char *name, double value) {",
+            "inline const char *name(int i) {",
             "static const char *const names[] = {" + ", ".join(f'"{n}"' for n in names) + "};",
-            f"for (int i = 0; i < {len(names)}; i++) {{",
-            "if (strcmp(names[i], name) == 0) { values()[i] = value; return; } } abort(); }",
+            "return names[i]; }",
+            "inline int find(const char *wanted) {",
+            f"for (int i = 0; i < {len(names)}; i++) {{ if (strcmp(name(i), wanted) == 0) {{ return i; }} }}",
+            "return 0xffff; }",
+            "inline void set_value(const char *name, double value) {",
+            "const int i = find(name); if (i == 0xffff) { abort(); } values()[i] = value; }",
             "}",
-            "#define APPLY_1(m, x) m(x)",
-            *apply,
-            f"#define APPLY_PICK({places}, macro, ...) macro",
-            f"#define APPLY_ALL(m, ...) APPLY_PICK(__VA_ARGS__, {counts}, 0)(m, __VA_ARGS__)",
             "",
         ]
     )
@@ -109,7 +125,7 @@ def build(gains, api: str, folder: Path) -> Path:
     common = [find_compiler(), STANDARD[api], *PX4_FLAGS, *includes]
     jobs = {core / "mimo_pid.cpp": ["-fno-fast-math", "-fno-reciprocal-math", "-fno-associative-math", *WARNINGS]}
     jobs |= {path: [*WARNINGS, "-Wno-unused-parameter"] for path in sorted(module.glob("*.cpp"))}
-    jobs[STUBS / "host.cpp"] = ["-Wall", "-fexceptions", "-frtti"]
+    jobs |= {path: ["-Wall", "-fexceptions", "-frtti"] for path in sorted(STUBS.glob("*.cpp"))}
     objects = []
     for source, flags in jobs.items():
         objects.append(folder / f"{source.stem}.o")
@@ -137,6 +153,8 @@ class Transcript:
         Return values of start, stop and status.
     other : list of str
         Remaining lines.
+    announced : list of bool
+        For each row of `out`: whether the module published the excitation, too.
     """
 
     out: np.ndarray
@@ -144,6 +162,7 @@ class Transcript:
     log: list[str]
     exits: list[int]
     other: list[str]
+    announced: list[bool]
 
 
 def drive(program: Path, commands: Iterable[str]) -> Transcript:
@@ -151,12 +170,14 @@ def drive(program: Path, commands: Iterable[str]) -> Transcript:
     text = "\n".join(commands) + "\n"
     result = subprocess.run([str(program)], input=text, capture_output=True, text=True, check=False, timeout=60)
     assert result.returncode == 0, result.stdout[-500:] + result.stderr
-    rows, ticks, log, exits, other = [], [], [], [], []
+    assert "two publishers" not in result.stdout
+    rows, ticks, log, exits, other, announced = [], [], [], [], [], []
     for line in result.stdout.splitlines():
         kind, _, rest = line.partition(" ")
         if kind == "out":
             words = rest.split()
-            assert words[-1] == "MIMO_EXC"
+            assert words[-1] in ("MIMO_EXC", "silent")
+            announced.append(words[-1] == "MIMO_EXC")
             rows.append([int(word, 16) for word in words[1:-1]])
         if kind in ("out", "quiet"):
             ticks.append(kind == "out")
@@ -167,4 +188,4 @@ def drive(program: Path, commands: Iterable[str]) -> Transcript:
         else:
             other.append(line)
     out = np.array(rows, np.uint32).reshape(len(rows), sum(WORDS.values())).view(OUT)[:, 0]
-    return Transcript(out, ticks, log, exits, other)
+    return Transcript(out, ticks, log, exits, other, announced)

@@ -13,23 +13,24 @@ from mimopilot.codegen import budget
 from mimopilot.codegen.budget import BudgetItem, cycles, different_rows, processor_in_the_loop, stack_bytes, step_costs
 from mimopilot.codegen.cortex_m4 import RAM, RAM_SIZE, EmulatedController, build_image, load_emulated, run_in_qemu
 from mimopilot.codegen.errors import CodegenError
-from mimopilot.codegen.layout import to_array
+from mimopilot.codegen.layout import INPUT, to_array
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.toolchain import CXX_FLAGS
 from mimopilot.codegen.vectors import random_inputs
 from mimopilot.sitl.physics.airframe import FOLDER
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameter_row import Shape
-from mimopilot.tuning.parameters import rows
+from mimopilot.tuning.parameters import PARAMETERS, rows
 from tests.conftest import assert_one_clear_line, following_gains
 
-#: PX4's compiler flags that affect code, and -fno-fast-math, which the controller requires.
+#: PX4's compiler flags that affect code, and those that the controller requires: -fno-fast-math, after which
+#: -fno-math-errno must stand again.
 PX4_FLAGS = (
     *("-std=gnu++14", "-Os", "-g", "-fdata-sections", "-ffunction-sections", "-fomit-frame-pointer"),
     *("-funsafe-math-optimizations", "-fno-strict-aliasing", "-fno-math-errno", "-fno-strength-reduce"),
     *("-fvisibility=hidden", "-fno-builtin-printf", "-fcheck-new", "-fno-exceptions", "-fno-rtti"),
     *("-fno-threadsafe-statics", "-Warray-bounds", "-Wcast-align", "-Wfloat-equal", "-Wlogical-op", "-Wpointer-arith"),
-    "-fno-fast-math",
+    *("-fno-fast-math", "-fno-math-errno"),
 )
 FLAGS = {
     "O0": (*CXX_FLAGS, "-O0"),
@@ -41,6 +42,7 @@ FLAGS = {
 ROWS = 10_000
 #: Numbers that are gains; they are the first of the structure.
 GAINS = sum(len(row.codes) for row in rows(Shape.MATRIX, Shape.YAW))
+WEIGHT, SLEW = ([parameter.code for parameter in PARAMETERS].index(code) for code in ("YAW_W", "SP_SLEW"))
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +84,7 @@ def test_state_and_outputs_are_bit_identical_after_gain_changes(fixed, image, in
         changed[:GAINS] *= rng.uniform(0.5, 1.5, GAINS).astype(np.float32)
         changed[rng.integers(GAINS)] = 0.0 if rng.random() < 0.7 else np.nan
         changed[-1] = rng.choice([0.0, 9.0, 20.0])  # model_omega
+        changed[WEIGHT], changed[SLEW] = rng.uniform(0.1, 1.0), rng.choice([0.0, 2.0])
         assert emulated.set_gains(changed) == native.set_gains(changed)
         assert different_rows(emulated.run(block), native.run(block)) == 0
         assert emulated.state.tobytes() == native.state.tobytes()
@@ -107,7 +110,7 @@ def with_model(gains):
 
 
 @pytest.mark.parametrize(
-    ("following", "instructions", "share"), [(False, 400, 0.0015), (True, 540, 0.002)], ids=["plain", "following"]
+    ("following", "instructions", "share"), [(False, 540, 0.002), (True, 700, 0.0026)], ids=["plain", "following"]
 )
 @pytest.mark.parametrize("name", ["adam0", "antr"])
 def test_the_controllers_of_the_airframes_are_within_budget(name, following, instructions, share):
@@ -242,7 +245,7 @@ def test_a_missing_tool_is_reported_with_its_package(mimopilot, tmp_path, monkey
         EmulatedController(image, fixed)
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(CodegenError, match="apt-get install qemu-system-arm"):
-        run_in_qemu(image, np.zeros(1, "V68"))
+        run_in_qemu(image, np.zeros(1, INPUT))
 
 
 def test_a_compiler_error_shows_its_first_lines_and_the_command(fixed, tmp_path):

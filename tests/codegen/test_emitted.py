@@ -12,6 +12,7 @@ from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, WARNINGS, find_compiler
 from mimopilot.codegen.vectors import random_inputs
+from mimopilot.tuning.controller import MAX_NORM_ERROR, MAX_RATE
 from mimopilot.tuning.parameter_row import Shape
 from mimopilot.tuning.parameters import ROWS
 
@@ -71,7 +72,9 @@ int answered = 0;
 void read_board(mimopilot::Input &input)
 {
     input.armed = 1;
-    input.attitude[0] = 0.1F;
+    input.attitude_setpoint[0] = 1.0F;
+    input.attitude[0] = 0.99875026F;  // 0.1 rad of roll
+    input.attitude[1] = 0.04997917F;
 }
 void write_board(const mimopilot::Output &output)
 {
@@ -135,9 +138,8 @@ def test_cppcheck_finds_nothing(tree):
 
 def test_cppcheck_finds_an_inserted_error(tree):
     core = tree / "core" / "mimo_pid.cpp"
-    right = "i < 3 * kAxes; i++) { state.age[i]"
-    assert right in core.read_text()
-    core.write_text(core.read_text().replace(right, right.replace("<", "<=")))
+    wrong = "for (int i = 0; i <= kAxes; i++) { state.integral[i] = 0.0F; }"
+    core.write_text(f"{core.read_text()}\nvoid wrong(mimopilot::State &state) {{ using mimopilot::kAxes; {wrong} }}\n")
     result = run(BIN / "cppcheck", "--error-exitcode=1", "--language=c++", "--quiet", core)
     assert result.returncode == 1
     assert "arrayIndexOutOfBounds" in result.stderr
@@ -178,24 +180,33 @@ def test_a_million_steps_with_invalid_inputs_and_gain_changes_stay_finite_and_li
     controller = NativeController(load_native(gains), gains)
     current = to_array(gains)
     accepted = refused = faulty = bumped = 0
+    last = np.zeros((1, 3), np.float32)
     for _ in range(100):
         inputs = random_inputs(10_000, rng)
-        for name in ("attitude_setpoint", "attitude", "rates", "excitation"):
+        for name in ("attitude_setpoint", "attitude", "rates_setpoint", "rates", "excitation", "yaw_rate_setpoint"):
             hit = rng.random(inputs[name].shape) < rng.choice([0.0, 0.001, 0.3])
             inputs[name][hit] = rng.choice(wild, int(hit.sum()))
-        inputs["saturation"] = rng.integers(-(2**31), 2**31, inputs["saturation"].shape)
+        for name in ("saturation", "silent"):
+            integers = rng.integers(-(2**31), 2**31, inputs[name].shape)
+            inputs[name] = np.where(rng.random(inputs[name].shape) < rng.choice([0.01, 1.0]), integers, inputs[name])
+        inputs["rate_mode"] = rng.integers(-(2**31), 2**31, 20).repeat(500) * (rng.random(20) < 0.3).repeat(500)
         outputs = controller.run(inputs)
-        limits = {"moment": current[place("moment_max")], "rates_setpoint": current[place("rate_max")]}
-        for name, limit in limits.items():
-            assert np.isfinite(outputs[name]).all()
-            assert (np.abs(outputs[name]) <= limit).all()
+        rate_max = np.where(inputs["rate_mode"][:, None] != 0, np.float32(MAX_RATE), current[place("rate_max")])
+        r = outputs["rates_setpoint"]
+        held = np.vstack([last, r[:-1]]) == r  # one that is held is limited as it was
+        last = r[-1:]
+        assert ((np.abs(r) <= rate_max) | held).all()
+        assert (np.abs(outputs["moment"]) <= current[place("moment_max")]).all()
         assert (np.abs(controller.state["integral"]) <= current[place("integral_max")]).all()
         assert np.isfinite(controller.state["derivative"]).all()
-        # Setpoints are within 4 pi; with the smallest damping ratio, 0.1, the model passes them sixfold at most.
-        assert (np.abs(controller.state["model"]["angle"]) < 8 * 4 * np.pi).all()
+        # Tilts are within 2, give or take the length of a quaternion; with the smallest damping ratio, 0.1, the model
+        # passes them sixfold at most.
+        assert (np.abs(controller.state["model"]["angle"]) < 8 * 2.0).all()
+        for name in ("attitude", "attitude_setpoint"):
+            assert np.linalg.norm(controller.state[name]) == pytest.approx(1, abs=MAX_NORM_ERROR / 2 + 1e-3)
         assert all(np.isfinite(controller.state["model"][name]).all() for name in ("rate", "acceleration"))
         faulty += int((outputs["fault"] != 0).sum())
-        bumped += int((np.abs(outputs["moment"]) == limits["moment"]).any(axis=1).sum())
+        bumped += int((np.abs(outputs["moment"]) == current[place("moment_max")]).any(axis=1).sum())
         changed = to_array(gains)
         for row in ROWS:
             count = len(row.codes)
@@ -206,6 +217,8 @@ def test_a_million_steps_with_invalid_inputs_and_gain_changes_stay_finite_and_li
                 changed[place(row.key)] = rng.uniform(1e-3, 50, count)
             elif row.shape is Shape.POLE:
                 changed[place(row.key)] = rng.uniform(0, 0.999)
+        changed[place("yaw_weight")] = rng.uniform(1e-6, 1)
+        changed[place("setpoint_slew")] = rng.choice([0.0, 1e-30, 1.0, 25.0])
         changed[place("model_damping")] = rng.uniform(0.1, 2.0)
         changed[place("model_omega")] = rng.choice([0.0, 1e-30, 1.0, 62.5])
         if rng.random() < 0.3:

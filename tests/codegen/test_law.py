@@ -5,18 +5,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from mimopilot.codegen.layout import INPUT, offset
+from mimopilot.codegen.layout import offset
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.tuning.law import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, TERMS, Filters, response
 from mimopilot.tuning.parameter_row import Shape
 from mimopilot.tuning.parameters import PARAMETERS, ROWS
+from tests.codegen.input_rows import input_rows
 from tests.conftest import coupled_gains, following_gains
 
 INPUTS = ("attitude_setpoint", "attitude", "rates", "excitation")
 #: Samples per period, and the lines at which responses are compared: 0.5 to 120 Hz of a 250 Hz loop.
 SAMPLES = 2000
 LINES = np.unique(np.geomspace(4, 960, 24).round().astype(int))[-20:]
-#: Small enough to reach no limit, large enough for single precision.
+#: rad and so on: small enough for the linear law and to reach no limit, large enough for single precision.
 AMPLITUDE = 1e-3
 
 
@@ -33,10 +34,9 @@ def compiled_response(library, gains):
     spectrum = np.fft.fft(signal[SAMPLES:].astype(np.float32).astype(np.float64))[LINES]
     found = np.zeros((len(LINES), 6, 12), complex)
     for column in range(12):
-        rows = np.zeros(2 * SAMPLES, INPUT)
-        rows["armed"] = 1
-        rows[INPUTS[column // 3]][:, column % 3] = signal
-        outputs = NativeController(library, gains).run(rows)[SAMPLES:]
+        axes = np.zeros((2 * SAMPLES, 3))
+        axes[:, column % 3] = signal
+        outputs = NativeController(library, gains).run(input_rows(2 * SAMPLES, **{INPUTS[column // 3]: axes}))[SAMPLES:]
         assert not outputs["fault"].any()
         made = np.hstack([outputs["rates_setpoint"], outputs["moment"]]).astype(np.float64)
         found[:, :, column] = np.fft.fft(made, axis=0)[LINES] / spectrum[:, None]
@@ -49,6 +49,8 @@ def perturbed(gains, code):
     changed = {"TS": 0.0025, "D_POLE": 0.8, "M_DAMP": 1.2, "M_OMEGA": 14.0}.get(code, 1.5 * value + 0.013)
     if code.startswith(("RMAX", "UMAX", "IMAX")):
         changed = 0.9 * value
+    if code == "SP_SLEW":
+        changed = 24.0  # beyond what the signals need
     return gains.with_elements({code: changed})
 
 
@@ -75,11 +77,11 @@ def test_the_law_and_the_compiled_code_respond_alike_when_any_parameter_changes(
 
 
 def test_each_parameter_changes_the_response_far_beyond_the_tolerance():
-    """So the test above detects a law that omits a parameter; limits do not act there."""
+    """So the test above detects a law that omits a parameter; limits and the yaw weight do not act there."""
     omega = 2 * np.pi * LINES / SAMPLES / 0.004
     start = response(following_gains(), omega)
     for parameter in PARAMETERS:
-        if parameter.code[:4] not in ("RMAX", "UMAX", "IMAX") and parameter.code != "TS":
+        if not parameter.code.startswith(("RMAX", "UMAX", "IMAX", "YAW_W", "SP_SLEW", "TS")):
             changed = response(perturbed(following_gains(), parameter.code), omega)
             assert difference(changed, start) > 1e-3, parameter.code
 

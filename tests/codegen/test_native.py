@@ -9,13 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mimopilot.codegen.errors import CodegenError
-from mimopilot.codegen.layout import INPUT, to_array
+from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.native import NativeController, NativeLibrary, build_native, load_native
 from mimopilot.codegen.vectors import random_inputs, reference_outputs
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.parameter_row import Shape
 from mimopilot.tuning.parameters import MATRICES, ROWS, YAW_GAINS
+from tests.codegen.input_rows import input_rows
 from tests.conftest import following_gains
 
 TS = 0.004
@@ -29,15 +30,6 @@ def library():
     return load_native(gains.__wrapped__())
 
 
-def zero_inputs(rows=1, **values):
-    """Armed rows of zeros with the given fields."""
-    inputs = np.zeros(rows, INPUT)
-    inputs["armed"] = 1
-    for name, value in values.items():
-        inputs[name] = value
-    return inputs
-
-
 def random_gains(base, rng):
     """Other gains and filters, of every row of the table that is no limit and no period."""
     elements, changes = base.elements(), {}
@@ -48,6 +40,8 @@ def random_gains(base, rng):
                 changes[code] = float(np.float32(value + rng.normal() * (abs(value) + 0.05) * 0.5))
             elif row.shape is Shape.POLE:
                 changes[code] = float(rng.uniform(0.0, 0.95))
+    changes["YAW_W"] = float(rng.choice([1.0, 0.4, rng.uniform(0.01, 1.0)]))
+    changes["SP_SLEW"] = float(rng.choice([0.0, rng.uniform(0.01, 20.0)]))
     changes["M_DAMP"] = float(rng.uniform(0.1, 2.0))
     changes["M_OMEGA"] = float(rng.choice([0.0, rng.uniform(0.5, 60.0)]))
     if rng.random() < 0.3:
@@ -92,7 +86,7 @@ def test_any_gains_and_inputs_are_bit_identical(library, seed):
 
 
 def test_denormal_inputs_are_not_flushed_to_zero(library, gains):
-    inputs = zero_inputs(2, rates=[[1e-40, 0, 0]])
+    inputs = input_rows(2, rates=[[1e-40, 0, 0]])
     got = NativeController(library, gains).run(inputs)
     assert 0 < abs(got["moment"][0, 0]) < 1.2e-38
 
@@ -108,9 +102,9 @@ def test_each_gain_element_changes_only_its_own_output(library, matrix, i, j):
     changed[i, j] += 0.0625
     other = dataclasses.replace(base, **{matrix: changed})
     rng = np.random.default_rng(3)
-    inputs = zero_inputs(50)
-    for name in ("attitude_setpoint", "attitude", "rates"):
-        inputs[name][:, j] = 0.1 * rng.standard_normal(50)
+    signals = np.zeros((3, 50, 3))
+    signals[:, :, j] = 0.1 * rng.standard_normal((3, 50))
+    inputs = input_rows(50, attitude_setpoint=signals[0], attitude=signals[1], rates=signals[2])
     before, after = (NativeController(library, g).run(inputs)["moment"] for g in (base, other))
     changed_outputs = (before != after).any(axis=0)
     assert list(np.flatnonzero(changed_outputs)) == [i]
@@ -120,9 +114,8 @@ def test_each_gain_element_changes_only_its_own_output(library, matrix, i, j):
 def test_each_yaw_gain_changes_only_yaw(library, gains, name):
     other = dataclasses.replace(gains, yaw=dataclasses.replace(gains.yaw, **{name: getattr(gains.yaw, name) + 0.0625}))
     rng = np.random.default_rng(3)
-    inputs = zero_inputs(50)
-    for field in ("attitude_setpoint", "attitude", "rates"):
-        inputs[field] = 0.1 * rng.standard_normal((50, 3))
+    setpoint, attitude, rates = 0.1 * rng.standard_normal((3, 50, 3))
+    inputs = input_rows(50, attitude_setpoint=setpoint, attitude=attitude, rates=rates)
     before, after = (NativeController(library, g).run(inputs)["moment"] for g in (gains, other))
     assert list(np.flatnonzero((before != after).any(axis=0))) == [2]
 
@@ -130,19 +123,19 @@ def test_each_yaw_gain_changes_only_yaw(library, gains, name):
 def test_a_positive_derivative_gain_damps(library, gains):
     only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2) * 0.01}
     damping = dataclasses.replace(gains, **only)
-    inputs = zero_inputs(20)
+    inputs = input_rows(20)
     inputs["rates"][:, 0] = np.arange(20) * 0.01  # accelerating in roll
     assert (NativeController(library, damping).run(inputs)["moment"][1:, 0] < 0).all()
 
 
 def test_the_first_sample_has_no_derivative(library, gains):
     only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2)}
-    out = NativeController(library, dataclasses.replace(gains, **only)).run(zero_inputs(1, rates=[[3.0, -2.0, 1.0]]))
+    out = NativeController(library, dataclasses.replace(gains, **only)).run(input_rows(1, rates=[[3.0, -2.0, 1.0]]))
     assert (out["moment"][0, :2] == 0).all()
 
 
 def test_gain_changes_are_bumpless_within_the_integrator_limit(library, gains):
-    inputs = zero_inputs(40, attitude_setpoint=[[0.02, -0.01, 0.01]], rates=[[0.01, 0.02, -0.01]])
+    inputs = input_rows(40, attitude_setpoint=[[0.02, -0.01, 0.01]], rates=[[0.01, 0.02, -0.01]])
     controller = NativeController(library, gains)
     before = controller.run(inputs)["moment"][-1]
     assert controller.set_gains(
@@ -157,7 +150,7 @@ def test_gain_changes_are_bumpless_within_the_integrator_limit(library, gains):
 
 def test_an_axis_without_integral_gain_clears_its_integrator(library, gains):
     controller = NativeController(library, gains)
-    controller.run(zero_inputs(100, attitude_setpoint=[[0.05, 0.05, 0.05]]))
+    controller.run(input_rows(100, attitude_setpoint=[[0.05, 0.05, 0.05]]))
     assert (controller.state["integral"][0] != 0).all()
     assert controller.set_gains(gains.with_elements({"RI_RR": 0.0, "RI_RP": 0.0}))
     assert controller.state["integral"][0, 0] == 0
@@ -167,7 +160,7 @@ def test_an_axis_without_integral_gain_clears_its_integrator(library, gains):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e38, -1e7])
 def test_gains_out_of_range_are_refused_without_effect(library, gains, bad):
     controller = NativeController(library, gains)
-    controller.run(zero_inputs(10, attitude_setpoint=[[0.1, 0.1, 0.1]]))
+    controller.run(input_rows(10, attitude_setpoint=[[0.1, 0.1, 0.1]]))
     before = controller.state.tobytes()
     for index in range(len(to_array(gains))):
         array = to_array(gains)
@@ -192,7 +185,7 @@ def test_initialise_refuses_gains_that_are_not_finite(library, gains):
 def test_saturation_stops_the_integrator_only_in_its_direction(library, gains):
     only_integral = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kp_o": np.eye(2), "Ki_i": np.eye(2)}
     g = dataclasses.replace(gains, **only_integral, limits=Limits((9, 9, 9), (1, 1, 1), (0.5, 0.5, 0.5)))
-    setpoint = zero_inputs(1, attitude_setpoint=[[1.0, 0, 0]])
+    setpoint = input_rows(1, attitude_setpoint=[[1.0, 0, 0]])
     for sign, moves in ((1, False), (-1, True), (0, True)):
         controller = NativeController(library, g)
         setpoint["saturation"][0, 0] = sign
@@ -203,32 +196,31 @@ def test_saturation_stops_the_integrator_only_in_its_direction(library, gains):
 def test_the_integrator_does_not_wind_up_while_the_excitation_saturates(library, gains):
     g = gains.with_elements({"UMAX_R": 0.2})
     controller = NativeController(library, g)
-    controller.run(zero_inputs(200, attitude_setpoint=[[0.01, 0, 0]], excitation=[[0.5, 0, 0]]))
+    controller.run(input_rows(200, attitude_setpoint=[[0.01, 0, 0]], excitation=[[0.5, 0, 0]]))
     assert controller.state["integral"][0, 0] == 0
 
 
 def test_disarming_clears_the_integrator_and_landing_holds_it(library, gains):
     controller = NativeController(library, gains)
-    controller.run(zero_inputs(50, attitude_setpoint=[[0.05, 0.02, 0.01]]))
+    controller.run(input_rows(50, attitude_setpoint=[[0.05, 0.02, 0.01]]))
     held = controller.state["integral"].copy()
-    controller.run(zero_inputs(50, attitude_setpoint=[[0.05, 0.02, 0.01]], landed=1))
+    controller.run(input_rows(50, attitude_setpoint=[[0.05, 0.02, 0.01]], landed=1))
     assert (controller.state["integral"] == held).all()
-    controller.run(zero_inputs(1, attitude_setpoint=[[0.05, 0.02, 0.01]], armed=0))
+    controller.run(input_rows(1, attitude_setpoint=[[0.05, 0.02, 0.01]], armed=0))
     assert (controller.state["integral"] == 0).all()
 
 
-@pytest.mark.parametrize("field", ["attitude_setpoint", "attitude", "rates"])
+@pytest.mark.parametrize(("field", "bit"), [("attitude_setpoint", 1), ("attitude", 2), ("rates", 4)])
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e38, -101.0])
-def test_after_25_invalid_samples_the_controller_only_damps_the_rates(library, gains, field, bad):
+def test_after_25_invalid_samples_the_controller_only_damps_the_rates(library, gains, field, bit, bad):
     controller = NativeController(library, gains)
-    normal = zero_inputs(20, attitude_setpoint=[[0.05, 0.02, 0.0]], attitude=[[0.01, 0, 0]], rates=[[0.3, -0.2, 0.1]])
+    normal = input_rows(20, attitude_setpoint=[[0.05, 0.02, 0.0]], attitude=[[0.01, 0, 0]], rates=[[0.3, -0.2, 0.1]])
     controller.run(normal)
     broken = normal[:1].repeat(HOLD + 1)
     broken[field][:, 0] = bad
     out = controller.run(broken)
     assert (out["fault"][:HOLD] == 0).all()
-    kind = ("attitude_setpoint", "attitude", "rates").index(field)
-    assert out["fault"][HOLD] == 1 << (3 * kind)
+    assert out["fault"][HOLD] == bit
     assert out["fault_count"][HOLD] == HOLD + 1
     integral = controller.state["integral"].copy()
     again = controller.run(broken)
@@ -249,29 +241,31 @@ def test_after_25_invalid_samples_the_controller_only_damps_the_rates(library, g
 def test_a_recovered_rate_causes_no_derivative_kick(library, gains):
     only = {name: np.zeros((2, 2)) for name in MATRICES} | {"Kd_i": np.eye(2) * 0.1}
     controller = NativeController(library, dataclasses.replace(gains, **only))
-    controller.run(zero_inputs(5))
-    lost = zero_inputs(40, rates=[[np.nan, 0, 0]])
+    controller.run(input_rows(5))
+    lost = input_rows(40, rates=[[np.nan, 0, 0]])
     controller.run(lost)
-    assert controller.run(zero_inputs(1, rates=[[2.0, 0, 0]]))["moment"][0, 0] == 0
+    assert controller.run(input_rows(1, rates=[[2.0, 0, 0]]))["moment"][0, 0] == 0
 
 
 def test_an_excitation_that_is_not_finite_is_not_injected(library, gains):
     controller, clean = NativeController(library, gains), NativeController(library, gains)
-    extreme = controller.run(zero_inputs(3, excitation=[[np.nan, np.inf, 7.0]]))
-    assert (extreme["moment"] == clean.run(zero_inputs(3))["moment"]).all()
+    extreme = controller.run(input_rows(3, excitation=[[np.nan, np.inf, 7.0]]))
+    assert (extreme["moment"] == clean.run(input_rows(3))["moment"]).all()
     # NaN means no excitation; infinity and 7 are faults.
     assert extreme["fault_count"][-1] == 6
 
 
 def test_yaw_turns_the_shorter_way(library, gains):
-    out = NativeController(library, gains).run(zero_inputs(1, attitude_setpoint=[[0, 0, 3.1]], attitude=[[0, 0, -3.1]]))
+    inputs = input_rows(1, attitude_setpoint=[[0, 0, 3.1]], attitude=[[0, 0, -3.1]])
+    out = NativeController(library, gains).run(inputs)
     # From -3.1 to 3.1 rad the shorter way is -0.083 rad.
     assert out["rates_setpoint"][0, 2] == pytest.approx(1.5 * (6.2 - 2 * np.pi), rel=1e-4)
 
 
 def test_the_rate_setpoint_is_limited(library, gains):
-    out = NativeController(library, gains).run(zero_inputs(1, attitude_setpoint=[[3.0, -3.0, 3.0]]))
-    assert list(out["rates_setpoint"][0]) == [5.0, -4.0, 3.0]
+    tight = dataclasses.replace(gains, limits=dataclasses.replace(gains.limits, rate_max=(0.5, 0.4, 0.3)))
+    out = NativeController(library, tight).run(input_rows(1, attitude_setpoint=[[0.3, -0.3, 0.3]]))
+    assert out["rates_setpoint"][0].tolist() == np.float32([0.5, -0.4, 0.3]).tolist()
 
 
 def test_a_library_with_another_interface_is_refused(gains, tmp_path):

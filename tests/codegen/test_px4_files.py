@@ -23,9 +23,9 @@ from tests.codegen.px4_host import PX4_FLAGS, definitions
 
 GOLDEN = Path(__file__).parent / "golden"
 MODULE = "px4/src/modules/mc_mimo_pid"
-PLAIN = ("attitude", "excitation", "sticks")
+PLAIN = ("actuation", "attitude", "excitation", "sticks", "throttle")
 #: Units that PX4's validator accepts and we could need.
-PX4_UNITS = {"1/s", "s", "rad", "rad/s", "rad/s^2", "deg", "deg/s", "Hz", "Nm", "norm"}
+PX4_UNITS = {"s", "rad", "rad/s", "rad/s^2", "deg", "deg/s", "Hz", "Nm", "norm"}
 
 
 def test_the_yaml_has_every_parameter_with_the_gains_as_defaults(gains):
@@ -94,14 +94,14 @@ def test_the_defaults_set_every_gain_the_gyro_rate_and_the_log_profile(gains):
     for parameter in PARAMETERS:
         if parameter.writable:
             assert np.float32(defaults.pop(parameter.name)) == np.float32(values[parameter.code])
-    assert defaults == {"MIMO_EN": "1", "IMU_GYRO_RATEMAX": "250", "SDLOG_PROFILE": "49"}
+    assert defaults == {"MIMO_EN": "1", "MC_AT_EN": "0", "IMU_GYRO_RATEMAX": "250", "SDLOG_PROFILE": "49"}
     assert files["px4/airframe/mimo_defaults.txt"] in files["px4/sd_card/etc/config.txt"]
 
 
-def test_the_stock_controllers_stop_only_after_the_module_has_started(gains):
+def test_the_start_up_lines_start_the_module_and_stop_nothing(gains):
     script = render(gains, "px4")["px4/sd_card/etc/extras.txt"]
-    order = [script.index(word) for word in ("set +e", "MIMO_EN 1", "mc_mimo_pid start", "then\n\t\tmc_rate", "set -e")]
-    assert order == sorted(order)
+    order = [script.index(word) for word in ("set +e", "MIMO_EN 0", "then\n\tmc_mimo_pid start", "set -e")]
+    assert order == sorted(order) and " stop" not in script
     assert subprocess.run(["sh", "-n"], input=script, text=True, check=False).returncode == 0
 
 
@@ -126,7 +126,7 @@ def test_files_independent_of_px4_include_no_px4_header(name):
     folder = TEMPLATES / MODULE
     for path in (folder / f"{name}.hpp", folder / f"{name}.cpp"):
         included = set(re.findall(r"#include [<\"](.*)[>\"]", path.read_text()))
-        assert included <= {f"{name}.hpp", "stdint.h", *(["math.h"] if name != "excitation" else [])}
+        assert included <= {f"{name}.hpp", "stock_settings.hpp", "stdint.h", "float.h", "math.h"}
     flags = ["-std=c++11", "-Wall", "-Wextra", "-Werror", "-fsyntax-only"]
     subprocess.run([find_compiler(), *flags, str(folder / f"{name}.cpp")], check=True)
 

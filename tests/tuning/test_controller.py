@@ -10,6 +10,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.law import Filters, rate_matrices, regressors
 from mimopilot.tuning.law_inverse import inverse_law, rebuild_rate_setpoint
+from tests.codegen.input_rows import quaternion
 
 N = 400
 
@@ -26,7 +27,7 @@ def fly(gains, seed=0):
     y_o, y_i, r_o = (rng.standard_normal((N, 3)) * s for s in (0.2, 1.0, 0.2))
     for signal in (y_o, y_i, r_o):
         signal[:, 2] = 0
-    steps = [controller.step(r_o[k], y_o[k], y_i[k]) for k in range(N)]
+    steps = [controller.step(*pair, rate) for *pair, rate in zip(quaternion(r_o), quaternion(y_o), y_i, strict=True)]
     u, r_i = (np.array([getattr(s, name) for s in steps])[:, :2] for name in ("moment", "rates_setpoint"))
     return u, r_i, y_i[:, :2]
 

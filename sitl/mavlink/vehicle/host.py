@@ -212,7 +212,8 @@ class Host:
         demand = self.vehicle.step(now, estimate)
         self._follow_arming()
         row = self.rows[0] if self.log is None else self.log.next_row(self.vehicle)
-        row["setpoint"] = demand[:3]
+        row["setpoint"], row["yaw_rate"] = demand.setpoint[:3], demand.setpoint.yaw_rate
+        row["rate_mode"] = demand.setpoint.rate_mode
         row["excitation"] = self.excitation(now)
         autopilot.controls["landed"] = self.vehicle.vertical.landed
         tick(self.fixed, demand.collective, demand.altitude, m, row)

@@ -13,6 +13,7 @@ from mimopilot.sitl.autopilot.flight_modes import Commander, Severity
 from mimopilot.sitl.autopilot.setpoints import AttitudeSetpoint, Pose, Sticks
 from mimopilot.sitl.mavlink.wire.codec import SYSTEM
 from mimopilot.sitl.physics.state_estimate import euler_angles
+from mimopilot.tuning.controller import MAX_RATE
 
 RATES_IGNORED = (
     mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE,
@@ -20,7 +21,6 @@ RATES_IGNORED = (
     mavlink.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE,
 )
 THRUST_BODY_SET = 32  # ATTITUDE_TARGET_TYPEMASK_THRUST_BODY_SET, which pymavlink's enumeration lacks
-UNSUPPORTED_BITS = mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE | THRUST_BODY_SET
 DEAD_BAND = 0.05  # of the climb stick's range; chosen
 PULSE_MIN, PULSE_MAX = 800, 2200  # us; chosen: plausible RC pulse widths
 PULSE_MIDDLE, PULSE_SPAN = 1500, 500  # us, the RC convention: 1000 to 2000
@@ -67,18 +67,27 @@ class SetpointReceiver:
 
     def _attitude_target(self, message: Any) -> str:
         mask = message.type_mask
-        rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
-        angles = _angles(message.q)
-        if mask & UNSUPPORTED_BITS:
-            return f"setpoint refused: type_mask {mask}: only attitude is supported, with or without thrust"
-        if any(not mask & bit and rate != 0 for bit, rate in zip(RATES_IGNORED, rates, strict=True)):
-            return f"setpoint refused: type_mask {mask}: body rates are not supported, add 7 to ignore them"
-        if angles is None or max(abs(angles[0]), abs(angles[1])) > MAX_TILT:
+        given = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
+        rates = [0.0 if mask & bit else rate for bit, rate in zip(RATES_IGNORED, given, strict=True)]
+        rate_mode = bool(mask & mavlink.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE)
+        angles = rates if rate_mode else _angles(message.q)
+        if mask & THRUST_BODY_SET:
+            return f"setpoint refused: type_mask {mask}: thrust along body axes is not supported"
+        if not all(abs(rate) <= MAX_RATE for rate in rates):
+            return f"setpoint refused: expected body rates of at most {MAX_RATE:g} rad/s"
+        if rate_mode and mask & mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE:
+            return f"setpoint refused: type_mask {mask}: body rates need a thrust"
+        if not rate_mode and (rates[0] != 0 or rates[1] != 0):
+            return f"setpoint refused: type_mask {mask}: with an attitude only the yaw rate counts, add 3"
+        if angles is None or (not rate_mode and max(abs(angles[0]), abs(angles[1])) > MAX_TILT):
             return f"setpoint refused: expected a quaternion, tilted by at most {math.degrees(MAX_TILT):.0f} degrees"
         thrust = None if mask & mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE else message.thrust
         if thrust is not None and not 0 <= thrust <= 1:
             return f"setpoint refused: thrust {thrust:g}, expected 0 to 1"
-        self.vehicle.attitude.put(AttitudeSetpoint(*angles, thrust), self.vehicle.now)
+        yaw_rate = 0.0 if rate_mode else rates[2]
+        first, second, third = angles
+        setpoint = AttitudeSetpoint(first, second, third, thrust, yaw_rate, rate_mode)
+        self.vehicle.attitude.put(setpoint, self.vehicle.now)
         return ""
 
     def _manual_control(self, message: Any) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.autopilot.flight_modes import Mode
-from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, quaternions
+from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, setpoint_quaternions
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
@@ -82,7 +82,7 @@ def _attitude_quaternion(s: VehicleState) -> Any:
 
 
 def _attitude_target(s: VehicleState) -> Any:
-    wanted = _floats(quaternions(s.record["setpoint"][None])[0])
+    wanted = _floats(setpoint_quaternions(s.record[None])[0])
     return mavlink.MAVLink_attitude_target_message(
         s.milliseconds, 0, wanted, *_floats(s.record["rates_setpoint"]), float(s.record["collective"])
     )

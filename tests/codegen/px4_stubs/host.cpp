@@ -4,93 +4,63 @@
 #include <stdlib.h>
 
 #include <iostream>
-#include <map>
 #include <sstream>
 #include <string>
 
-#include "attitude.hpp"
+#include <px4_platform_common/param.h>
+
 #include "excitation.hpp"
 #include "mc_mimo_pid.hpp"
-
-#define DEFINE_TOPIC(name) const orb_metadata __orb_##name{#name, sizeof(name##_s)}
-extern "C" {
-DEFINE_TOPIC(control_allocator_status);
-DEFINE_TOPIC(debug_vect);
-DEFINE_TOPIC(manual_control_setpoint);
-DEFINE_TOPIC(parameter_update);
-DEFINE_TOPIC(rate_ctrl_status);
-DEFINE_TOPIC(vehicle_angular_velocity);
-DEFINE_TOPIC(vehicle_attitude);
-DEFINE_TOPIC(vehicle_attitude_setpoint);
-DEFINE_TOPIC(vehicle_control_mode);
-DEFINE_TOPIC(vehicle_land_detected);
-DEFINE_TOPIC(vehicle_rates_setpoint);
-DEFINE_TOPIC(vehicle_status);
-DEFINE_TOPIC(vehicle_thrust_setpoint);
-DEFINE_TOPIC(vehicle_torque_setpoint);
-}
+#include "topics.hpp"
 
 extern "C" int mc_mimo_pid_main(int argc, char *argv[]);
 
 namespace {
 
-uint64_t now = 1000000;
 uint64_t gyro_interval = 4000;
+float stock_torque[3] {};
+bool muted[3] {};  // attitude, setpoint, sticks: not published any more
+vehicle_status_s vehicle{};
 
 }  // namespace
 
-namespace uORB {
-
-px4::WorkItem *scheduled = nullptr;
-
-Node &node(const orb_metadata *meta)
-{
-	static std::map<const orb_metadata *, Node> nodes;
-	return nodes[meta];
-}
-
-}  // namespace uORB
-
-hrt_abstime hrt_absolute_time() { return now; }
-
-void px4_log(const char *level, const char *format, ...)
-{
-	va_list arguments;
-	va_start(arguments, format);
-	printf("log %s ", level);
-	vprintf(format, arguments);
-	printf("\n");
-	va_end(arguments);
-}
-
 namespace {
 
+// A source that is alive says the same again.
 template<typename T>
-void publish(const orb_metadata *meta, const T &message)
+void repeat(const orb_metadata *meta, bool mute)
 {
-	// Never unadvertised, because these publishers outlive the module.
-	static uORB::Publication<T> *const publication = new uORB::Publication<T>(meta);
-	publication->publish(message);
+	if (mute || uORB::node(meta).message.empty()) { return; }
+
+	T message = last<T>(meta);
+	message.timestamp = now;
+	publish(meta, message);
 }
 
-template<typename T>
-T last(const orb_metadata *meta)
+// One sample. True if the module published the torque.
+bool gyro(const float (&rates)[3])
 {
-	T message{};
-	uORB::Subscription(meta).copy(&message);
-	return message;
-}
-
-void gyro(const float (&rates)[3])
-{
+	repeat<vehicle_attitude_s>(ORB_ID(vehicle_attitude), muted[0]);
+	repeat<vehicle_attitude_setpoint_s>(ORB_ID(vehicle_attitude_setpoint), muted[1]);
+	repeat<manual_control_setpoint_s>(ORB_ID(manual_control_setpoint), muted[2]);
 	vehicle_angular_velocity_s message{};
 	message.timestamp = message.timestamp_sample = now;
 
 	for (int i = 0; i < 3; i++) { message.xyz[i] = rates[i]; }
 
 	publish(ORB_ID(vehicle_angular_velocity), message);
+	run_commander();
+	run_stock(stock_torque);
+	const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
 
 	if (uORB::scheduled != nullptr) { uORB::scheduled->Run(); }
+
+	const bool published = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation != before;
+
+	if (published && stock_flies()) { printf("two publishers\n"); }
+
+	run_tasks();
+	return published;
 }
 
 void words(const float *values, int count)
@@ -102,20 +72,19 @@ void words(const float *values, int count)
 	}
 }
 
-// torque, rate setpoint, integral, excitation, thrust; then the angles from the module's own functions.
+// torque, rate setpoint, integral, excitation, thrust; then the last attitude and attitude setpoint, of whoever.
 void print_published()
 {
 	const auto torque = last<vehicle_torque_setpoint_s>(ORB_ID(vehicle_torque_setpoint));
 	const auto rates = last<vehicle_rates_setpoint_s>(ORB_ID(vehicle_rates_setpoint));
 	const auto status = last<rate_ctrl_status_s>(ORB_ID(rate_ctrl_status));
-	const auto excitation = last<debug_vect_s>(ORB_ID(debug_vect));
+	auto excitation = last<debug_vect_s>(ORB_ID(debug_vect));
+
+	if (excitation.timestamp != now) { excitation = {0, 0.0F, 0.0F, -1.0F, "silent"}; }
+
 	const auto thrust = last<vehicle_thrust_setpoint_s>(ORB_ID(vehicle_thrust_setpoint));
 	const auto attitude = last<vehicle_attitude_s>(ORB_ID(vehicle_attitude));
 	const auto setpoint = last<vehicle_attitude_setpoint_s>(ORB_ID(vehicle_attitude_setpoint));
-	float angles[3];
-	float wanted[3];
-	mimopilot::angles(attitude.q, angles);
-	mimopilot::setpoint_angles(setpoint.q_d, angles[2], wanted);
 	printf("out %llu", static_cast<unsigned long long>(torque.timestamp_sample));
 	words(torque.xyz, 3);
 	words(&rates.roll, 1);
@@ -128,10 +97,17 @@ void print_published()
 	words(&excitation.y, 1);
 	words(&excitation.z, 1);
 	words(thrust.xyz, 3);
-	words(angles, 3);
-	words(wanted, 3);
+	words(attitude.q, 4);
 	words(setpoint.q_d, 4);
+	words(&setpoint.yaw_sp_move_rate, 1);
 	printf(" %s\n", excitation.name);
+	const auto parts = last<debug_array_s>(ORB_ID(debug_array));
+
+	if (parts.timestamp == now) {
+		printf("%s", parts.name);
+		words(parts.data, 15);
+		printf("\n");
+	}
 }
 
 void module(const char *command)
@@ -140,6 +116,19 @@ void module(const char *command)
 	std::string argument = command;
 	char *argv[] = {&name[0], &argument[0]};
 	printf("exit %d\n", mc_mimo_pid_main(2, argv));
+	run_tasks();
+}
+
+// At rest until the module has stopped PX4's own controllers, at most two seconds.
+void wait_for_hand_over()
+{
+	const float still[3] = {};
+	const uint64_t end = now + 2000000;
+
+	while (stock_flies() && now < end) {
+		now += gyro_interval;
+		gyro(still);
+	}
 }
 
 struct Line : std::istringstream {
@@ -169,16 +158,52 @@ void execute(Line &line)
 	if (command == "start" || command == "stop" || command == "status") {
 		module(command.c_str());
 
+		if (command == "start") { wait_for_hand_over(); }
+
+	} else if (command == "mute") {
+		std::string source;
+		line >> source;
+		muted[source == "attitude" ? 0 : (source == "setpoint" ? 1 : 2)] = line.flag();
+
+	} else if (command == "stock") {
+		line.numbers(stock_torque);
+
+	} else if (command == "wait") {
+		long long left;
+		line >> left;
+
+		for (; left > 0; left -= 1000) {
+			now += 1000;
+			const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
+			run_scheduled();
+
+			if (uORB::node(ORB_ID(vehicle_torque_setpoint)).generation != before) { print_published(); }
+
+			run_tasks();
+		}
+
+	} else if (command == "arming") {
+		const auto reply = last<arming_check_reply_s>(ORB_ID(arming_check_reply));
+		printf("arming %d %d %d\n", static_cast<int>(reply.registration_id), static_cast<int>(reply.can_arm_and_run),
+		       static_cast<int>(reply.num_events));
+
 	} else if (command == "gyro") {
 		long long step;
 		float rates[3];
 		line >> step;
 		line.numbers(rates);
 		now += static_cast<uint64_t>(step);
-		const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
-		gyro(rates);
+		const unsigned powers = uORB::node(ORB_ID(actuator_controls_status_0)).generation;
+		const bool published = gyro(rates);
 
-		if (uORB::node(ORB_ID(vehicle_torque_setpoint)).generation != before) {
+		if (uORB::node(ORB_ID(actuator_controls_status_0)).generation != powers) {
+			const auto power = last<actuator_controls_status_s>(ORB_ID(actuator_controls_status_0));
+			printf("power");
+			words(power.control_power, 3);
+			printf("\n");
+		}
+
+		if (published) {
 			print_published();
 
 		} else {
@@ -194,22 +219,42 @@ void execute(Line &line)
 		px4::set_value(name.c_str(), line.number());
 		publish(ORB_ID(parameter_update), parameter_update_s{});
 
-	} else if (command == "stock") {
-		uORB::node(ORB_ID(vehicle_torque_setpoint)).advertised = line.flag();
-		uORB::node(ORB_ID(vehicle_rates_setpoint)).advertised = line.flag();
-		uORB::node(ORB_ID(vehicle_attitude_setpoint)).advertised = line.flag();
-
 	} else if (command == "mode") {
 		vehicle_control_mode_s mode{};
-		vehicle_status_s status{};
 		mode.flag_armed = line.flag();
 		mode.flag_control_manual_enabled = line.flag();
 		mode.flag_control_altitude_enabled = line.flag();
 		mode.flag_control_attitude_enabled = line.flag();
 		mode.flag_control_rates_enabled = true;
-		status.nav_state = static_cast<uint8_t>(line.number());
+		vehicle.nav_state = static_cast<uint8_t>(line.number());
+		mode.flag_control_offboard_enabled = line.flag();
+		vehicle.nav_state_timestamp = now;
+		vehicle.armed_time = !mode.flag_armed ? 0 : (vehicle.armed_time == 0 ? now : vehicle.armed_time);
 		publish(ORB_ID(vehicle_control_mode), mode);
-		publish(ORB_ID(vehicle_status), status);
+		publish(ORB_ID(vehicle_status), vehicle);
+
+	} else if (command == "vehicle") {
+		vehicle.vehicle_type = static_cast<uint8_t>(line.number());
+		vehicle.is_vtol = line.flag();
+		publish(ORB_ID(vehicle_status), vehicle);
+
+	} else if (command == "hover") {
+		hover_thrust_estimate_s hover{};
+		hover.valid = line.flag();
+		hover.hover_thrust = line.number();
+		publish(ORB_ID(hover_thrust_estimate), hover);
+
+	} else if (command == "heading") {
+		vehicle_local_position_s position{};
+		position.heading_good_for_control = line.flag();
+		position.unaided_heading = line.number();
+		publish(ORB_ID(vehicle_local_position), position);
+
+	} else if (command == "battery") {
+		battery_status_s battery{};
+		battery.connected = line.flag();
+		battery.scale = line.number();
+		publish(ORB_ID(battery_status), battery);
 
 	} else if (command == "land") {
 		vehicle_land_detected_s land{};
@@ -224,6 +269,10 @@ void execute(Line &line)
 		sticks.pitch = line.number();
 		sticks.yaw = line.number();
 		sticks.throttle = line.number();
+
+		for (int i = 0; i < 6; i++) { (&sticks.aux1)[i] = line.number(); }
+
+		sticks.timestamp = now;
 		publish(ORB_ID(manual_control_setpoint), sticks);
 
 	} else if (command == "alloc") {
@@ -239,6 +288,15 @@ void execute(Line &line)
 		setpoint.yaw_sp_move_rate = line.number();
 		line.numbers(setpoint.thrust_body);
 		publish(ORB_ID(vehicle_attitude_setpoint), setpoint);
+
+	} else if (command == "rates_setpoint") {
+		vehicle_rates_setpoint_s setpoint{};
+		setpoint.timestamp = now + 1;  // later than what the module published at `now`
+		setpoint.roll = line.number();
+		setpoint.pitch = line.number();
+		setpoint.yaw = line.number();
+		line.numbers(setpoint.thrust_body);
+		publish(ORB_ID(vehicle_rates_setpoint), setpoint);
 
 	} else if (command == "attitude") {
 		vehicle_attitude_s attitude{};
@@ -270,23 +328,16 @@ void execute(Line &line)
 
 }  // namespace
 
-// The gyro publishes while time passes.
-int px4_usleep(unsigned microseconds)
-{
-	const uint64_t end = now + microseconds;
-	const float still[3] = {};
-
-	while (now + gyro_interval <= end) {
-		now += gyro_interval;
-		gyro(still);
-	}
-
-	return 0;
-}
-
 int main()
 {
 	std::string text;
+	vehicle.vehicle_type = vehicle_status_s::VEHICLE_TYPE_ROTARY_WING;
+	vehicle.timestamp = now;
+	publish(ORB_ID(vehicle_status), vehicle);
+	vehicle_attitude_s level{};
+	level.q[0] = level.delta_q_reset[0] = 1.0F;
+	publish(ORB_ID(vehicle_attitude), level);
+	px4::set_value("MIMO_EN", 1.0);
 
 	while (std::getline(std::cin, text)) {
 		Line line(text);

@@ -57,8 +57,8 @@ class PointMassVehicle:
         if e.altitude <= 100.0:
             e.altitude, e.climb = 100.0, max(e.climb, 0.0)
             e.north = e.east = 0.0
-        e.roll += TS / 0.1 * (demand.roll - e.roll)
-        e.pitch += TS / 0.1 * (demand.pitch - e.pitch)
+        e.roll += TS / 0.1 * (demand.setpoint.roll - e.roll)
+        e.pitch += TS / 0.1 * (demand.setpoint.pitch - e.pitch)
         self.highest = max(self.highest, e.altitude)
         self.time += TS
 
@@ -249,7 +249,7 @@ def offboard(simulated, *target):
 def test_an_offboard_attitude_is_flown_with_altitude_hold(flying):
     offboard(flying, 0.3, -0.2, 1.0, None)
     flying.run(1.0)
-    assert flying.demand[:3] == (0.3, -0.2, 1.0)
+    assert flying.demand.setpoint[:3] == (0.3, -0.2, 1.0)
     assert flying.estimate.altitude == pytest.approx(105.0, abs=0.2)
 
 
@@ -280,9 +280,9 @@ def test_after_a_setpoint_timeout_the_vehicle_levels_and_then_lands(flying):
     flying.run(1.0)
     flying.sources = []
     flying.run(0.49)
-    assert flying.demand.roll == 0.3
+    assert flying.demand.setpoint.roll == 0.3
     flying.run(0.03)
-    assert flying.demand[:3] == (0.0, 0.0, 0.5)
+    assert flying.demand.setpoint[:3] == (0.0, 0.0, 0.5)
     assert flying.vehicle.mode is Mode.OFFBOARD
     assert (Severity.CRITICAL, "no setpoints for 0.5 s: level") in flying.said
     flying.run(1.9)
@@ -298,10 +298,10 @@ def test_setpoints_that_return_before_landing_are_flown_again(flying):
     offboard(flying, 0.3, 0.0, 0.5, None)
     source, flying.sources = flying.sources, []
     flying.run(1.5)
-    assert flying.demand.roll == 0.0
+    assert flying.demand.setpoint.roll == 0.0
     flying.sources = source
     flying.run(0.1)
-    assert (flying.demand.roll, flying.vehicle.mode) == (0.3, Mode.OFFBOARD)
+    assert (flying.demand.setpoint.roll, flying.vehicle.mode) == (0.3, Mode.OFFBOARD)
 
 
 def test_a_setpoint_timeout_on_the_ground_disarms_the_vehicle(simulated):
@@ -318,9 +318,9 @@ def test_sticks_command_tilt_heading_and_climb(flying):
     flying.run(TS)
     flying.vehicle.enter(Mode.ALTITUDE)
     flying.run(1.0)
-    assert math.degrees(flying.demand.roll) == pytest.approx(17.5)
-    assert math.degrees(flying.demand.pitch) == pytest.approx(-35.0)
-    assert flying.demand.yaw == pytest.approx(1.5, abs=0.01)
+    assert math.degrees(flying.demand.setpoint.roll) == pytest.approx(17.5)
+    assert math.degrees(flying.demand.setpoint.pitch) == pytest.approx(-35.0)
+    assert flying.demand.setpoint.yaw == pytest.approx(1.5, abs=0.01)
     flying.run(3.0)
     assert flying.estimate.climb == pytest.approx(0.75, abs=0.1)
     flying.sources = []
@@ -355,7 +355,7 @@ def test_with_motion_capture_the_position_is_held(flying, heading):
     assert (flying.north, flying.east) == pytest.approx(held, abs=0.05)
     flying.sources = []
     flying.run(0.6)
-    assert flying.demand[:2] == (0.0, 0.0)
+    assert flying.demand.setpoint[:2] == (0.0, 0.0)
 
 
 def test_a_lost_vehicle_stops_its_rotors(flying):
@@ -415,5 +415,5 @@ def test_any_sequence_of_commands_gives_a_finite_demand(actions):
         for _ in range(round(seconds / TS)):
             simulated.step()
             assert 0 <= simulated.collective <= 1
-            assert all(math.isfinite(value) for value in simulated.demand[:3])
+            assert all(math.isfinite(value) for value in simulated.demand.setpoint[:3])
             assert simulated.vehicle.armed or simulated.collective == 0.0

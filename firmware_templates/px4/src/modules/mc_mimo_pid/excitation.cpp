@@ -1,8 +1,10 @@
 #include "excitation.hpp"
 
-namespace mimopilot {
+namespace mimopilot
+{
 
-namespace {
+namespace
+{
 
 constexpr float kStickMove = 0.1F;       // of -1 to 1
 constexpr float kMaxAmplitude = 0.5F;
@@ -113,9 +115,7 @@ Excitation::End Excitation::fault(const ExcitationConditions &conditions) const
 {
 	if (!conditions.ready) { return End::NotReady; }
 
-	for (const float angle : conditions.attitude) {
-		if (!between(angle, -_settings.tilt_max, _settings.tilt_max)) { return End::Tilt; }
-	}
+	if (!between(conditions.tilt, 0.0F, _settings.tilt_max)) { return End::Tilt; }
 
 	for (int i = 0; i < 4; i++) {
 		if (!between(conditions.sticks[i] - _sticks[i], -kStickMove, kStickMove)) { return End::Sticks; }

@@ -4,7 +4,8 @@
 
 #include <stdint.h>
 
-namespace mimopilot {
+namespace mimopilot
+{
 
 // Alternates between +1 and -1, each held for a random number of samples from hold_min to hold_max inclusive.
 class Prbs
@@ -31,12 +32,12 @@ struct ExcitationSettings {
 	int32_t duration;   // samples on each axis
 	int32_t pause;      // samples between the axes
 	int32_t seed;
-	float tilt_max;     // rad, on roll and pitch
+	float tilt_max;     // rad
 };
 
 struct ExcitationConditions {
 	bool ready;             // armed, in the air, in the chosen mode, measurements valid
-	float attitude[2];      // rad, roll and pitch
+	float tilt;             // rad
 	float sticks[4];        // -1 to 1; all 0 without a remote control
 };
 
@@ -69,7 +70,7 @@ private:
 	bool _configured{false};
 	int32_t _chosen{0};  // axis of the last configure()
 	int32_t _left{0};    // samples, this phase
-	float _sticks[4]{};  // at the start
+	float _sticks[4] {}; // at the start
 };
 
 }  // namespace mimopilot

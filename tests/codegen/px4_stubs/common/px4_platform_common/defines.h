@@ -7,7 +7,6 @@
 #define PX4_ISFINITE(x) __builtin_isfinite(x)
 #define __EXPORT __attribute__((visibility("default")))
 
-extern "C" int px4_usleep(unsigned microseconds);
 
 namespace time_literals {
 constexpr uint64_t operator"" _s(unsigned long long seconds) { return seconds * 1000000ULL; }

@@ -1,43 +1,46 @@
 #pragma once
 
-#include <string.h>
-
 #include <uORB/uORB.h>
 
 namespace uORB {
 
-template<typename T>
-class Publication
+class PublicationBase
 {
 public:
-	explicit Publication(const orb_metadata *meta) : _meta(meta) {}
+	bool advertised() const { return _handle != nullptr; }
+	bool unadvertise() { return Manager::orb_unadvertise(_handle) == 0; }
 
-	~Publication()
+protected:
+	explicit PublicationBase(const orb_metadata *meta) : _meta(meta) {}
+
+	~PublicationBase()
 	{
-		if (_advertised) { node(_meta).advertised = false; }
+		if (_handle != nullptr) { unadvertise(); }
 	}
+
+	orb_advert_t _handle{nullptr};
+	const orb_metadata *const _meta;
+};
+
+template<typename T>
+class Publication : public PublicationBase
+{
+public:
+	explicit Publication(const orb_metadata *meta) : PublicationBase(meta) {}
 
 	bool advertise()
 	{
-		if (!_advertised) { node(_meta).advertised = true; }
+		if (!advertised()) { _handle = orb_advertise(_meta, nullptr); }
 
-		_advertised = true;
-		return true;
+		return advertised();
 	}
 
 	bool publish(const T &data)
 	{
-		advertise();
-		Node &topic = node(_meta);
-		topic.message.resize(sizeof(T));
-		memcpy(topic.message.data(), &data, sizeof(T));
-		topic.generation++;
-		return true;
-	}
+		if (!advertised()) { advertise(); }
 
-private:
-	const orb_metadata *_meta;
-	bool _advertised{false};
+		return Manager::orb_publish(_meta, _handle, &data) == 0;
+	}
 };
 
 }  // namespace uORB

@@ -1,7 +1,5 @@
 #pragma once
 
-#include <string.h>
-
 #include <uORB/uORB.h>
 
 namespace uORB {
@@ -9,27 +7,16 @@ namespace uORB {
 class Subscription
 {
 public:
-	Subscription(const orb_metadata *meta, uint8_t = 0) : _meta(meta) {}
+	Subscription(const orb_metadata *meta, uint8_t = 0) : _node(Manager::orb_add_internal_subscriber(meta)) {}
 
-	bool advertised() { return node(_meta).advertised; }
-	bool updated() { return advertised() && node(_meta).generation != _last_generation; }
-	bool update(void *dst) { return updated() && copy(dst); }
-
-	bool copy(void *dst)
-	{
-		Node &topic = node(_meta);
-
-		if (topic.message.empty()) { return false; }
-
-		memcpy(dst, topic.message.data(), topic.message.size());
-		_last_generation = topic.generation;
-		return true;
-	}
-
+	bool advertised() { return Manager::is_advertised(_node); }
+	bool updated() { return Manager::updates_available(_node, _last_generation) > 0; }
+	bool update(void *dst) { return Manager::orb_data_copy(_node, dst, _last_generation, true); }
+	bool copy(void *dst) { return Manager::orb_data_copy(_node, dst, _last_generation, false); }
 	unsigned get_last_generation() const { return _last_generation; }
 
 private:
-	const orb_metadata *_meta;
+	void *_node;
 	unsigned _last_generation{0};
 };
 

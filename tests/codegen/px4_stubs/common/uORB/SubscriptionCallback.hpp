@@ -12,13 +12,8 @@ class SubscriptionCallbackWorkItem : public Subscription
 public:
 	SubscriptionCallbackWorkItem(px4::WorkItem *item, const orb_metadata *meta) : Subscription(meta), _item(item) {}
 
-	bool registerCallback()
-	{
-		scheduled = _item;
-		return true;
-	}
-
-	void unregisterCallback() { scheduled = nullptr; }
+	bool registerCallback();
+	void unregisterCallback();
 
 private:
 	px4::WorkItem *_item;

@@ -1,6 +1,5 @@
 #pragma once
 
-#include <drivers/drv_hrt.h>
 #include <uORB/Subscription.hpp>
 
 namespace uORB {
@@ -10,13 +9,8 @@ class SubscriptionInterval
 public:
 	SubscriptionInterval(const orb_metadata *meta, uint64_t interval_us) : _subscription(meta), _interval(interval_us) {}
 
-	bool updated() { return hrt_absolute_time() - _last >= _interval && _subscription.updated(); }
-
-	bool copy(void *dst)
-	{
-		_last = hrt_absolute_time();
-		return _subscription.copy(dst);
-	}
+	bool updated();
+	bool copy(void *dst);
 
 private:
 	Subscription _subscription;

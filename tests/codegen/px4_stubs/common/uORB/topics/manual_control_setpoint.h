@@ -10,6 +10,12 @@ struct manual_control_setpoint_s {
 	float yaw;
 	float throttle;
 	float flaps;
+	float aux1;
+	float aux2;
+	float aux3;
+	float aux4;
+	float aux5;
+	float aux6;
 	bool valid;
 	uint8_t data_source;
 	bool sticks_moving;
