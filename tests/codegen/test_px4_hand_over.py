@@ -98,20 +98,31 @@ def test_stop_in_the_air_hands_back(program):
     assert result.ticks[-2:] == [False, False]
 
 
-def test_from_stock_the_torque_does_not_jump_and_the_integrators_carry_it(program):
+def test_from_stock_the_torque_does_not_jump_and_what_is_missing_fades(program):
     gains = coupled_gains()
     elements = [f"param MIMO_{code} {text(value)}" for code, value in gains.elements().items() if code != "TS"]
-    stock = np.float32([0.05, -0.04, 0.02])
+    stock, integral = np.float32([0.05, -0.04, 0.02]), np.float32([0.03, -0.06, 0.01])
     tilted = f"attitude {text(*quaternion(0.03, -0.02, 0.1))} 0 1 0 0 0"
     turning = [f"gyro 4000 {text(0.1, 0.05, -0.05)}"] * 400
-    start = [*elements, "param MIMO_EN 0", f"stock {text(*stock)}", *AIRBORNE, tilted]
-    result = drive(program, [*start, *turning, "param MIMO_EN 1", *turning])
-    inputs = level_inputs(400, armed=0, attitude=result.out["attitude"][0], rates=[0.1, 0.05, -0.05])
-    rest = NativeController(load_native(gains), gains).run(inputs)["moment"][-1]
-    assert np.abs(rest - stock).max() > 0.05
+    start = [*elements, "param MC_YAW_TQ_CUTOFF 0", "param MIMO_EN 0", f"stock {text(*stock, *integral)}"]
+    out = drive(program, [*start, *AIRBORNE, tilted, *turning, "param MIMO_EN 1", *turning]).out
+    inputs = level_inputs(400, armed=0, attitude=out["attitude"][0], rates=[0.1, 0.05, -0.05])
+    own = NativeController(load_native(gains), gains).run(inputs)["moment"][-1]
+    missing = stock - integral - own
+    assert np.abs(missing).max() > 0.05
     # One period of Ki e is added already.
-    np.testing.assert_allclose(result.out["torque"][0], stock, atol=1e-3)
-    np.testing.assert_allclose(result.out["integral"][0], stock - rest, atol=1e-3)
+    np.testing.assert_allclose(out["torque"][0], stock, atol=1e-3)
+    np.testing.assert_allclose(out["integral"][0], integral, atol=1e-3)
+    faded = out["torque"] - out["integral"] - own
+    k = np.arange(100)
+    np.testing.assert_allclose(faded[:100], missing * (1 - 0.004 / 0.1) ** k[:, None], atol=2e-6)
+
+
+def test_an_integrator_without_gain_starts_at_zero(program):
+    none = [f"param MIMO_RI_{element} 0" for element in ("RR", "RP", "PR", "PP")]
+    out = drive(program, [*none, f"stock {text(0.05, 0.05, 0.05, 0.2, 0.2, 0.2)}", *AIRBORNE, STEP, STEP]).out
+    assert (out["integral"][0, :2] == 0).all() and out["integral"][0, 2] == np.float32(0.2)
+    np.testing.assert_allclose(out["torque"][0, :2], 0.05, atol=1e-6)
 
 
 # Silence.

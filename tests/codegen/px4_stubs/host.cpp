@@ -19,6 +19,7 @@ namespace {
 
 uint64_t gyro_interval = 4000;
 float stock_torque[3] {};
+float stock_integral[3] {};
 bool muted[3] {};  // attitude, setpoint, sticks: not published any more
 vehicle_status_s vehicle{};
 
@@ -50,7 +51,7 @@ bool gyro(const float (&rates)[3])
 
 	publish(ORB_ID(vehicle_angular_velocity), message);
 	run_commander();
-	run_stock(stock_torque);
+	run_stock(stock_torque, stock_integral);
 	const unsigned before = uORB::node(ORB_ID(vehicle_torque_setpoint)).generation;
 
 	if (uORB::scheduled != nullptr) { uORB::scheduled->Run(); }
@@ -167,6 +168,7 @@ void execute(Line &line)
 
 	} else if (command == "stock") {
 		line.numbers(stock_torque);
+		line.numbers(stock_integral);
 
 	} else if (command == "wait") {
 		long long left;

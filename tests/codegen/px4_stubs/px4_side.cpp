@@ -207,7 +207,7 @@ extern "C" int mc_rate_control_main(int, char *argv[])
 
 bool stock_flies() { return rate_runs; }
 
-void run_stock(const float (&torque)[3])
+void run_stock(const float (&torque)[3], const float (&integral)[3])
 {
 	if (attitude_runs) {
 		vehicle_rates_setpoint_s rates{};
@@ -225,6 +225,7 @@ void run_stock(const float (&torque)[3])
 		if (torque_handle == nullptr) { torque_handle = orb_advertise(ORB_ID(vehicle_torque_setpoint), nullptr); }
 
 		uORB::Manager::orb_publish(ORB_ID(vehicle_torque_setpoint), torque_handle, &message);
+		publish(ORB_ID(rate_ctrl_status), rate_ctrl_status_s{now, integral[0], integral[1], integral[2]}, true);
 	}
 }
 

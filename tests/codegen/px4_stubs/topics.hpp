@@ -46,7 +46,7 @@ T last(const orb_metadata *meta)
 
 // What of PX4 runs beside the module.
 bool stock_flies();           // mc_rate_control runs
-void run_stock(const float (&torque)[3]);
+void run_stock(const float (&torque)[3], const float (&integral)[3]);
 void run_commander();
 void run_tasks();
 void run_scheduled();

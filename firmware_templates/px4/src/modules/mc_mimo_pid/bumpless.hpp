@@ -3,21 +3,43 @@
 
 #include <math.h>
 
-#include "mimo_pid.hpp"
+#include "gains.hpp"
 
 namespace mimopilot
 {
 
-// The integrators start with `torque`, what is missing without them, within their limits. One that the gains do not use
-// would stay for ever: it starts with zero.
-inline void start_integrals(State &state, const float (&torque)[kAxes])
+// The integrators start with those of PX4's own controller, within their limits. What is still missing to its torque
+// is added and fades, so that an error at the moment of the change does not stay in the integrators.
+class Bumpless
 {
-	const Gains &gains = state.gains;
+public:
+	// `output`: of a step with the integrators at zero. `integral` and `torque`: of PX4's own controller.
+	void start(State &state, const Output &output, const float (&integral)[kAxes], const float (&torque)[kAxes])
+	{
+		const Gains &gains = state.gains;
 
-	for (int i = 0; i < kAxes; i++) {
-		const float sum = i == 2 ? fabsf(gains.yaw_ki_i) : fabsf(gains.ki_i[i][0]) + fabsf(gains.ki_i[i][1]);
-		state.integral[i] = sum > 0.0F ? fminf(fmaxf(torque[i], -gains.integral_max[i]), gains.integral_max[i]) : 0.0F;
+		for (int i = 0; i < kAxes; i++) {
+			// An integrator that the gains do not use would stay for ever.
+			const float used = i == 2 ? fabsf(gains.yaw_ki_i) : fabsf(gains.ki_i[i][0]) + fabsf(gains.ki_i[i][1]);
+			const float limit = used > 0.0F ? gains.integral_max[i] : 0.0F;
+			state.integral[i] = fminf(fmaxf(integral[i], -limit), limit);
+			_missing[i] = fminf(fmaxf(torque[i] - output.moment[i] - state.integral[i], -1.0F), 1.0F);
+		}
 	}
-}
+
+	// The next sample's torque, for all axes.
+	void add(float (&torque)[kAxes])
+	{
+		constexpr float kFade = 0.1F;  // s; shorter than an attitude loop's response, longer than a motor's
+
+		for (int i = 0; i < kAxes; i++) {
+			torque[i] += _missing[i];
+			_missing[i] -= kGains.period / kFade * _missing[i];
+		}
+	}
+
+private:
+	float _missing[kAxes] {};
+};
 
 }  // namespace mimopilot

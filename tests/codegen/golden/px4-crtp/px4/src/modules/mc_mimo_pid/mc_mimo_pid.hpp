@@ -34,6 +34,7 @@
 
 #include "actuation.hpp"
 #include "arming_check.hpp"
+#include "bumpless.hpp"
 #include "excitation.hpp"
 #include "hand_over.hpp"
 #include "mimo_pid.hpp"
@@ -88,6 +89,7 @@ private:
 	uORB::Subscription _control_allocator_status_sub{ORB_ID(control_allocator_status)};
 	uORB::Subscription _hover_thrust_estimate_sub{ORB_ID(hover_thrust_estimate)};
 	uORB::Subscription _manual_control_setpoint_sub{ORB_ID(manual_control_setpoint)};
+	uORB::Subscription _rate_ctrl_status_sub{ORB_ID(rate_ctrl_status)};
 	uORB::Subscription _vehicle_attitude_sub{ORB_ID(vehicle_attitude)};
 	uORB::Subscription _vehicle_attitude_setpoint_sub{ORB_ID(vehicle_attitude_setpoint)};
 	uORB::Subscription _vehicle_control_mode_sub{ORB_ID(vehicle_control_mode)};
@@ -133,7 +135,10 @@ private:
 	bool _external_rates{false};  // the rate setpoint is another program's
 	hrt_abstime _attitude_time{0};
 	hrt_abstime _rates_time{0};
+	mimopilot::Bumpless _bumpless{};
 	vehicle_torque_setpoint_s _stock_torque{};  // of PX4's own controllers
+	float _stock_integral[3] {};
+	float _excited[3] {};
 	const char *_obstacle{nullptr};
 	const char *_wrong_gain{nullptr};
 	int _unlogged{0};                // samples

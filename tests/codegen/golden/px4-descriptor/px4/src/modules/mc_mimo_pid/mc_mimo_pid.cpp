@@ -8,7 +8,6 @@
 #include <systemlib/mavlink_log.h>
 
 #include "attitude.hpp"
-#include "bumpless.hpp"
 #include "contributions.hpp"
 #include "gains.hpp"
 #include "stock_controllers.hpp"
@@ -142,6 +141,8 @@ void McMimoPid::Run()
 
 		} else if (_control_mode.flag_control_rates_enabled) {
 			excite(_input.excitation);
+			memcpy(_excited, _input.excitation, sizeof(_excited));
+			_bumpless.add(_input.excitation);
 			step(_state, _input, _output);
 			publish(sampled ? angular_velocity.timestamp_sample : now);
 		}
@@ -229,22 +230,32 @@ void McMimoPid::release()
 	_vehicle_rates_setpoint_pub.leave();
 }
 
-// While PX4's own controllers fly: the integrators make up for the difference, so that the torque does not jump at the
-// hand-over.
+// While PX4's own controllers fly: be ready to take over in each sample.
 void McMimoPid::observe(hrt_abstime now)
 {
 	_vehicle_torque_setpoint_sub.update(&_stock_torque);
-	const bool tracks = _input.armed != 0 && !silent(now, _stock_torque.timestamp, kHoldTime);
+	rate_ctrl_status_s status;
+
+	if (_rate_ctrl_status_sub.update(&status)) {
+		_stock_integral[0] = status.rollspeed_integ;
+		_stock_integral[1] = status.pitchspeed_integ;
+		_stock_integral[2] = status.yawspeed_integ;
+	}
+
+	const bool follows = _input.armed != 0 && !silent(now, _stock_torque.timestamp, kHoldTime);
 	_input.armed = 0;
 	memset(_input.excitation, 0, sizeof(_input.excitation));
 	step(_state, _input, _output);
 
-	if (tracks) {
+	if (follows) {
 		float torque[kAxes];
 
-		for (int i = 0; i < kAxes; i++) { torque[i] = _actuation.unscaled(_settings, _stock_torque.xyz[i]) - _output.moment[i]; }
+		for (int i = 0; i < kAxes; i++) { torque[i] = _actuation.unscaled(_settings, _stock_torque.xyz[i]); }
 
-		start_integrals(_state, torque);
+		_bumpless.start(_state, _output, _stock_integral, torque);
+
+	} else {
+		_bumpless = {};
 	}
 }
 
@@ -462,8 +473,8 @@ void McMimoPid::log()
 	if (_excitation.phase() != Excitation::Phase::Off || _excitation_logged) {
 		debug_vect_s excitation{};
 		memcpy(excitation.name, kExcitationName, sizeof(kExcitationName));
-		excitation.x = _input.excitation[0];
-		excitation.y = _input.excitation[1];
+		excitation.x = _excited[0];
+		excitation.y = _excited[1];
 		excitation.z = _excitation.running() ? static_cast<float>(static_cast<int>(_excitation.phase())) : -1.0F;
 		excitation.timestamp = hrt_absolute_time();
 		_debug_vect_pub.publish(excitation);
