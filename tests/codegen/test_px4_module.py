@@ -272,8 +272,8 @@ def test_one_axis_alone_can_be_excited(program, axis, column):
         (f"attitude {text(*quaternion(0.6, 0, 0))} 0 1 0 0 0", "MIMO_EX_TILT"),
         (f"attitude {text(*quaternion(0, -0.6, 0))} 0 1 0 0 0", "MIMO_EX_TILT"),
         (f"mode 0 0 1 1 {HOLD_MODE}", "disarmed"),
-        ("mode 1 0 1 1 2", "mode left"),
-        ("land 0 1", "on the ground"),
+        ("mode 1 0 1 1 2", "mode"),
+        ("land 0 1", "ground"),
     ],
 )
 def test_the_excitation_stops_at_once(program, event, reason):

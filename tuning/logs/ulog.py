@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mimopilot.tuning.logs.flight_phase import bridged, intersection, intervals
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, Series, sampling_period
+from mimopilot.tuning.logs.torque_parts import PARTS_TOPIC, torque_parts
 from mimopilot.tuning.logs.ulog_file import UlogFile, open_ulog
 from mimopilot.tuning.logs.vehicle_type import px4_vehicle
 
@@ -67,6 +68,8 @@ def record_ulog(path: Path) -> Recording:
                     break
     excitation = _excitation(log)
     if excitation is not None:
+        if "u" in signals:
+            excitation = _zero_when_silent(excitation, log.published(signals["u"].topic)[0])
         signals["u_bar"] = excitation
     published = {}
     for signal in ("r_o", "r_i", "u_bar"):
@@ -94,6 +97,7 @@ def record_ulog(path: Path) -> Recording:
         changes=file.changes,
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((file.damage,) if file.damage else ()), *vehicle.warnings),
+        notes=_notes(log),
         commands=_commands(log),
         published=published,
         span=_span(file),
@@ -129,6 +133,12 @@ class _UlogLog:
         return Series(self.published(topic)[1], values, topic)
 
 
+def _notes(log: _UlogLog) -> tuple[str, ...]:
+    """What our module says about its torque, for `mimopilot inspect`."""
+    parts = torque_parts(log.fields(PARTS_TOPIC))
+    return () if parts is None else (parts.summary(),)
+
+
 def _advice(profile: float | None) -> str:
     """What to change so that the signals are logged fast enough; names no setting that is right already."""
     if profile is None or int(profile) & 49 != 49:
@@ -160,6 +170,20 @@ def _excitation(log: _UlogLog) -> Series | None:
     ours = (series.values[:, 2:] == np.frombuffer(EXCITATION_NAME.encode(), np.uint8)).all(axis=1)
     values = series.values[ours, :2]
     return Series(series.time[ours], values, series.topic) if values.any() else None
+
+
+def _zero_when_silent(excitation: Series, cycles: NDArray[np.float64]) -> Series:
+    """The excitation in every control cycle (times in s): it is published only while it runs, and zero last."""
+    if len(cycles) < 3 or np.any(np.diff(cycles) < 0) or np.any(np.diff(excitation.time) < 0):
+        return excitation
+    near = sampling_period(cycles) / 2
+    last = np.searchsorted(excitation.time, cycles + near, side="right") - 1
+    zero = (last < 0) | ~excitation.values[np.maximum(last, 0)].any(axis=1)
+    silent = cycles[zero & ((last < 0) | (np.abs(excitation.time[np.maximum(last, 0)] - cycles) > near))]
+    time = np.concatenate([excitation.time, silent])
+    values = np.concatenate([excitation.values, np.zeros((len(silent), 2))])
+    order = np.argsort(time, kind="stable")
+    return Series(time[order], values[order], excitation.topic)
 
 
 def _commands(log: _UlogLog) -> Series | None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.inspection import inspect_log
 from mimopilot.tuning.logs.reader import open_log, read_log
 from tests.tuning.logs.flights import (
     attitude,
@@ -111,6 +112,39 @@ def test_excitation_belongs_to_the_cycle_that_published_it_with_its_torque(tmp_p
     log = read_log(write_ulog(tmp_path / "x.ulg", topics))
     assert log.u_bar == pytest.approx(flight.u_bar[250:])
     assert log.u == pytest.approx(flight.u[250:], abs=1e-6)
+
+
+def test_excitation_that_is_published_only_while_it_runs_is_zero_outside(tmp_path):
+    flight = make_flight(seconds=14.0, inject=lambda t: pulses(t, begin=13.0, end=19.0))
+    topic = injected(flight)
+    whole = read_log(write_ulog(tmp_path / "whole.ulg", px4_topics(flight, debug_vect=topic)))
+    # Two runs, each from a zero before to one after: the second pulse train is cut out of the first.
+    runs = (flight.t > 12.99) & (flight.t < 19.002) & ~((flight.t > 15.5) & (flight.t < 16.5))
+    topic["x"][(flight.t > 15.48) & (flight.t < 16.52)] = topic["y"][(flight.t > 15.48) & (flight.t < 16.52)] = 0
+    quiet = {name: values[runs] for name, values in topic.items()}
+    full = read_log(write_ulog(tmp_path / "full.ulg", px4_topics(flight, debug_vect=topic)))
+    log = read_log(write_ulog(tmp_path / "quiet.ulg", px4_topics(flight, debug_vect=quiet)))
+    for name in ("u", "u_bar", "y_i", "y_o"):
+        assert getattr(log, name) == pytest.approx(getattr(full, name), abs=1e-9)
+    assert log.segments == full.segments == whole.segments
+    assert not log.u_bar[round((15.6 - 13) / PERIOD) : round((16.4 - 13) / PERIOD)].any()
+    found = inspect_log(tmp_path / "quiet.ulg")
+    assert found.signals["u_bar"].gaps == 0 and found.signals["u_bar"].rate_hz == pytest.approx(250, rel=1e-3)
+
+
+def test_the_parts_of_the_torque_are_noted(tmp_path, flight):
+    k = np.arange(0, len(flight.t), 5)
+    data = np.zeros((len(k), 58), np.float32)
+    data[:, :15] = np.arange(15) / 100
+    name = np.full(len(k), b"MIMO_PID", "S10")
+    name[::7] = b"other"
+    parts = {"timestamp": microseconds(flight.t[k]), "id": np.zeros(len(k), "<u2"), "name": name, "data": data}
+    found = inspect_log(write_ulog(tmp_path / "x.ulg", px4_topics(flight, debug_array=parts)))
+    (note,) = found.recording.notes
+    assert "P 0 / 0.01 / 0.02, I 0.03 / 0.04 / 0.05, D 0.06 / 0.07 / 0.08" in note
+    assert "feed-forward 0.09 / 0.1 / 0.11, cross-axis 0.12 / 0.13 / 0.14" in note
+    other = {**parts, "name": np.full(len(k), b"other", "S10")}
+    assert not inspect_log(write_ulog(tmp_path / "y.ulg", px4_topics(flight, debug_array=other))).recording.notes
 
 
 def test_a_setpoint_published_between_two_cycles_is_used_by_the_second(tmp_path, flight):
