@@ -34,7 +34,7 @@ const char *describe(Excitation::Phase phase)
 
 	case Excitation::Phase::Pause: return "pause";
 
-	case Excitation::Phase::Waiting: return "waits for its mode in the air";
+	case Excitation::Phase::Waiting: return "waiting";
 
 	default: return "off";
 	}
@@ -47,13 +47,13 @@ const char *describe(Excitation::End end)
 
 	case Excitation::End::Cancelled: return "cancelled";
 
-	case Excitation::End::NotReady: return "stopped: mode left, on the ground or disarmed";
+	case Excitation::End::NotReady: return "stopped: mode, ground or disarmed";
 
-	case Excitation::End::Tilt: return "stopped: tilt beyond MIMO_EX_TILT";
+	case Excitation::End::Tilt: return "stopped: MIMO_EX_TILT";
 
 	case Excitation::End::Sticks: return "stopped: a stick moved";
 
-	case Excitation::End::Settings: return "refused: a MIMO_EX_ parameter is out of its range";
+	case Excitation::End::Settings: return "refused: a MIMO_EX_ out of range";
 
 	default: return "none yet";
 	}
@@ -67,7 +67,7 @@ McMimoPid::McMimoPid() :
 	ScheduledWorkItem(MODULE_NAME, px4::wq_configurations::rate_ctrl),
 	_clock(kGains.period)
 {
-	initialise(_state, kGains);
+	initialise(_state, Parameters::programmed());
 	update_parameters();
 }
 

@@ -113,6 +113,8 @@ Parameters::Parameters()
 	for (const px4::params name : kNames) { param_set_used(param_handle(name)); }
 }
 
+const Gains &Parameters::programmed() { return kGains; }
+
 const char *Parameters::read(Gains &gains)
 {
 	static_assert(sizeof(gains) == kGainCount * sizeof(float), "Gains is a row of floats");

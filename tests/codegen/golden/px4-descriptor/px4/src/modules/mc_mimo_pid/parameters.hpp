@@ -18,6 +18,9 @@ public:
 	// then of no use. What is fixed in the firmware stays so.
 	const char *read(Gains &gains);
 
+	// The gains in the firmware.
+	static const Gains &programmed();
+
 	ExcitationSettings excitation() const;
 	int32_t excitation_mode() const { return integer(MIMO_EX_MODE); }
 	int32_t enabled() const { return integer(MIMO_EN); }
