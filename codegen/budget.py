@@ -51,11 +51,13 @@ from mimopilot.tuning.gains import Gains
 CLOCK = 168e6
 #: Control period that the budget is for, s.
 PERIOD = 4e-3
-#: Limits, all chosen: bytes of code and of stack; instructions of a step and share of a period, without and with model
+#: Limits, all chosen: bytes of code and of stack; instructions of a step and share of 4 ms, without and with model
 #: following.
 MAX_TEXT_BYTES, MAX_STACK_BYTES = 3072, 128
 MAX_STEP = (540, 0.002)
 MAX_STEP_FOLLOWING = (700, 0.0026)
+#: What a setpoint slew limit may add to both.
+MAX_SLEW = (150, 0.0008)
 EMULATORS = ("unicorn", "qemu")
 #: C library functions that the controller may call: copying and filling memory.
 LIBRARY = {"memcpy", "memset", "memmove"}
@@ -211,9 +213,16 @@ def processor_in_the_loop(
         return [
             BudgetItem("rows", "rows", rows),
             BudgetItem("rows_different", "rows that differ from the host", different_rows(outputs, expected), 0),
-            *_time_items(step_costs(image, periods), *(MAX_STEP_FOLLOWING if gains.filters.followed else MAX_STEP)),
+            *_time_items(step_costs(image, periods), *_step_limits(gains)),
             *_size_items(image),
         ]
+
+
+def _step_limits(gains: Gains) -> tuple[int, float]:
+    """Largest instructions of a step and share of the period that the options of a set may cost."""
+    instructions, share = MAX_STEP_FOLLOWING if gains.filters.followed else MAX_STEP
+    more, more_share = MAX_SLEW if gains.filters.setpoint_slew else (0, 0.0)
+    return instructions + more, share + more_share
 
 
 def different_rows(a: NDArray[Any], b: NDArray[Any]) -> int:

@@ -32,7 +32,7 @@ class StockController:
     rate : str
         Parameter of the control rate, Hz.
     scalars : mapping
-        Scalar of our table -> parameter. A row that the table does not have is not mapped.
+        Scalar of our table -> parameter.
     unlimited : mapping
         Limit -> value where the parameter is 0, which means that there is no limit.
     """

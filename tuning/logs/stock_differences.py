@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mimopilot.tuning.logs.stock_controllers import ARDUPILOT, PX4, StockController
-from mimopilot.tuning.parameters import ROWS
+from mimopilot.tuning.parameters import YAW_WEIGHT
 
-#: Keys of our table.
-_KEYS = {row.key for row in ROWS}
 #: Parameter -> its unit, and what it does where it is not 0.
 Effects = Mapping[str, tuple[str, str]]
 _PX4: Effects = {
@@ -41,7 +39,7 @@ _ARDUPILOT_GYRO = ("INS_GYRO_FILTER", "INS_HNTCH_ENABLE", "INS_HNTC2_ENABLE")
 def optional_names(stock: StockController) -> tuple[str, ...]:
     """Parameters that `differences` looks at."""
     if stock is PX4:
-        return (*_PX4, *_PX4_GYRO, "MC_YAW_WEIGHT", "MAV_TYPE")
+        return (*_PX4, *_PX4_GYRO, "MAV_TYPE")
     per_axis = [f"ATC_RAT_{axis}_{name}" for axis in ARDUPILOT.axes for name in _ARDUPILOT_AXIS]
     cutoffs = [f"ATC_RAT_{axis}_FLTD" for axis in ARDUPILOT.axes[1:]]
     return (*per_axis, *cutoffs, *_ARDUPILOT, *_ARDUPILOT_GYRO, "FRAME_CLASS")
@@ -61,8 +59,6 @@ def differences(stock: StockController, values: Mapping[str, float]) -> list[str
 
 def _of_px4(values: Mapping[str, float]) -> list[str]:
     found = _named(_PX4, values)
-    lost = {key: name for key, name in PX4.scalars.items() if key not in _KEYS}
-    found += [f"{name} {values[name]:g}: {key} is no gain of ours" for key, name in lost.items() if name in values]
     damped = [axis for axis in PX4.axes if values.get(f"MC_{axis}RATE_D", 0)]
     if damped:
         found.append(
@@ -91,6 +87,7 @@ def _of_ardupilot(values: Mapping[str, float]) -> list[str]:
     for axis, limit in zip("RPY", ARDUPILOT.unlimited["rate_max"], strict=True):
         if values.get(f"ATC_RATE_{axis}_MAX") == 0:
             found.append(f"ATC_RATE_{axis}_MAX 0: no limit; our law needs one, {limit:g} rad/s")
+    found.append(f"yaw_weight {YAW_WEIGHT:g}: our default; ArduPilot has another law for tilt and yaw together")
     found.append("ArduPilot scales torque with battery voltage and air density in its motor library")
     found += _gyro(_ARDUPILOT_GYRO, values)
     return found

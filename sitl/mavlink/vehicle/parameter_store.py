@@ -33,7 +33,7 @@ class ParameterStore:
 
     Raises
     ------
-    SitlError
+    Error
         When the file is damaged.
     """
 

@@ -14,7 +14,6 @@ from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.imported_gains import DEFAULTS, import_gains, needed_names, read_source
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.logs.stock_controllers import ARDUPILOT, PX4
-from mimopilot.tuning.parameters import ROWS
 from tests.conftest import assert_one_clear_line
 from tests.tuning.logs.flights import (
     ardupilot_messages,
@@ -31,7 +30,7 @@ PX4_VALUES = {
     "MC_ROLL_P": 6.5,
     "MC_PITCH_P": 6.0,
     "MC_YAW_P": 2.8,
-    "MC_YAW_WEIGHT": 0.4,
+    "MC_YAW_WEIGHT": 0.35,
     "MC_ROLLRATE_P": 0.15,
     "MC_ROLLRATE_I": 0.2,
     "MC_ROLLRATE_D": 0.003,
@@ -95,8 +94,7 @@ def test_px4s_parameters_become_our_gains_by_hand(tmp_path, form):
     assert (gains.Ts, gains.derivative_cutoff_hz) == (0.0025, 25.0)
     assert (gains.moment_scale, gains.certificate, gains.provenance.method) == (None, None, "imported")
     assert found.defaults == ()
-    weight = [row.key for row in ROWS if row.key == "yaw_weight"]
-    assert any("MC_YAW_WEIGHT 0.4" in text for text in found.not_carried) == (not weight)
+    assert gains.filters.yaw_weight == 0.35
 
 
 def test_ardupilots_parameters_become_our_gains_by_hand(tmp_path):

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from mimopilot.codegen.layout import INPUT
 from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.common.errors import Error
 from mimopilot.sitl.autopilot.excitation_injector import Injector
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
@@ -158,7 +159,7 @@ LINE = "1\t1\t{}\t{}\t9\n"
 def test_an_invalid_file_is_one_clear_error_and_stays_unchanged(tmp_path, content, message):
     path = tmp_path / "p.params"
     path.write_text(content)
-    with pytest.raises(SitlError, match=message) as error:
+    with pytest.raises(Error, match=message) as error:
         start(ParameterStore(path))
     assert error.value.exit_code == 2
     assert "\n" not in str(error.value)

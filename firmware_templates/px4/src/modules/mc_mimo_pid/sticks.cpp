@@ -16,34 +16,39 @@ constexpr float kTurn = 6.2831853F;      // rad
 constexpr float kErrorTime = 1.0F;  // s
 constexpr float kErrorChange = kRadian;
 
-float limit(float value, float low, float high) { return value >= low ? (value <= high ? value : high) : low; }
+// Each is called several times: not inlined, for size.
+[[gnu::noinline]] float limit(float value, float low, float high)
+{
+	return value >= low ? (value <= high ? value : high) : low;
+}
 
 // A missing stick, NaN, counts as centred.
-float stick(float value) { return value >= -1.0F && value <= 1.0F ? value : 0.0F; }
+[[gnu::noinline]] float stick(float value) { return value >= -1.0F && value <= 1.0F ? value : 0.0F; }
 
 float throttle(const StickInput &input) { return limit(input.throttle, -1.0F, 1.0F); }
 
-// PX4's stick curves: a share `e` of x^3, and a dead zone in the middle.
-float expo(float x, float e)
+// PX4's stick curves: a share `expo` of x^3; and "super expo", which bends the curve but keeps its ends.
+[[gnu::noinline]] float curve(float x, float expo, float bend)
 {
-	e = limit(e, 0.0F, 1.0F);
-	return (1.0F - e) * x + e * x * x * x;
+	const float share = limit(expo, 0.0F, 1.0F);
+	const float bent = limit(bend, 0.0F, 0.99F);
+	return (x + share * (x * x * x - x)) * (1.0F - bent) / (1.0F - fabsf(x) * bent);
 }
 
-float deadzone(float x, float zone)
+float deadzone(float x, float width)
 {
-	zone = limit(zone, 0.0F, 0.99F);
+	const float zone = limit(width, 0.0F, 0.99F);
 	const float outside = (fabsf(x) - zone) / (1.0F - zone);
 	return outside > 0.0F ? copysignf(outside, x) : 0.0F;
 }
 
 // PX4's first order low-pass, started at 0.
-void filter(float &state, float value, float time_constant, float period)
+[[gnu::noinline]] void filter(float &state, float value, float time_constant, float period)
 {
 	state += period / (fmaxf(time_constant, 0.0F) + period) * (value - state);
 }
 
-float wrap(float angle) { return angle - kTurn * floorf(angle / kTurn + 0.5F); }
+[[gnu::noinline]] float wrap(float angle) { return angle - kTurn * floorf(angle / kTurn + 0.5F); }
 
 }  // namespace
 
@@ -87,7 +92,7 @@ StickSetpoint Sticks::setpoint(const StockSettings &settings, const StickInput &
 			       float period)
 {
 	const float change = converge(vehicle, period);
-	const float yaw = expo(deadzone(stick(input.yaw), settings.yaw_deadzone), settings.yaw_expo);
+	const float yaw = curve(deadzone(stick(input.yaw), settings.yaw_deadzone), settings.yaw_expo, 0.0F);
 	filter(_yaw_rate, kRadian * settings.yaw_rate_max * yaw, settings.yaw_time_constant, period);
 
 	// The arming gesture turns the yaw stick at the bottom of the throttle.
@@ -122,10 +127,8 @@ void acro_rates(const StockSettings &settings, const StickInput &input, float (&
 	const float sticks[3] = {stick(input.roll), -stick(input.pitch), stick(input.yaw)};
 
 	for (int i = 0; i < 3; i++) {
-		// PX4's "super expo", which bends the curve but keeps its ends.
-		const float bend = limit(settings.acro_superexpo[i], 0.0F, 0.99F);
-		const float curve = expo(sticks[i], settings.acro_expo[i]) * (1.0F - bend) / (1.0F - fabsf(sticks[i]) * bend);
-		rates[i] = kRadian * settings.acro_rate_max[i] * curve;
+		const float shaped = curve(sticks[i], settings.acro_expo[i], settings.acro_superexpo[i]);
+		rates[i] = kRadian * settings.acro_rate_max[i] * shaped;
 	}
 }
 
