@@ -145,8 +145,8 @@ def _ranges() -> list[dict[str, Any]]:
         low = low if row.valid.lowest_included else np.nextafter(low, np.float32(np.inf))
         high = high if row.valid.highest_included else np.nextafter(high, np.float32(-np.inf))
         bounds = {
-            "lowest": float_literal(low) if math.isfinite(low) else "-kMaxGain",
-            "highest": float_literal(high) if math.isfinite(high) else "kMaxGain",
+            "lowest": float_literal(float(low)) if math.isfinite(low) else "-kMaxGain",
+            "highest": float_literal(float(high)) if math.isfinite(high) else "kMaxGain",
         }
         if ranges and bounds.items() <= ranges[-1].items():
             ranges[-1]["count"] += len(row.codes)

@@ -378,7 +378,7 @@ struct Torque {
 {
 	settle(state, 1, 0);
 
-	for (float rate : input.rates_setpoint) {
+	for (const float rate : input.rates_setpoint) {
 		if (!within(rate, kMaxRate)) { return false; }
 	}
 
@@ -410,12 +410,10 @@ struct Torque {
 #pragma GCC unroll 3
 	for (int i = 0; i < kAxes; i++) {
 		const float before = state.rates[i];
-		float rate = input.rates[i];
+		const bool invalid = !within(input.rates[i], kMaxRate);
+		const float rate = invalid ? before : input.rates[i];
 
-		if (unlikely(!within(rate, kMaxRate))) {
-			missing |= kRateFault << i;
-			rate = before;
-		}
+		if (invalid) { missing |= kRateFault << i; }
 
 		state.derivative[i] = state.gains.derivative_pole * state.derivative[i] + state.derivative_gain * (rate - before);
 		state.rates[i] = rate;
