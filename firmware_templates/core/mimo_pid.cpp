@@ -343,11 +343,11 @@ struct Torque {
 		return;
 	}
 
-	const float step = (along < 0.0F ? -angle : angle) / distance;
+	const float share = (along < 0.0F ? -angle : angle) / distance;
 	square = 0.0F;
 
 	for (int i = 0; i < 4; i++) {
-		across[i] = q[i] + step * across[i];
+		across[i] = q[i] + share * across[i];
 		square += across[i] * across[i];
 	}
 
@@ -378,8 +378,8 @@ struct Torque {
 {
 	settle(state, 1, 0);
 
-	for (const float rate : input.rates_setpoint) {
-		if (!within(rate, kMaxRate)) { return false; }
+	for (int i = 0; i < kAxes; i++) {
+		if (!within(input.rates_setpoint[i], kMaxRate)) { return false; }
 	}
 
 	for (int i = 0; i < kAxes; i++) { state.flown.rates[i] = input.rates_setpoint[i]; }
