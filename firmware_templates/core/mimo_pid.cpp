@@ -155,7 +155,8 @@ struct Quaternion {
 	};
 }
 
-// Attitude controller. The attitude model moves one period ahead. Sets the flown rate setpoint, and the acceleration of the attitude model in body axes.
+// Attitude controller. The attitude model moves one period ahead. Sets the flown rate setpoint, and the acceleration of
+// the attitude model in body axes.
 // In rate mode, r_i is given.
 [[gnu::noinline]] void outer_loop(State &state)
 {
