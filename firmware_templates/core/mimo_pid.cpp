@@ -158,7 +158,8 @@ struct Quaternion {
 	};
 }
 
-// Attitude controller. The attitude model moves one period ahead. Sets the flown rate setpoint, and the acceleration of the attitude model in body axes.
+// Attitude controller. The attitude model moves one period ahead. Sets the flown rate setpoint, and the acceleration of
+// the attitude model in body axes.
 // In rate mode, r_i is given.
 [[gnu::noinline]] void outer_loop(State &state)
 {
@@ -414,12 +415,10 @@ struct Torque {
 
 	for (int i = 0; i < kAxes; i++) {
 		const float before = state.rates[i];
-		float rate = input.rates[i];
+		const bool invalid = !within(input.rates[i], kMaxRate);
+		const float rate = invalid ? before : input.rates[i];
 
-		if (unlikely(!within(rate, kMaxRate))) {
-			missing |= kRateFault << i;
-			rate = before;
-		}
+		if (invalid) { missing |= kRateFault << i; }
 
 		state.derivative[i] = state.gains.derivative_pole * state.derivative[i] + state.derivative_gain * (rate - before);
 		state.rates[i] = rate;
