@@ -31,6 +31,8 @@ class Experiment:
         Measured body rates and measured roll and pitch angle.
     u_bar : (N, 2) array or None
         Injected excitation, part of u. None: not logged.
+    r_bar : (N, 2) array or None, rad/s
+        Excitation injected into the rate setpoint, part of r_i: PX4's own autotune. None: not logged.
     r_o, r_i : (N, 2) arrays or None, rad, rad/s
         Attitude and rate setpoints. None: not logged.
     segments : tuple of (start, stop)
@@ -57,6 +59,7 @@ class Experiment:
     y_i: Signal
     y_o: Signal
     u_bar: Signal | None = None
+    r_bar: Signal | None = None
     r_o: Signal | None = None
     r_i: Signal | None = None
     segments: tuple[tuple[int, int], ...] = ()
@@ -70,7 +73,7 @@ class Experiment:
     def __post_init__(self) -> None:
         if not self.segments:
             object.__setattr__(self, "segments", ((0, len(self.u)),))
-        for name in ("u", "y_i", "y_o", "u_bar", "r_o", "r_i"):
+        for name in ("u", "y_i", "y_o", "u_bar", "r_bar", "r_o", "r_i"):
             signal = getattr(self, name)
             if signal is None:
                 continue
@@ -93,19 +96,20 @@ class Experiment:
 
 
 def external_signal(experiment: Experiment) -> tuple[Signal, str]:
-    """External signal, (N, 2), and its name: the injected torque, else the attitude setpoint (rad).
+    """External signal, (N, 2), and its name: injected torque, else injected rate setpoint, else attitude setpoint.
 
     Raises
     ------
     TuningError
         When neither is logged and varies.
     """
-    for name in ("u_bar", "r_o"):
+    for name in ("u_bar", "r_bar", "r_o"):
         signal = getattr(experiment, name)
         if signal is not None and any(np.ptp(signal[start:stop]) > 0 for start, stop in experiment.segments):
             return signal, name
     raise TuningError(
-        f"{experiment.source}: no excitation: neither an injected torque nor a varying attitude setpoint is logged; "
+        f"{experiment.source}: no excitation: no injected torque or rate setpoint and no varying attitude setpoint is "
+        "logged; "
         "fly an experiment with a torque injected on roll, then on pitch"
     )
 

@@ -17,6 +17,8 @@ MAX_GAIN_ABOVE_BAND = 0.5
 #: Largest sensitivity at the band's lower end, below which the vehicle is the fitted rigid body: most frequencies at
 #: which the loop amplifies must be measured. Of 40 random vehicles in gusts none was unstable or above Ms 1.8 with it.
 MAX_SENSITIVITY_BELOW_BAND = 1.5
+#: Least gain of the loop there: a band that begins above the crossover says nothing about the margins.
+MIN_GAIN_AT_BAND_START = 1.0
 #: Above the frequency where the loop first falls below the limit, noise may exceed it up to this ratio of frequencies.
 CROSSOVER_NOISE_RATIO = 1.25
 #: A gain whose error is below this share of it counts as measured, whatever the coherence.
@@ -49,6 +51,12 @@ def reason_beyond_band(gains: Gains, known: PlantResponse, gain_above: float) ->
         return (
             f"excitation ends at {known.omega[-1]:.0f} rad/s, where the whole cascade's gain may still reach 1: "
             "excite a wider band"
+        )
+    weakest = loop_at_band_start(gains, known)
+    if weakest < MIN_GAIN_AT_BAND_START:
+        return (
+            f"excitation begins at {known.omega[0]:.1f} rad/s, where the loop's gain is {weakest:.2g} in its weakest "
+            f"direction (at least {MIN_GAIN_AT_BAND_START:g}): the crossover is not measured; excite lower frequencies"
         )
     remaining = sensitivity_at_band_start(gains, known)
     if remaining > MAX_SENSITIVITY_BELOW_BAND:
@@ -96,6 +104,11 @@ def attitude_gain_above(gains: Gains, plant: PlantResponse) -> float:
 def sensitivity_at_band_start(gains: Gains, known: PlantResponse) -> float:
     """The sensitivity's largest singular value at the lowest frequency of the band."""
     return margins.peak(margins.sensitivity(cascade_loop(gains, known.at(np.array([0])))))
+
+
+def loop_at_band_start(gains: Gains, known: PlantResponse) -> float:
+    """The loop's smallest singular value at the lowest frequency of the band."""
+    return float(np.linalg.svd(cascade_loop(gains, known.at(np.array([0]))).L_u, compute_uv=False).min())
 
 
 def find_structural_mode(gains: Gains, plant: PlantResponse) -> tuple[float, float] | None:

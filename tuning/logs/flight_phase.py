@@ -50,7 +50,7 @@ def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str,
         raise TuningError(
             f"{source}: no flight: according to {recording.evidence} the vehicle never left the ground; record a flight"
         )
-    marked = _marked(recording.signals.get("u_bar"))
+    marked = _marked(recording.signals.get("u_bar") or recording.signals.get("r_bar"))
     warnings: list[str] = []
     parts: tuple[Interval, ...] = (marked,) if marked else ((-np.inf, np.inf),)
     if airborne:

@@ -15,6 +15,7 @@ _NAMES = {
     "y_i": ("rates y_i", "deg/s", 180 / math.pi),
     "y_o": ("angles y_o", "deg", 180 / math.pi),
     "u_bar": ("injected u_bar", "", 1.0),
+    "r_bar": ("injected rate r_bar", "deg/s", 180 / math.pi),
     "r_o": ("attitude setpoint r_o", "deg", 180 / math.pi),
     "r_i": ("rate setpoint r_i", "deg/s", 180 / math.pi),
 }

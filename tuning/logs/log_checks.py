@@ -21,7 +21,7 @@ from mimopilot.tuning.logs.signal_relations import (
     SignalRelation,
     classify,
     faulty_signals,
-    injected_in_torque,
+    injected_in,
     measure_kinematics,
 )
 from mimopilot.tuning.parameter_row import ROLL_PITCH
@@ -70,8 +70,9 @@ def check_log(experiment: Experiment, recording: Recording) -> None:
     try:
         external, name = external_signal(experiment)
         excited_stretches(experiment, external, "mimo")
-        injected = injected_in_torque(experiment) if name == "u_bar" else None
+        injected = injected_in(experiment.u, external, experiment.segments) if name == "u_bar" else None
         _check_contained(injected, names)
+        _check_rate_injection(experiment, names)
         body = rigid_body(measured_plant(experiment))
     except TuningError as error:
         # Without enough excitation only rates and angles can be compared.
@@ -97,6 +98,19 @@ def _check_contained(injected: Matrix | None, names: SignalNames) -> None:
         raise TuningError(
             f"{names.path}: {names.of('u')} does not contain the torque injected on {axis} "
             f"({shares.min():.2f} of it, expected 1): log the torque after the injection, at the same rate"
+        )
+
+
+def _check_rate_injection(experiment: Experiment, names: SignalNames) -> None:
+    """Check that the rate setpoint contains what was injected into it."""
+    if experiment.r_bar is None or experiment.r_i is None:
+        return
+    shares = np.diag(injected_in(experiment.r_i, experiment.r_bar, experiment.segments))
+    if shares.min() < CONTAINED:
+        axis = ROLL_PITCH[int(np.argmin(shares))]
+        raise TuningError(
+            f"{names.path}: {names.of('r_i')} does not contain the rate injected on {axis}, {names.of('r_bar')} "
+            f"({shares.min():.2f} of it, expected 1): log both, and the torque, at full rate"
         )
 
 

@@ -16,8 +16,9 @@ from mimopilot.tuning.logs.resample import REQUIRED, Interval, Series, monotone
 
 #: Largest plausible magnitude of a signal: torque (normalised), rad/s, rad. Gyros saturate at 35 rad/s (2000 deg/s).
 #: y_o in degrees passes here, so that `check_angles` can name the wrong unit.
-RANGES = {"u": 5.0, "u_bar": 5.0, "y_i": 100.0, "r_i": 100.0, "y_o": 400.0, "r_o": 2 * np.pi}
-UNITS = dict.fromkeys(("u", "u_bar"), "a torque as a fraction of full torque") | dict.fromkeys(("y_i", "r_i"), "rad/s")
+RANGES = {"u": 5.0, "u_bar": 5.0, "y_i": 100.0, "r_i": 100.0, "r_bar": 100.0, "y_o": 400.0, "r_o": 2 * np.pi}
+UNITS = dict.fromkeys(("u", "u_bar"), "a torque as a fraction of full torque")
+UNITS |= dict.fromkeys(("y_i", "r_i", "r_bar"), "rad/s")
 UNITS |= dict.fromkeys(("y_o", "r_o"), "rad")
 MAX_LISTED = 100  # names in one message: a PX4 log at the default profile has fewer topics
 #: Prefixes of parameters of PX4, ArduPilot and our module that change the loop: gains, filters, motors.

@@ -22,7 +22,7 @@ MAX_EMPTY = 20  # grid points per sample; more means a damaged time stamp
 #: Signals that every log must hold, all at `MIN_RATE` or more.
 REQUIRED = ("u", "y_i", "y_o")
 #: Signals held between samples; the others are interpolated.
-HELD = ("u", "u_bar", "r_o", "r_i")
+HELD = ("u", "u_bar", "r_bar", "r_o", "r_i")
 
 Interval = tuple[float, float]
 

@@ -85,14 +85,21 @@ def measure_kinematics(experiment: Experiment) -> Kinematics:
     return Kinematics(matrix, explained, moves)
 
 
-def injected_in_torque(experiment: Experiment) -> Matrix:
-    """Gain from steps of the injected torque to steps of the torque, (2, 2): the identity in a correct log."""
-    assert experiment.u_bar is not None
+def injected_in(total: Signal, injected: Signal, segments: tuple[tuple[int, int], ...]) -> Matrix:
+    """Gain from steps of what is injected to steps of the whole, (2, 2): the identity in a correct log.
+
+    Parameters
+    ----------
+    total, injected : (N, 2) arrays
+        Torque and the injected torque, or the same of the rate setpoint.
+    segments : tuple of (start, stop)
+        Stretches without a gap.
+    """
     found = []
     for lag in range(-MAX_LAG, MAX_LAG + 1):
         outer, inner = np.zeros((2, 2)), np.zeros((2, 2))
-        for start, stop in experiment.segments:
-            u, w = np.diff(experiment.u[start:stop], axis=0), np.diff(experiment.u_bar[start:stop], axis=0)
+        for start, stop in segments:
+            u, w = np.diff(total[start:stop], axis=0), np.diff(injected[start:stop], axis=0)
             u, w = (u[lag:], w[: len(w) - lag]) if lag >= 0 else (u[:lag], w[-lag:])
             outer += u.T @ w
             inner += w.T @ w

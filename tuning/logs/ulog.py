@@ -27,6 +27,7 @@ LAYOUTS = {
         ("vehicle_attitude_setpoint", ("roll_body", "pitch_body")),
     ),
     "r_i": (("vehicle_rates_setpoint", ("roll", "pitch")),),
+    "r_bar": (("autotune_attitude_control_status", ("rate_sp[0]", "rate_sp[1]")),),
 }
 EXCITATION_TOPIC, EXCITATION_NAME = "debug_vect", "MIMO_EXC"
 #: Upward thrust, newest PX4 first: (topic, field, sign).
@@ -72,7 +73,7 @@ def record_ulog(path: Path) -> Recording:
             excitation = _zero_when_silent(excitation, log.published(signals["u"].topic)[0])
         signals["u_bar"] = excitation
     published = {}
-    for signal in ("r_o", "r_i", "u_bar"):
+    for signal in ("r_o", "r_i", "r_bar", "u_bar"):
         if signal in signals and not log.is_sampled(signals[signal].topic) and "u" in signals:
             published[signal] = signals[signal].time
             signals[signal] = _at_cycle(signals[signal], log.published(signals["u"].topic))

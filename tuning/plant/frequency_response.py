@@ -95,7 +95,7 @@ class PlantResponse:
         return error
 
     def known_run(self) -> NDArray[np.intp]:
-        """Indices of the longest band of known frequencies; gaps up to `HOLE` do not end it.
+        """Indices of the widest band, in octaves, of known frequencies; gaps up to `HOLE` do not end it.
 
         It begins where the error is small. Below, the closed loop rejects most of the excitation from the torque:
         the rates are still coherent, but nonlinear effects dominate.
@@ -105,7 +105,8 @@ class PlantResponse:
         if not len(indices):
             return indices
         far = self.omega[indices[1:]] > HOLE * self.omega[indices[:-1]] + 2 * (self.omega[1] - self.omega[0])
-        return max(np.split(indices, np.flatnonzero(far) + 1), key=len)
+        runs = np.split(indices, np.flatnonzero(far) + 1)
+        return max(runs, key=lambda run: float(self.omega[run[-1]] / self.omega[run[0]]))
 
     def band(self, axis: int) -> tuple[float, float] | None:
         """First and last frequency (rad/s) with a coherent rate of an axis; None when there is none."""

@@ -138,3 +138,24 @@ def test_a_structural_mode_is_not_certified_and_a_remedy_is_given():
     assert found.verdict == Verdict.NOT_CERTIFIED
     assert "at 157 rad/s (25 Hz) the loop's gain may reach 0.60 again" in found.reason
     assert "a mode of the frame" in found.reason
+
+
+def test_a_band_that_begins_above_the_crossover_says_nothing_about_the_margins():
+    """The loop is 15 / s and more slowly that of the attitude; at 45 rad/s the sensitivity is below its limit there."""
+    gains = plain()
+    found = certify(gains, integrating(grid(120.0, start=45.0, step=1.01)), *MODELS)
+    assert found.verdict == Verdict.NOT_CERTIFIED
+    assert "excitation begins at 45.0 rad/s, where the loop's gain is 0.33 in its weakest direction" in found.reason
+    assert "the crossover is not measured" in found.reason
+
+
+def test_the_widest_band_in_octaves_is_the_known_one_whatever_the_number_of_its_frequencies():
+    """Two octaves of ten frequencies against a tenth of an octave of a hundred."""
+    wide, dense = np.geomspace(5.0, 20.0, 10), np.linspace(600.0, 640.0, 100)
+    plant = integrating(np.concatenate([wide, [100.0], dense]))
+    coherence = plant.coherence.copy()
+    coherence[10] = 0.0
+    reach = plant.reach.copy()
+    reach[10] *= 1e9
+    known = dataclasses.replace(plant, coherence=coherence, reach=reach).known_run()
+    assert known.tolist() == list(range(10))
