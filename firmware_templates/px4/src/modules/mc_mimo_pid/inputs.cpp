@@ -1,7 +1,6 @@
 // What the module reads from PX4's topics in each sample.
 #include <drivers/drv_hrt.h>
 #include <float.h>
-#include <math.h>
 #include <string.h>
 
 #include "attitude.hpp"
@@ -96,10 +95,8 @@ void McMimoPid::update_setpoint()
 	const bool external_rates = rate_mode && !_control_mode.flag_control_manual_enabled;
 	_input.rate_mode = rate_mode ? 1 : 0;
 
-	// Unknown until the other program's first message: the controller then holds the last rate setpoint for a moment.
-	if (external_rates && !_external_rates) {
-		for (float &rate : _input.rates_setpoint) { rate = NAN; }
-	}
+	// Until the other program's first message.
+	if (external_rates && !_external_rates) { memset(_input.rates_setpoint, 0, sizeof(_input.rates_setpoint)); }
 
 	_external_rates = external_rates;
 
