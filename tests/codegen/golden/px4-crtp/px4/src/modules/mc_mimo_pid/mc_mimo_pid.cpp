@@ -105,7 +105,7 @@ void McMimoPid::Run()
 		_arming_check.unregister();
 		release();
 
-		if (_hand_over.replaces()) { command_stock_controllers(true); }
+		if (_hand_over.replaces()) { command_stock_controllers(StockCommand::Start); }
 
 		exit_and_cleanup();
 		return;
@@ -197,6 +197,7 @@ bool McMimoPid::flies(hrt_abstime now)
 	conditions.faulty = _output.fault != 0 && _control_mode.flag_armed && !_on_ground;
 	conditions.busy = stock_controllers_busy();
 	conditions.torque_free = !_vehicle_torque_setpoint_sub.advertised();
+	conditions.manual_thrust = flown_by_sticks() && _input.rate_mode == 0 && _control_mode.flag_armed && !_landed;
 	const HandOver::Action action = _hand_over.step(now, conditions);
 
 	if (action == HandOver::Action::StartStock) {
@@ -204,7 +205,15 @@ bool McMimoPid::flies(hrt_abstime now)
 		release();
 	}
 
-	if (action != HandOver::Action::None) { command_stock_controllers(action == HandOver::Action::StartStock); }
+	switch (action) {
+	case HandOver::Action::StopStock: command_stock_controllers(StockCommand::Stop); break;
+
+	case HandOver::Action::StartAttitude: command_stock_controllers(StockCommand::StartAttitude); break;
+
+	case HandOver::Action::StartStock: command_stock_controllers(StockCommand::Start); break;
+
+	default: break;
+	}
 
 	if (_hand_over.flies() && !flew) {
 		notice("MIMO flies");
