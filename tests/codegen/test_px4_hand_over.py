@@ -98,6 +98,23 @@ def test_stop_in_the_air_hands_back(program):
     assert result.ticks[-2:] == [False, False]
 
 
+@pytest.mark.parametrize(("mode", "ahead"), [("mode 1 1 0 1 15", True), ("mode 1 1 0 0 10", False)])
+def test_by_sticks_the_attitude_controller_starts_ahead_because_it_ramps_its_thrust(program, mode, ahead):
+    flight = [*AIRBORNE, mode, "sticks 1 0 0 0 0", STEP, *SECOND]
+    result = drive(program, [*flight, "param MIMO_EN 0", *SECOND, *[STEP] * 700])
+    assert lines(result, "stock") == [*STOPPED, *(reversed(STARTED) if ahead else STARTED)]
+    flown = len(result.out) - 250
+    assert flown - (550 if ahead else 0) <= 250
+    assert (flown >= 550) == ahead and not result.ticks[-1]
+
+
+def test_a_change_of_mind_stops_the_attitude_controller_again(program):
+    flight = [*AIRBORNE, "mode 1 1 0 1 15", "sticks 1 0 0 0 0", STEP, *SECOND]
+    result = drive(program, [*flight, "param MIMO_EN 0", *SECOND, "param MIMO_EN 1", *SECOND, *SECOND, *SECOND, *SECOND])
+    assert lines(result, "stock") == [*STOPPED, STARTED[1], *STOPPED]
+    assert all(result.ticks[2:])
+
+
 def test_from_stock_the_torque_does_not_jump_and_what_is_missing_fades(program):
     gains = coupled_gains()
     elements = [f"param MIMO_{code} {text(value)}" for code, value in gains.elements().items() if code != "TS"]

@@ -244,7 +244,7 @@ def test_the_parts_of_the_torque_are_published_fifty_times_a_second(program):
     tilted = f"setpoint {text(*quaternion(0.1, -0.2, 0.3), 0, 0, 0, -0.5)}"
     rng = np.random.default_rng(5)
     turning = [f"gyro 4000 {text(*(rng.normal(size=3) * 0.3))}" for _ in range(500)]
-    result = drive(program, [*elements, "param MC_YAW_TQ_CUTOFF 0", *AIRBORNE, tilted, STEP, *turning])
+    result = drive(program, [*elements, "param MC_YAW_TQ_CUTOFF 0", *AIRBORNE, STEP, tilted, *turning])
     lines = [line.split()[1:] for line in result.other if line.startswith("MIMO_PID")]
     parts = np.array([[int(word, 16) for word in words] for words in lines], np.uint32).view(np.float32)
     parts = parts.reshape(-1, 5, 3)  # proportional, integral, derivative, feed-forward, cross-axis

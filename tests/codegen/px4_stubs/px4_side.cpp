@@ -258,7 +258,7 @@ int px4_task_spawn_cmd(const char *name, int, int, int, px4_main_t entry, char *
 {
 	Task task{entry, {name}};
 
-	for (int i = 0; argv[i] != nullptr; i++) { task.arguments.push_back(argv[i]); }
+	for (int i = 0; argv != nullptr && argv[i] != nullptr; i++) { task.arguments.push_back(argv[i]); }
 
 	tasks.push_back(task);
 	return 1;

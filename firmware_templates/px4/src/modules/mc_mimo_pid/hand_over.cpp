@@ -12,9 +12,25 @@ HandOver::Action HandOver::step(uint64_t now, const Conditions &conditions)
 
 		_gave_up = _gave_up || now > _valid + kFaultTime;
 
-		if ((conditions.wanted && !_gave_up) || conditions.busy) { return Action::None; }
+		if (conditions.busy) { return Action::None; }
+
+		if (conditions.wanted && !_gave_up) {
+			const bool started = _ramp != 0;
+			_ramp = 0;
+			return started ? Action::StopStock : Action::None;
+		}
+
+		if (conditions.manual_thrust && !_gave_up) {
+			if (_ramp == 0) {
+				_ramp = now;
+				return Action::StartAttitude;
+			}
+
+			if (now < _ramp + kRampTime) { return Action::None; }
+		}
 
 		_flies = _replaces = false;
+		_ramp = 0;
 		return Action::StartStock;
 	}
 

@@ -11,8 +11,9 @@ class HandOver
 public:
 	enum class Action : uint8_t {
 		None,
-		StopStock,   // stop PX4's own controllers
-		StartStock,  // start them; this module no longer publishes
+		StopStock,      // stop PX4's own controllers
+		StartAttitude,  // start the attitude controller alone, whose manual thrust starts from zero
+		StartStock,     // start them; this module no longer publishes
 	};
 
 	struct Conditions {
@@ -21,6 +22,7 @@ public:
 		bool faulty;     // in the air with an invalid input
 		bool busy;       // PX4's own controllers are just being stopped or started
 		bool torque_free;  // nobody else advertises the torque
+		bool manual_thrust;  // in the air by sticks
 	};
 
 	// Once a sample; `now` in us. The module publishes torque if it flies() afterwards.
@@ -36,6 +38,7 @@ public:
 
 private:
 	static constexpr uint64_t kFaultTime = 500000;  // us
+	static constexpr uint64_t kRampTime = 2200000;  // us; mc_att_control raises its manual thrust by 50 % a second
 	static constexpr int kFreeSamples = 2;
 	static constexpr int kPatience = 250;           // samples until PX4's controllers are stopped again
 
@@ -43,6 +46,7 @@ private:
 	bool _gave_up{false};
 	bool _replaces{false};  // PX4's own controllers were stopped for this module
 	uint64_t _valid{0};     // us, when the inputs were last valid
+	uint64_t _ramp{0};      // us, when the attitude controller was started ahead; 0: it was not
 	bool _published{false}; // they advertised the torque when they were told to stop
 	int _free{0};           // samples since the topic is free
 	int _waited{0};

@@ -2,6 +2,7 @@
 
 #include <px4_platform_common/atomic.h>
 #include <px4_platform_common/tasks.h>
+#include <string.h>
 
 // The commands of PX4's shell with these names.
 extern "C" int mc_att_control_main(int argc, char *argv[]);
@@ -14,38 +15,51 @@ namespace
 {
 
 px4::atomic<bool> busy{false};
-char start[] = "start";
-char stop[] = "stop";
+px4::atomic<StockCommand> wanted{StockCommand::Stop};
+bool attitude_started = false;  // alone, before the rate controller
+
+void call(int (&entry)(int, char *[]), const char *what)
+{
+	char name[] = "stock";
+	char argument[8];
+	strncpy(argument, what, sizeof(argument));
+	char *arguments[] = {name, argument, nullptr};
+	entry(2, arguments);
+}
 
 // The torque is given up last and taken first, so that the gap without it is the shortest.
-int command(int argc, char *argv[])
+int execute(int, char *[])
 {
-	const bool run = argc > 1 && argv[1][2] == 'a';  // start, not stop
-	char name[] = "stock";
-	char *arguments[] = {name, run ? start : stop, nullptr};
-	(run ? mc_rate_control_main : mc_att_control_main)(2, arguments);
-	(run ? mc_att_control_main : mc_rate_control_main)(2, arguments);
+	const StockCommand command = wanted.load();
+
+	if (command == StockCommand::Stop) {
+		call(mc_att_control_main, "stop");
+		call(mc_rate_control_main, "stop");
+
+	} else {
+		if (command == StockCommand::Start) { call(mc_rate_control_main, "start"); }
+
+		if (!attitude_started) { call(mc_att_control_main, "start"); }
+	}
+
+	attitude_started = command == StockCommand::StartAttitude;
 	busy.store(false);
 	return 0;
 }
 
 }  // namespace
 
-void command_stock_controllers(bool run)
+void command_stock_controllers(StockCommand command)
 {
 	constexpr int kStack = 2400;  // bytes, as PX4's shell commands have
-	char *arguments[] = {run ? start : stop, nullptr};
+	wanted.store(command);
 	busy.store(true);
 
-	if (px4_task_spawn_cmd("mimo_stock", SCHED_DEFAULT, SCHED_PRIORITY_ATTITUDE_CONTROL, kStack, command, arguments) < 0) {
+	if (px4_task_spawn_cmd("mimo_stock", SCHED_DEFAULT, SCHED_PRIORITY_ATTITUDE_CONTROL, kStack, execute, nullptr) < 0) {
 		busy.store(false);
 
 		// Somebody must fly.
-		if (run) {
-			char name[] = "mimo_stock";
-			char *here[] = {name, start, nullptr};
-			command(2, here);
-		}
+		if (command == StockCommand::Start) { execute(0, nullptr); }
 	}
 }
 
