@@ -110,7 +110,9 @@ def test_by_sticks_the_attitude_controller_starts_ahead_because_it_ramps_its_thr
 
 def test_a_change_of_mind_stops_the_attitude_controller_again(program):
     flight = [*AIRBORNE, "mode 1 1 0 1 15", "sticks 1 0 0 0 0", STEP, *SECOND]
-    result = drive(program, [*flight, "param MIMO_EN 0", *SECOND, "param MIMO_EN 1", *SECOND, *SECOND, *SECOND, *SECOND])
+    result = drive(
+        program, [*flight, "param MIMO_EN 0", *SECOND, "param MIMO_EN 1", *SECOND, *SECOND, *SECOND, *SECOND]
+    )
     assert lines(result, "stock") == [*STOPPED, STARTED[1], *STOPPED]
     assert all(result.ticks[2:])
 

@@ -1,7 +1,7 @@
 """The gains that flew, from the vehicle's parameters.
 
-This controller's (``MIMO_``), else those of PX4 (``MC_``) or ArduPilot (``ATC_``). Logs with ``MIMO_EN`` 0 were flown by
-the latter.
+This controller's (``MIMO_``), else those of PX4 (``MC_``) or ArduPilot (``ATC_``). With ``MIMO_EN`` 0 the
+latter flew.
 """
 
 from __future__ import annotations
