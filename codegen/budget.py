@@ -213,7 +213,7 @@ def processor_in_the_loop(
         return [
             BudgetItem("rows", "rows", rows),
             BudgetItem("rows_different", "rows that differ from the host", different_rows(outputs, expected), 0),
-            *_time_items(step_costs(image, periods), *_step_limits(gains)),
+            *_time_items(step_costs(image, periods), gains.Ts, *_step_limits(gains)),
             *_size_items(image),
         ]
 
@@ -230,7 +230,7 @@ def different_rows(a: NDArray[Any], b: NDArray[Any]) -> int:
     return int((a.view(np.uint8) != b.view(np.uint8)).reshape(len(a), -1).any(axis=1).sum())
 
 
-def _time_items(costs: NDArray[np.int64], max_instructions: int, max_share: float) -> list[BudgetItem]:
+def _time_items(costs: NDArray[np.int64], Ts: float, max_instructions: int, max_share: float) -> list[BudgetItem]:
     instructions, lower, upper = costs.T
     most = int(upper.max())
     return [
@@ -242,6 +242,7 @@ def _time_items(costs: NDArray[np.int64], max_instructions: int, max_share: floa
         BudgetItem("microseconds_lower", "the same at 168 MHz, us, lower estimate", float(lower.max() / CLOCK * 1e6)),
         BudgetItem("microseconds_upper", "the same at 168 MHz, us, upper estimate", most / CLOCK * 1e6),
         BudgetItem("budget_share", "share of 4 ms, upper estimate", most / CLOCK / PERIOD, max_share),
+        BudgetItem("period_share", f"share of the gains' period, {1e3 * Ts:g} ms, upper estimate", most / CLOCK / Ts),
     ]
 
 

@@ -31,6 +31,11 @@ def check_ranges(gains: Gains) -> None:
             )
 
 
+def px4_rate(gains: Gains) -> int:
+    """The gyro rate of PX4 (Hz) that is nearest to the control rate of the gains."""
+    return min(PX4_RATES, key=lambda hertz: abs(1 / gains.Ts / hertz - 1))
+
+
 def check_px4_rate(gains: Gains) -> None:
     """Refuse gains for a control rate at which PX4's gyro does not run.
 
@@ -40,7 +45,7 @@ def check_px4_rate(gains: Gains) -> None:
         With the rate, and the nearest one that is possible.
     """
     rate = 1 / gains.Ts
-    nearest = min(PX4_RATES, key=lambda hertz: abs(rate / hertz - 1))
+    nearest = px4_rate(gains)
     if abs(rate / nearest - 1) > PX4_RATE_TOLERANCE:
         raise TuningError(
             f"Ts: the gains are for {rate:.4g} Hz, but the PX4 module runs at the gyro's rate, IMU_GYRO_RATEMAX "

@@ -1,7 +1,8 @@
 // Cascaded P + PID attitude controller with full 2x2 gains for roll and pitch and scalar gains for yaw.
 //
 //   q_e    = conj(q(k)) q_d(k)                           attitude error: a tilt, then a turn about z
-//   e_o    = 2 imag of q_e, its turn scaled by the yaw weight, as PX4 does; e_o(z) divided by the weight
+//   e_o    = 2 imag of q_e, its turn scaled by the yaw weight, as PX4 does; e_o(z) divided by the weight. The scaled
+//            turn is interpolated between none and the whole: within 0.5 degrees of PX4's for turns up to 90 degrees
 //   r_i(k) = sat_rate( Kp_o e_o(k) + R(q)' (0, 0, yaw_rate_setpoint) )
 //   e(k)   = r_i(k) - y_i(k)
 //   d(k)   = a d(k-1) + (1-a) (y_i(k) - y_i(k-1)) / Ts

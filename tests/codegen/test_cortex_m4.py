@@ -131,6 +131,7 @@ def test_the_controllers_of_the_airframes_are_within_budget(name, following, ins
     }
     assert 200 < figures["instructions_mean"].value <= figures["instructions_max"].value
     assert figures["cycles_lower"].value > figures["instructions_max"].value
+    assert figures["period_share"].value == pytest.approx(figures["budget_share"].value * 0.004 / gains.Ts)
     assert figures["budget_share"].value == pytest.approx(figures["cycles_upper"].value / 168e6 / 0.004)
 
 

@@ -1,6 +1,6 @@
 """The gains that flew, from the vehicle's parameters.
 
-This controller's (``MIMO_``), else those of PX4 (``MC_``) or ArduPilot (``ATC_``). With ``MIMO_EN`` 0 the
+This controller's (``MIMO_``), else those of PX4 (``MC_``) or ArduPilot (``ATC_``). With ``MIMO_EN`` 0 in the log, the
 latter flew.
 """
 

@@ -97,6 +97,7 @@ def _px4_stock(gains: Gains) -> UploadPlan:
             ParameterWrite(f"MC_{name[0]}R_INT_LIM", "norm", gains.limits.integral_max[axis], 0.0, 1.0),
             ParameterWrite(f"MC_{name}RATE_MAX", "deg/s", limit, 0.0, 1800.0),
         ]
+    settings.append(ParameterWrite("MC_YAW_WEIGHT", "norm", gains.filters.yaw_weight, 0.0, 1.0))
     settings.append(ParameterWrite("IMU_DGYRO_CUTOFF", "Hz", gains.derivative_cutoff_hz, 0.0, 1000.0))
     notes = ("PX4 integrates less when the rate error is large, and MC_YAW_TQ_CUTOFF filters yaw; neither is set",)
     return UploadPlan(tuple(settings), {}, (), {}, notes)
