@@ -17,7 +17,7 @@ LEVEL = "attitude 1 0 0 0 0 1 0 0 0"
 START = ["gyro 0 0 0 0", "start", LEVEL, "land 0 0"]
 BY_STICKS = f"mode 1 1 0 1 {STABILIZED}"
 BY_RATE_STICKS = f"mode 1 1 0 0 {ACRO}"
-BY_RATES = f"mode 1 0 0 0 {OFFBOARD}"
+BY_RATES = f"mode 1 0 0 0 {OFFBOARD} 1"
 LEVEL_SETPOINT = "setpoint 1 0 0 0 0 0 0 -0.5"
 TILTED = "setpoint 0.995 0.0998749 0 0 0 0 0 -0.5"
 STEP = "gyro 4000 0 0 0"
@@ -263,6 +263,14 @@ def off_board(program, *commands):
     return drive(program, [*parameters({"MC_YAW_TQ_CUTOFF": 0.0}), *hold, BY_RATES, *commands])
 
 
+def flown_before(controller, out):
+    """The native controller after the attitude mode of `off_board`."""
+    inputs = rate_inputs(out, 0, 0)
+    inputs["rate_mode"] = 0
+    inputs["attitude"], inputs["attitude_setpoint"] = out["attitude"], out["q_d"]
+    controller.run(inputs)
+
+
 def test_off_board_rates_are_flown_with_their_thrust(program, gains):
     rng, commands, rates, wanted = np.random.default_rng(6), [], [], []
     for k in range(200):
@@ -286,12 +294,15 @@ def test_off_board_rates_are_flown_with_their_thrust(program, gains):
     assert out["torque"].tobytes() == np.ascontiguousarray(before.run(inputs)["moment"]).tobytes()
 
 
-def test_its_own_last_rate_setpoint_is_not_taken_for_an_off_board_one(program):
-    wanted = off_board(program).out["rates"][-1]
-    assert wanted[0] > 1
-    torque = off_board(program, *[STEP] * 60).out["torque"][9:, 0]
-    assert (torque[:25] > 0.1).all()  # held for 25 samples, as an invalid setpoint is
-    assert (torque[25:] == 0).all()  # the vehicle is at rest: nothing to damp
+def test_its_own_last_rate_setpoint_is_not_taken_for_an_off_board_one(program, gains):
+    out = off_board(program, *[STEP] * 60).out
+    before, out = out[:-60], out[-60:]
+    assert before["rates"][-1, 0] > 1
+    controller = NativeController(load_native(gains), gains)
+    flown_before(controller, before)
+    expected = controller.run(rate_inputs(out, 0, 0))  # no rate until the first message
+    assert out["torque"].tobytes() == np.ascontiguousarray(expected["moment"]).tobytes()
+    assert (expected["fault"] == 0).all() and (np.abs(out["torque"]) < 0.02).all()
     arrived = off_board(program, *[STEP] * 60, "rates_setpoint 0 1 0 0 0 -0.4", STEP)
     assert arrived.out["torque"][-1, 1] > 0.1
     assert arrived.out["thrust"][-1, 2] == np.float32(-0.4)
