@@ -92,6 +92,23 @@ def test_a_switch_changes_the_controllers(program, channel):
     assert "".join(".X"[tick] for tick in result.ticks[1:]) == "....." + "..XXX" + "....." + "..XXX" + "XXXXX"
 
 
+@pytest.mark.parametrize("value", [-1, 8, 99])
+def test_a_value_of_mimo_en_without_meaning_changes_nothing(program, value):
+    result = drive(program, [*AIRBORNE, STEP, *SECOND, f"param MIMO_EN {value}", "sticks 1 0 0 0 0", *SECOND, *SECOND])
+    assert lines(result, "stock") == (STOPPED if value > 0 else [*STOPPED, *STARTED])
+
+
+def test_a_change_ends_the_excitation(program):
+    excited = ["param MIMO_EX_DUR 10", "param MIMO_EX_AX 3", *SECOND, *SECOND]
+    back = ["param MIMO_EN 0", *SECOND, *SECOND, "param MIMO_EN 1", *SECOND, *SECOND, "status"]
+    result = drive(program, [*AIRBORNE, STEP, *SECOND, *excited, *back])
+    x = result.out["excitation"][:, 0]
+    change = int(np.flatnonzero(np.diff(np.array(result.ticks[1:], int)) < 0)[0])
+    assert x[change - 1] != 0 and not x[change:].any()
+    assert any("on the ground or disarmed" in line or "stopped: mode" in line for line in result.log)
+    assert lines(result, "excitation ended") == ["excitation ended 0 0 -1"]
+
+
 def test_stop_in_the_air_hands_back(program):
     result = drive(program, [*AIRBORNE, STEP, STEP, "stop", STEP, STEP])
     assert lines(result, "stock") == [*STOPPED, *STARTED]
@@ -110,7 +127,9 @@ def test_by_sticks_the_attitude_controller_starts_ahead_because_it_ramps_its_thr
 
 def test_a_change_of_mind_stops_the_attitude_controller_again(program):
     flight = [*AIRBORNE, "mode 1 1 0 1 15", "sticks 1 0 0 0 0", STEP, *SECOND]
-    result = drive(program, [*flight, "param MIMO_EN 0", *SECOND, "param MIMO_EN 1", *SECOND, *SECOND, *SECOND, *SECOND])
+    result = drive(
+        program, [*flight, "param MIMO_EN 0", *SECOND, "param MIMO_EN 1", *SECOND, *SECOND, *SECOND, *SECOND]
+    )
     assert lines(result, "stock") == [*STOPPED, STARTED[1], *STOPPED]
     assert all(result.ticks[2:])
 

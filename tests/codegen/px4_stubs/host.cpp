@@ -209,6 +209,13 @@ void execute(Line &line)
 			print_published();
 
 		} else {
+			const auto excitation = last<debug_vect_s>(ORB_ID(debug_vect));
+
+			if (excitation.timestamp == now) {
+				printf("excitation ended %g %g %g\n", static_cast<double>(excitation.x), static_cast<double>(excitation.y),
+				       static_cast<double>(excitation.z));
+			}
+
 			printf("quiet\n");
 		}
 

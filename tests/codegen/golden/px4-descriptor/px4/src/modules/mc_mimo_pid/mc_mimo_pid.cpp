@@ -177,7 +177,7 @@ void McMimoPid::note_obstacle(hrt_abstime now)
 	if (enabled < 2) {
 		_wanted = enabled == 1;
 
-	} else if (_manual.valid) {
+	} else if (enabled < 8 && _manual.valid) {
 		_wanted = (&_manual.aux1)[enabled - 2] > 0.0F;
 	}
 
@@ -231,6 +231,10 @@ bool McMimoPid::flies(hrt_abstime now)
 // The torque and its status are free for PX4's own controllers; the setpoints have other publishers, too.
 void McMimoPid::release()
 {
+	// An excitation ends here, and in the log.
+	_excitation.step(ExcitationConditions{}, _excited);
+	log();
+
 	_vehicle_torque_setpoint_pub.end();
 	_vehicle_thrust_setpoint_pub.end();
 	_rate_ctrl_status_pub.end();
