@@ -186,7 +186,7 @@ def logs(
 ) -> None:
     """List the logs of a vehicle, or download one.
 
-    A download that was interrupted (Ctrl-C, a lost link, a full disk) leaves LOG.part and LOG.part.json; the same command
+    An interrupted download (Ctrl-C, a lost link, a full disk) leaves LOG.part and LOG.part.json, and the same command
     goes on. The size, and by FTP the CRC-32, must be the vehicle's. An armed vehicle is refused.
     """
     from mimopilot.sitl.errors import SitlError

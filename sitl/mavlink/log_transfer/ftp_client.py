@@ -84,6 +84,13 @@ class _Burst:
         self.over_at = now + min(max(QUIET_INTERVALS * self.interval, QUIET_S[0]), QUIET_S[1])
 
 
+def grown(name: str, before: int, now: int) -> SitlError:
+    """The error that a log has another size than before, bytes."""
+    sizes = f"has {now} bytes now, and had {before}"
+    advice = "the vehicle is still writing it; disarm it, or stop its logger"
+    return SitlError(f"{name}: {sizes}: {advice}", exit_code=1)
+
+
 class FtpClient:
     """Files of one vehicle.
 
@@ -230,8 +237,8 @@ class FtpClient:
         if reply.code:
             raise SitlError(f"{path}: the vehicle cannot open it: {reply.reason}", exit_code=1)
         held = int.from_bytes(reply.data[:4], "little")
-        if held < size:
-            raise SitlError(f"{path}: has {held} bytes, and had {size} when it was listed", exit_code=1)
+        if held != size:
+            raise grown(path, size, held)
         return reply.session
 
     def _close(self) -> Exchange[None]:

@@ -22,9 +22,12 @@ class MissingBytes:
         for start, end in sorted(ranges):
             if not 0 <= start < end or (self._ends and start < self._ends[-1]):
                 raise ValueError(f"range {start} to {end}: expected ascending ranges that do not overlap")
-            self._starts.append(start)
-            self._ends.append(end)
             self.total += end - start
+            if self._ends and start == self._ends[-1]:
+                self._ends[-1] = end
+            else:
+                self._starts.append(start)
+                self._ends.append(end)
 
     def __bool__(self) -> bool:
         return self.total > 0
@@ -35,6 +38,8 @@ class MissingBytes:
 
     def remove(self, start: int, end: int) -> int:
         """Remove the bytes from `start` to `end`; returns how many of them were missing."""
+        if start >= end:
+            return 0
         i = bisect_right(self._ends, start)
         removed = 0
         while i < len(self._starts) and self._starts[i] < end:

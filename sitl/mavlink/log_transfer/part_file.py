@@ -58,7 +58,7 @@ class PartFile:
         self.path, self.record = inside(folder, f"{name}.part"), inside(folder, f"{name}.part.json")
         self.source, self.size = source, size
         self.missing = self._load(grows) if self.path.exists() else MissingBytes([(0, size)])
-        self.resumed = size - self.missing.total
+        self.resumed = self.held
         free = shutil.disk_usage(folder).free
         if free < self.missing.total:
             raise SitlError(
@@ -123,10 +123,14 @@ class PartFile:
         self._unrecorded = 0
 
     @property
+    def held(self) -> int:
+        """Number of bytes that are there."""
+        return self.size - self.missing.total
+
+    @property
     def progress(self) -> str:
         """How much is there, for messages."""
-        held = self.size - self.missing.total
-        return f"{self.path.name} holds {held} of {self.size} bytes"
+        return f"{self.path.name} holds {self.held} of {self.size} bytes"
 
     def close(self) -> None:
         """Keep the part for another time."""

@@ -14,8 +14,8 @@ PROGRESS_S = 0.1
 #: Shortest and longest wait for an answer, s: the MAVLink guide recommends 0.05 s, a radio may hold 2 s of data.
 SHORTEST_S, LONGEST_S = 0.05, 3.0
 
-#: Waits for an answer without a new byte, from a vehicle that is heard, after which a transfer ends; chosen: at 30 % loss
-#: each way a piece is lost so often once in 10^9.
+#: Waits for an answer without a new byte, from a vehicle that is heard, after which a transfer ends; chosen: at 30 %
+#: loss each way a piece is lost so often once in 10^9.
 PATIENCE = 30
 
 
@@ -106,7 +106,7 @@ class TransferClient(VehicleLinkState):
             self._progress_at = self.now
         if self.now >= self._shown_at + PROGRESS_S or not part.missing:
             self._shown_at = self.now
-            self.progress("downloading", part.size - part.missing.total, part.size)
+            self.progress("downloading", part.held, part.size)
 
     def check_progress(self) -> None:
         """Check that the transfer goes on, on a vehicle that is not armed.

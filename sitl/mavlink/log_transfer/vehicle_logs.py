@@ -11,7 +11,7 @@ from mimopilot.common.files import inside
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import ARDUPILOT, Exchange
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import describe
-from mimopilot.sitl.mavlink.log_transfer.ftp_client import FtpClient
+from mimopilot.sitl.mavlink.log_transfer.ftp_client import FtpClient, grown
 from mimopilot.sitl.mavlink.log_transfer.log_client import LogClient
 from mimopilot.sitl.mavlink.log_transfer.part_file import PartFile, different, file_crc32
 from mimopilot.sitl.mavlink.log_transfer.transfer_client import TransferClient
@@ -24,6 +24,8 @@ SUFFIXES = (".ulg", ".bin")
 LAST_LOG = "LASTLOG.TXT"
 #: Time (s) in which a vehicle with FTP answers, even at 30 % loss each way: 8 tries; chosen.
 FTP_ANSWER_S = 6.0
+#: Pause (s) in which a log that is being written grows; chosen.
+GROWTH_S = 0.5
 #: Protocols, by their names for the user.
 PROTOCOLS = ("auto", "ftp", "log")
 #: A folder that PX4 names by the date.
@@ -249,6 +251,9 @@ class VehicleLogs:
         part = PartFile(folder, name, source, log.size, grows=bool(log.path))
         try:
             try:
+                if part.missing:  # a log that is being written is found before it is downloaded, too
+                    yield from self._pause(GROWTH_S)
+                    yield from self._check_unchanged(log)
                 if log.path:
                     yield from self.ftp.read_file(log.path, part)
                 else:
@@ -257,11 +262,15 @@ class VehicleLogs:
                 stop = self.ftp.stop() if log.path else self.log_protocol.stop()
                 yield from self.client.send_and_wait([stop], self.client.now)
                 raise
-            checksum = yield from self._check_unchanged(log)
+            yield from self._check_unchanged(log)
+            checksum = (yield from self.ftp.checksum(log.path, log.size)) if log.path else None
         except SitlError as error:
-            raise SitlError(f"{error}; {part.progress}: {AGAIN}", exit_code=1) from error
+            kept = f"; {part.progress}: {AGAIN}" if part.held else ""
+            raise SitlError(f"{error}{kept}", exit_code=1) from error
         finally:
             part.close()
+            if not part.held:
+                part.discard()
         if checksum is not None and checksum != part.checksum():
             part.discard()
             raise SitlError(
@@ -271,8 +280,13 @@ class VehicleLogs:
         written = part.finish()
         return Download(log, target, self.protocol, "size" if checksum is None else "crc32", written, part.resumed)
 
-    def _check_unchanged(self, log: VehicleLog) -> Exchange[int | None]:
-        """Check that the log has not grown meanwhile; returns its checksum on the vehicle, if that can tell."""
+    def _pause(self, seconds: float) -> Exchange[None]:
+        until = self.client.now + seconds
+        while self.client.now < until:
+            yield from self.client.receive([], until)
+
+    def _check_unchanged(self, log: VehicleLog) -> Exchange[None]:
+        """Check that the log has not grown since it was listed."""
         if log.path:
             found = yield from self.ftp.list_folder(str(PurePosixPath(log.path).parent))
             sizes = {entry.name: entry.size for entry in found} if isinstance(found, list) else {}
@@ -283,12 +297,7 @@ class VehicleLogs:
         if size is None:
             raise SitlError(f"{log.name}: the vehicle no longer lists it", exit_code=1)
         if size != log.size:
-            raise SitlError(
-                f"{log.name}: has {size} bytes now, and had {log.size}: the vehicle is still writing it; disarm it, or "
-                "stop its logger",
-                exit_code=1,
-            )
-        return (yield from self.ftp.checksum(log.path, log.size)) if log.path else None
+            raise grown(log.name, log.size, size)
 
 
 def _natural(name: str) -> list[tuple[int, str]]:

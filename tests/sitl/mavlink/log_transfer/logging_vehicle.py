@@ -1,4 +1,6 @@
-"""Vehicles with logs for the simulated link: our own server, and a scripted one with the habits and faults of others."""
+"""Vehicles with logs for the simulated link: our own server, and a scripted one with the habits and faults
+of others.
+"""
 
 import random
 import struct
@@ -81,10 +83,7 @@ class ScriptedLogs:
             return []
         if isinstance(order, FileRequest) and self.fault not in ("no ftp", "neither"):
             return [FileReply(1, 1, reply) for reply in self.ftp(order.packet)]
-        if isinstance(order, RequestLogs | RequestLogData | EndLogs) and self.fault not in (
-            "no log protocol",
-            "neither",
-        ):
+        if isinstance(order, RequestLogs | RequestLogData | EndLogs) and self.fault != "neither":
             return self.log_protocol(order)
         return []
 
@@ -115,6 +114,8 @@ class ScriptedLogs:
             return packet.reply()
         if packet.opcode == 1:
             found, self.open = self.open, None
+            if found and self.fault == "grows late":
+                self.files[found] += b"more"
             return packet.reply() if found else packet.refuse(4)
         if packet.opcode == 3:
             return self.list(packet, path)

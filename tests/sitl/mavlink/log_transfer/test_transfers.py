@@ -68,7 +68,7 @@ def test_a_log_arrives_byte_for_byte_at_30_percent_loss_each_way(vehicle, protoc
     assert (done.verified, done.written, done.resumed) == ("crc32" if protocol == "ftp" else "size", True, 0)
     assert [path.name for path in (tmp_path / "out").iterdir()] == [done.path.name]
     # 629 pieces, or 1,667: a piece for each round trip of 0.1 s would take 63 or 167 s.
-    assert run.link.time < (4 if not loss else 50)
+    assert run.link.time < (5 if not loss else 50)
 
 
 def test_logs_are_listed_by_both_protocols_with_their_sizes(tmp_path):
@@ -103,9 +103,7 @@ def test_a_log_is_named_by_the_end_of_its_path(tmp_path):
     run = Run(ScriptedLogs({**DATED, "2026-11-28/09_30_00.ulg": b"x"}))
     run.find()
     assert run(run.logs.choose("10_00_00.ulg")).name == "2026-11-28/10_00_00.ulg"
-    with pytest.raises(
-        SitlError, match="several logs have this name: 2026-11-28/09_30_00.ulg, 2026-11-29/09_30_00.ulg"
-    ):
+    with pytest.raises(SitlError, match=r"several logs have this name: 2026-11-28\S+, 2026-11-29/09"):
         run(run.logs.choose("09_30_00.ulg"))
     with pytest.raises(SitlError, match="there is no such log"):
         run(run.logs.choose("00_00.ulg"))
@@ -118,9 +116,7 @@ def test_a_download_that_is_interrupted_three_times_goes_on_where_it_was(protoco
     for share in (0.2, 0.5, 0.9):
         run = Run(vehicle, seed=3, loss=loss)
         stop_at(run, share)
-        with pytest.raises(
-            SitlError, match=r"interrupted; \S+\.ulg\.part holds \d+ of 150001 bytes: give the same"
-        ) as e:
+        with pytest.raises(SitlError, match=r"interrupted; \S+\.part holds \d+ of 150001 bytes: give") as e:
             run.download(tmp_path / "out", protocol=protocol)
         assert e.value.exit_code == 1
         assert sorted(path.suffix for path in (tmp_path / "out").iterdir()) == [".json", ".part"]
@@ -133,16 +129,17 @@ def test_a_download_that_is_interrupted_three_times_goes_on_where_it_was(protoco
 
 def test_a_lost_link_keeps_the_part(tmp_path):
     vehicle = ScriptedLogs(DATED)
-    for event in (lambda run: setattr(vehicle, "fault", "gone"), lambda run: setattr(run.link, "closed", True)):
+    for message in ("no message from the vehicle for 12 s", "the link was lost"):
         vehicle.fault = ""
         run = Run(vehicle)
-        progressed = []
-        run.client.progress = lambda *state: (
-            progressed.append(state) or (state[0] == "downloading" and len(progressed) > 2 and event(run))
-        )
-        with pytest.raises(
-            SitlError, match=r"(no message from the vehicle for 12 s|the link was lost); .*\.part holds"
-        ):
+
+        def lose(phase, done, of, run=run, message=message):
+            if phase == "downloading" and done > 0.1 * of:
+                run.link.closed = message == "the link was lost"
+                vehicle.fault = "gone"
+
+        run.client.progress = lose
+        with pytest.raises(SitlError, match=rf"{message}; \S+\.part holds"):
             run.download(tmp_path)
     vehicle.fault = ""
     done = Run(vehicle).download(tmp_path)
@@ -182,7 +179,7 @@ def test_the_same_file_is_not_downloaded_again_and_another_one_is_not_replaced(t
 
 
 FAULTS = {
-    "neither": r"no logs from the vehicle, a quadrotor with PX4: it does not answer FTP; it does not answer LOG_REQUEST",
+    "neither": "no logs from the vehicle, a quadrotor with PX4: it does not answer FTP; it does not answer LOG_REQ",
     "unreadable card": r"cannot read /logs: error 5 \(Input/output error\); it does not answer LOG_REQUEST_LIST",
     "bad sector": r"it: error 5 \(Input/output error\); \S+\.part holds \d+ of 150001 bytes: give the same command",
     "grows": r"has 150005 bytes now, and had 150001: the vehicle is still writing it; disarm it, or stop its logger",
@@ -198,8 +195,8 @@ def test_faults_of_the_vehicle_are_said(fault, tmp_path):
     with pytest.raises(SitlError, match=FAULTS[fault]) as error:
         Run(vehicle).download(tmp_path)
     assert error.value.exit_code == 1
-    if fault == "wrong checksum":
-        assert list(tmp_path.iterdir()) == []
+    # Nothing stays of what is wrong or empty.
+    assert len(list(tmp_path.iterdir())) == (2 if fault == "bad sector" else 0)
 
 
 def test_faults_of_a_vehicle_without_ftp_are_said(tmp_path):
@@ -225,8 +222,8 @@ def test_without_ftp_the_log_protocol_is_used(tmp_path):
 
 
 def test_a_log_that_has_grown_is_completed_once_it_is_closed(tmp_path):
-    vehicle = ScriptedLogs(DATED, fault="grows")
-    with pytest.raises(SitlError, match="still writing"):
+    vehicle = ScriptedLogs(DATED, fault="grows late")
+    with pytest.raises(SitlError, match="has 150005 bytes now, and had 150001: the vehicle is still writing it"):
         Run(vehicle).download(tmp_path)
     vehicle.fault = ""
     done = Run(vehicle).download(tmp_path)
@@ -246,7 +243,7 @@ def test_an_armed_vehicle_is_refused_and_arming_stops_a_download(tmp_path):
     vehicle.armed = False
     run = Run(ScriptedLogs({"a.ulg": content(4_000_000)}), latency=0.5)
     run.client.progress = lambda phase, done, of: setattr(run.link.vehicles["", 0], "armed", phase == "downloading")
-    with pytest.raises(SitlError, match="the vehicle was armed: its link is needed for the flight; a.ulg.part holds"):
+    with pytest.raises(SitlError, match=r"the vehicle was armed: its link is needed for the flight; a\.ulg\.part"):
         run.download(tmp_path)
 
 
