@@ -34,6 +34,8 @@ _PUBLIC = {
             "performance",
             "experiment",
             "upload",
+            "list_logs",
+            "download_log",
         ),
         "mimopilot.api",
     ),
@@ -51,11 +53,13 @@ _PUBLIC = {
 if TYPE_CHECKING:
     from mimopilot.api import advise as advise
     from mimopilot.api import certify as certify
+    from mimopilot.api import download_log as download_log
     from mimopilot.api import experiment as experiment
     from mimopilot.api import fly as fly
     from mimopilot.api import generate as generate
     from mimopilot.api import import_params as import_params
     from mimopilot.api import inspect as inspect
+    from mimopilot.api import list_logs as list_logs
     from mimopilot.api import load_airframe as load_airframe
     from mimopilot.api import load_gains as load_gains
     from mimopilot.api import performance as performance

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
     from mimopilot.sitl.mavlink.ground_station.upload import UploadOutcome
+    from mimopilot.sitl.mavlink.log_transfer.vehicle_logs import Download, VehicleLog
     from mimopilot.sitl.physics.airframe import Airframe
     from mimopilot.tuning.design.advise import Advice
     from mimopilot.tuning.experiment import Experiment
@@ -584,6 +585,77 @@ def upload(
     done = upload_and_verify(plan, options, loaded, moment_scale)
     done.check()
     return done.outcome
+
+
+def list_logs(
+    connect: str,
+    *,
+    protocol: str = "auto",
+    timeout: float = 12.0,
+    signing_key: PathLike | None = None,
+    system: int = 0,
+) -> list[VehicleLog]:
+    """Logs on a vehicle.
+
+    Parameters
+    ----------
+    connect, timeout, signing_key, system
+        As in `upload`.
+    protocol : str
+        ``ftp``, ``log`` (LOG_REQUEST_LIST), or ``auto``: FTP where the vehicle has it.
+
+    Returns
+    -------
+    list of VehicleLog
+        Name, size (bytes) and, if the vehicle reports it, time (s since 1970) of each.
+
+    Raises
+    ------
+    Error
+        When there is no vehicle, or it does not list logs.
+    """
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+    from mimopilot.sitl.mavlink.log_transfer.log_session import list_logs as find
+
+    return find(LinkOptions(connect, system, timeout, Path(signing_key) if signing_key else None), protocol)
+
+
+def download_log(
+    connect: str,
+    out: PathLike = ".",
+    *,
+    name: str | None = None,
+    protocol: str = "auto",
+    timeout: float = 12.0,
+    signing_key: PathLike | None = None,
+    system: int = 0,
+) -> Download:
+    """Download a log of a vehicle, or what an earlier download has left of it, and verify it.
+
+    Parameters
+    ----------
+    connect, protocol, timeout, signing_key, system
+        As in `list_logs`.
+    out : str or Path
+        Folder of the log.
+    name : str, optional
+        Of the log; by default the last one.
+
+    Returns
+    -------
+    Download
+        Its `path`, and whether it was `verified` by its CRC-32 or its size.
+
+    Raises
+    ------
+    Error
+        When the log cannot be read or verified, is being written, or another file has its name; a part is kept.
+    """
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+    from mimopilot.sitl.mavlink.log_transfer.log_session import download_log as download
+
+    options = LinkOptions(connect, system, timeout, Path(signing_key) if signing_key else None)
+    return download(options, name, Path(out), protocol)
 
 
 def prepare_upload(

@@ -1,4 +1,4 @@
-"""Commands on a vehicle's parameters."""
+"""Commands on a vehicle's parameters and logs."""
 
 from __future__ import annotations
 
@@ -39,6 +39,7 @@ def register(app: typer.Typer) -> None:
     app.command(epilog="Example: mimopilot upload my.gains.toml --connect udpin:127.0.0.1:14550")(upload)
     app.command(epilog="Example: mimopilot restore my.before-1.params --connect /dev/ttyACM0,57600")(restore)
     app.command(epilog="Example: mimopilot params my.gains.toml --format qgc --out my.params")(params)
+    app.command(epilog="Example: mimopilot logs --connect udpin:0.0.0.0:14550 --last --out logs")(logs)
     app.command(
         epilog="Example: mimopilot import-params vehicle.params --out first.gains.toml; "
         "mimopilot import-params --connect udpin:0.0.0.0:14550 --out first.gains.toml"
@@ -168,6 +169,37 @@ def params(
         raise SitlError("--out: a comparison is printed; give either a gains file or --connect to write a file")
     else:
         compare(gains, options)
+
+
+def logs(
+    connect: ConnectOption,
+    name: Annotated[str | None, typer.Argument(metavar="[LOG]", help="Log to download, by its listed name.")] = None,
+    last: Annotated[bool, typer.Option("--last", help="Download the last log.")] = False,
+    out: Annotated[Path, typer.Option(help="Folder of the downloaded log.")] = Path(),
+    protocol: Annotated[
+        str, typer.Option(help="ftp, log (LOG_REQUEST_LIST), or auto: FTP where the vehicle has it.")
+    ] = "auto",
+    timeout: TimeoutOption = 12.0,
+    signing_key: KeyOption = None,
+    system: SystemOption = 0,
+    as_json: JsonOption = False,
+) -> None:
+    """List the logs of a vehicle, or download one.
+
+    An interrupted download (Ctrl-C, a lost link, a full disk) leaves LOG.part and LOG.part.json, and the same command
+    goes on. The size, and by FTP the CRC-32, must be the vehicle's. An armed vehicle is refused.
+    """
+    from mimopilot.sitl.errors import SitlError
+    from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+    from mimopilot.sitl.mavlink.log_transfer.logs_console import show_download, show_logs
+
+    if last and name is not None:
+        raise SitlError("--last: give either --last or the name of a log")
+    options = LinkOptions(connect, system, timeout, signing_key, as_json=as_json)
+    if last or name is not None:
+        show_download(options, name, out, protocol)
+    else:
+        show_logs(options, protocol)
 
 
 def import_params(

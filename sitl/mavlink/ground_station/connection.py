@@ -18,22 +18,30 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     Address,
     AttitudeReport,
     CommandAck,
+    EndLogs,
+    FileReply,
+    FileRequest,
     GroundHeartbeat,
     Heartbeat,
     Incoming,
     InjectorState,
     LandedState,
+    LogData,
+    LogEntry,
     Outgoing,
     ParameterRefusal,
     ParameterValue,
     ReadParameter,
     Received,
+    RequestLogData,
+    RequestLogs,
     RequestMessage,
     SetMessageInterval,
     SetParameter,
     StatusText,
 )
 from mimopilot.sitl.mavlink.wire.codec import Codec
+from mimopilot.sitl.mavlink.wire.ftp import FtpPacket
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from mimopilot.sitl.mavlink.wire.sockets import udp_socket
 
@@ -75,6 +83,13 @@ def from_mavlink(message: Any) -> Incoming | None:
         return InjectorState(*sender, int(message.z), message.time_usec)
     if kind == "STATUSTEXT":
         return StatusText(*sender, message.text)
+    if kind == "FILE_TRANSFER_PROTOCOL":
+        ours = message.target_system in (0, GROUND_SYSTEM) and message.target_component in (0, GROUND_COMPONENT)
+        return FileReply(*sender, FtpPacket.unpack(bytes(message.payload))) if ours else None
+    if kind == "LOG_ENTRY":
+        return LogEntry(*sender, message.id, message.num_logs, message.size, message.time_utc)
+    if kind == "LOG_DATA":
+        return LogData(*sender, message.id, message.ofs, bytes(message.data[: message.count]))
     return None
 
 
@@ -92,6 +107,15 @@ def to_mavlink(order: Outgoing) -> Any:
         value = order.value
         coded = struct.unpack("<f", struct.pack("<i", round(value)))[0] if order.kind == INT32 else value
         return mavlink.MAVLink_param_set_message(order.system, order.component, name, coded, order.kind)
+    if isinstance(order, FileRequest):
+        return mavlink.MAVLink_file_transfer_protocol_message(0, order.system, order.component, order.packet.pack())
+    if isinstance(order, RequestLogs):
+        return mavlink.MAVLink_log_request_list_message(order.system, order.component, order.first, order.last)
+    if isinstance(order, RequestLogData):
+        place = order.id, order.offset, order.length
+        return mavlink.MAVLink_log_request_data_message(order.system, order.component, *place)
+    if isinstance(order, EndLogs):
+        return mavlink.MAVLink_log_request_end_message(order.system, order.component)
     if isinstance(order, SetMessageInterval):
         command, parameters = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (order.message, order.interval)
     elif isinstance(order, RequestMessage):

@@ -11,6 +11,7 @@ from collections.abc import Generator, Sequence
 from typing import NamedTuple, Protocol, TypeVar
 
 from mimopilot.sitl.mavlink.wire.float32 import REAL32
+from mimopilot.sitl.mavlink.wire.ftp import FtpPacket
 
 #: MAV_PARAM_TYPE. PX4 sends the bits of an INT32. ArduPilot's whole numbers are INT8, INT16 or INT32, sent as floats.
 INT8, INT16, INT32 = 2, 4, 6
@@ -23,6 +24,8 @@ STORAGE_COMMAND = 245
 ACCEPTED, DENIED, FAILED, IN_PROGRESS = 0, 2, 4, 5
 #: Message number of HEARTBEAT.
 HEARTBEAT = 0
+#: MAV_AUTOPILOT_ARDUPILOTMEGA.
+ARDUPILOT = 3
 #: MAV_TYPE_GENERIC.
 GENERIC = 0
 #: MAV_PARAM_ERROR of PARAM_ERROR, and its text.
@@ -112,6 +115,35 @@ class StatusText(NamedTuple):
     text: str
 
 
+class FileReply(NamedTuple):
+    """FILE_TRANSFER_PROTOCOL to this ground station."""
+
+    system: int
+    component: int
+    packet: FtpPacket
+
+
+class LogEntry(NamedTuple):
+    """LOG_ENTRY: number, number of all logs, size (bytes) and time (s since 1970; 0: unknown) of a log."""
+
+    system: int
+    component: int
+    id: int
+    total: int
+    size: int
+    time: int
+
+
+class LogData(NamedTuple):
+    """LOG_DATA: a piece of a log at an offset (bytes)."""
+
+    system: int
+    component: int
+    id: int
+    offset: int
+    data: bytes
+
+
 class GroundHeartbeat(NamedTuple):
     """HEARTBEAT of the ground station; the vehicle answers to where it comes from."""
 
@@ -158,10 +190,57 @@ class RequestMessage(NamedTuple):
     message: int
 
 
+class FileRequest(NamedTuple):
+    """FILE_TRANSFER_PROTOCOL."""
+
+    system: int
+    component: int
+    packet: FtpPacket
+
+
+class RequestLogs(NamedTuple):
+    """LOG_REQUEST_LIST of the logs numbered first to last."""
+
+    system: int
+    component: int
+    first: int
+    last: int
+
+
+class RequestLogData(NamedTuple):
+    """LOG_REQUEST_DATA: a number of bytes (`length`) of a log from an offset on."""
+
+    system: int
+    component: int
+    id: int
+    offset: int
+    length: int
+
+
+class EndLogs(NamedTuple):
+    """LOG_REQUEST_END: stop sending."""
+
+    system: int
+    component: int
+
+
+#: Pieces of a vehicle's files and logs.
+TransferReport = FileReply | LogEntry | LogData
 #: Flight state that a vehicle streams.
 FlightReport = AttitudeReport | LandedState | InjectorState | StatusText
-Incoming = Heartbeat | ParameterValue | ParameterRefusal | CommandAck | FlightReport
-Outgoing = GroundHeartbeat | ReadParameter | SetParameter | StoreParameters | SetMessageInterval | RequestMessage
+Incoming = Heartbeat | ParameterValue | ParameterRefusal | CommandAck | FlightReport | TransferReport
+Outgoing = (
+    GroundHeartbeat
+    | ReadParameter
+    | SetParameter
+    | StoreParameters
+    | SetMessageInterval
+    | RequestMessage
+    | FileRequest
+    | RequestLogs
+    | RequestLogData
+    | EndLogs
+)
 T = TypeVar("T")
 #: Host and port of a sender on a UDP link; `SOLE_PEER` on a point-to-point link.
 Address = tuple[str, int]

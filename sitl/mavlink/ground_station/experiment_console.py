@@ -122,7 +122,7 @@ def _check_log(profile: int) -> None:
 
 def _report(result: ExperimentResult, wanted: Mapping[str, float], on_px4: bool, options: LinkOptions) -> None:
     where = (
-        "the log is on the vehicle: land, disarm, download the last one (QGroundControl: Analyze Tools, Log Download)"
+        "the log is on the vehicle: land, disarm, download it with: mimopilot logs --last --connect ..."
         if on_px4
         else "the vehicle writes its log when it disarms after landing: the file of `mimopilot sitl --log`"
     )

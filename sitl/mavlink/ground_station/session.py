@@ -16,14 +16,14 @@ from mimopilot.sitl.mavlink.ground_station.events import Exchange, Heartbeat, T,
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import NoParametersError, read_values
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import STOCK_PARAMETERS, check_kind, describe_missing_module
-from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
+from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S, VehicleLinkState
 from mimopilot.sitl.mavlink.wire.signing import read_key
 from mimopilot.tuning.parameter_row import PREFIX
 
 
 @dataclass(frozen=True)
 class LinkOptions:
-    """Options of upload, restore, params and experiment; see their help.
+    """Options of upload, restore, params, experiment and logs; see their help.
 
     Attributes
     ----------
@@ -45,22 +45,21 @@ class LinkOptions:
     stem: Path = Path("vehicle")
 
 
-class Session:
-    """A vehicle on a link, for an interactive command.
+class LinkSession:
+    """A link to a vehicle, for an interactive command; its subclasses set `client`.
 
     Parameters
     ----------
     options : LinkOptions
-        How to reach it.
-    integers : collection of str
-        Names of parameters that may be INT32.
+        How to reach the vehicle.
     """
 
-    def __init__(self, options: LinkOptions, integers: Collection[str] = ()) -> None:
+    client: VehicleLinkState
+
+    def __init__(self, options: LinkOptions) -> None:
         self.options = options
         self.link = Connection(options.connect, read_key(options.signing_key) if options.signing_key else None)
-        tries = max(1, round(options.timeout / TRY_S))
-        self.client = ParameterClient(self.link.now(), tries, options.system, options.force_armed, integers)
+        self.tries = max(1, round(options.timeout / TRY_S))
 
     def run(self, exchange: Exchange[T]) -> T:
         """Run an exchange. Ctrl-C or a closed terminal ends it in order, with the roll-back."""
@@ -88,6 +87,30 @@ class Session:
             for number, handler in before.items():
                 signal.signal(number, handler)
 
+    @property
+    def vehicle(self) -> Heartbeat:
+        """Its last HEARTBEAT."""
+        assert self.client.vehicle is not None
+        return self.client.vehicle
+
+
+class Session(LinkSession):
+    """A link to the parameters of a vehicle.
+
+    Parameters
+    ----------
+    options : LinkOptions
+        How to reach it.
+    integers : collection of str
+        Names of parameters that may be INT32.
+    """
+
+    client: ParameterClient
+
+    def __init__(self, options: LinkOptions, integers: Collection[str] = ()) -> None:
+        super().__init__(options)
+        self.client = ParameterClient(self.link.now(), self.tries, options.system, options.force_armed, integers)
+
     def read(self, names: Sequence[str], profile: str = "") -> dict[str, float]:
         """Parameters of the vehicle, after it is identified and found to fit a profile."""
         check_kind(self.run(self.client.await_heartbeat()), profile)
@@ -101,12 +124,6 @@ class Session:
             if self.run(self.client.read([probe], "reading"))[probe].absent:
                 raise
             raise SitlError(f"{describe_missing_module(self.vehicle)}; nothing was written") from error
-
-    @property
-    def vehicle(self) -> Heartbeat:
-        """Its last HEARTBEAT."""
-        assert self.client.vehicle is not None
-        return self.client.vehicle
 
 
 @contextmanager

@@ -20,6 +20,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     LandedState,
     SetMessageInterval,
     StatusText,
+    TransferReport,
 )
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
@@ -71,7 +72,7 @@ class FlightMonitor:
     text: str = ""
     seen: dict[str, float] = field(default_factory=dict)
 
-    def __call__(self, report: FlightReport) -> None:
+    def __call__(self, report: FlightReport | TransferReport) -> None:
         """Record a report."""
         if isinstance(report, AttitudeReport):
             self.tilt = max(abs(report.roll), abs(report.pitch))

@@ -22,6 +22,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     ParameterValue,
     RequestMessage,
     SendAndWait,
+    TransferReport,
 )
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 
@@ -70,7 +71,7 @@ class VehicleLinkState:
     progress : callable
         Called with (phase, done, of) after each answer.
     on_report : callable
-        Called with each `FlightReport` of the vehicle.
+        Called with each `FlightReport` and `TransferReport` of the vehicle.
     """
 
     def __init__(self, now: float, tries: int = TRIES, system: int = 0, force_armed: bool = False) -> None:
@@ -83,7 +84,7 @@ class VehicleLinkState:
         self.written: set[str] = set()
         self.contradiction = ""
         self.progress: Callable[[str, int, int], None] = lambda phase, done, of: None
-        self.on_report: Callable[[FlightReport], None] = lambda report: None
+        self.on_report: Callable[[FlightReport | TransferReport], None] = lambda report: None
         self._agreed: dict[str, float] | None = None
         self._duplicate = ""
         self._heartbeat_at = self._heard_at = now

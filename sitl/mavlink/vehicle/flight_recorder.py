@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from mimopilot.sitl.autopilot.autopilot import RECORD
 from mimopilot.sitl.autopilot.flight_modes import Commander
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.flight_log import vehicle_log
+from mimopilot.sitl.mavlink.wire.ftp import crc32
 from mimopilot.sitl.physics.airframe import Airframe
 
 BLOCK = 15_000  # rows allocated at once: one minute at 250 Hz
@@ -28,6 +30,16 @@ class _RecordedFlight:
     record: NDArray[Any]
     landed: NDArray[np.bool_]
     gains: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class StoredLog:
+    """A log that was written: its file, size (bytes), `wire.ftp.crc32`, and time (s since 1970)."""
+
+    path: Path
+    size: int
+    checksum: int
+    time: int
 
 
 class FlightRecorder:
@@ -48,6 +60,8 @@ class FlightRecorder:
     ----------
     flights : int
         Number of flights that have ended.
+    logs : list of StoredLog
+        Those of them that were written.
 
     Raises
     ------
@@ -61,6 +75,7 @@ class FlightRecorder:
             raise SitlError(f"--log {path}: a file cannot be written there; name a file in a folder of yours")
         self.path, self.airframe, self.Ts = path, airframe, Ts
         self.flights = 0
+        self.logs: list[StoredLog] = []
         self._unsaved: list[_RecordedFlight] = []
         self._spare: NDArray[Any] = np.zeros(1, RECORD)
         self._forget()
@@ -114,5 +129,7 @@ class FlightRecorder:
             flight = self._unsaved[0]
             content = vehicle_log(flight.record, flight.landed, self.Ts, self.airframe, flight.gains)
             write_atomically(flight.path, content)
+            # The checksum is computed now: it takes too long in flight.
+            self.logs.append(StoredLog(flight.path, len(content), crc32(content), int(time.time())))
             written.append(self._unsaved.pop(0).path)
         return written

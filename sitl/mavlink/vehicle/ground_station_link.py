@@ -9,6 +9,7 @@ from typing import Any
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.autopilot.flight_modes import Denied, Failed, Refused, Severity
+from mimopilot.sitl.mavlink.vehicle.log_server import LogServer
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.setpoint_messages import SetpointReceiver
 from mimopilot.sitl.mavlink.vehicle.small_protocols import PROTOCOLS
@@ -35,12 +36,20 @@ class GroundStationLink:
         Schedules the telemetry.
     stations : Stations
         The connections.
+    logs : LogServer
+        Serves the logs.
     """
 
     def __init__(
-        self, parameters: ParameterServer, commands: VehicleCommands, telemetry: Telemetry, stations: Stations
+        self,
+        parameters: ParameterServer,
+        commands: VehicleCommands,
+        telemetry: Telemetry,
+        stations: Stations,
+        logs: LogServer,
     ) -> None:
         self.parameters, self.telemetry, self.vehicle, self.stations = parameters, telemetry, commands.vehicle, stations
+        self.logs = logs
         self.now = 0.0
         self.heard: float | None = None
         self._text_id = 0
@@ -57,7 +66,7 @@ class GroundStationLink:
             "REQUEST_DATA_STREAM": self._data_stream,
             "HEARTBEAT": self._heartbeat,
         }
-        stations.subscribe(*self.handlers)
+        stations.subscribe(*self.handlers, *logs.handlers)
         commands.handlers[mavlink.MAV_CMD_PREFLIGHT_STORAGE] = self._store
 
     def receive(self, now: float) -> None:
@@ -65,7 +74,8 @@ class GroundStationLink:
         self.now = now
         for message, station in self.stations.receive():
             kind = message.get_type()
-            for answer in self.handlers[kind](message):
+            serve = self.logs.handlers.get(kind)
+            for answer in serve(message, station) if serve else self.handlers[kind](message):
                 # Every station must learn of a changed parameter.
                 for_all = kind == "PARAM_SET" and answer.get_type() == "PARAM_VALUE"
                 self.stations.post(answer, None if for_all else station)

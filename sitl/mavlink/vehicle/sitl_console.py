@@ -21,6 +21,7 @@ from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
 from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightRecorder
 from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
 from mimopilot.sitl.mavlink.vehicle.host import Host
+from mimopilot.sitl.mavlink.vehicle.log_server import LogServer
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
 from mimopilot.sitl.mavlink.vehicle.stations import Stations
@@ -138,7 +139,7 @@ def _assemble(options: SitlOptions, leaving: ExitStack) -> tuple[Host, GroundSta
         print(server.summary)
     if link.child is not None:
         link.child.wait()
-    return host, GroundStationLink(server, commands, telemetry, stations)
+    return host, GroundStationLink(server, commands, telemetry, stations, LogServer(log.logs if log else ()))
 
 
 def _check_faults(options: SitlOptions) -> list[Fault]:

@@ -1,4 +1,4 @@
-"""Replies to small protocols that ground stations wait for: FTP, missions, time synchronisation, ping."""
+"""Replies to small protocols that ground stations wait for: missions, time synchronisation, ping."""
 
 from __future__ import annotations
 
@@ -6,22 +6,6 @@ import time
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
-
-FTP_NAK, FTP_UNKNOWN_COMMAND = 129, 7  # opcode and error code, mavlink.io/en/services/ftp.html
-FTP_BYTES = 251  # length of FILE_TRANSFER_PROTOCOL.payload
-
-
-def refuse_files(message: Any) -> list[Any]:
-    """NAK to any FTP request: the vehicle has no files. Without an answer MAVProxy waits 11 s."""
-    request = bytes(message.payload)
-    sequence = (int.from_bytes(request[:2], "little") + 1) % 65536
-    payload = bytearray(FTP_BYTES)
-    payload[:2] = sequence.to_bytes(2, "little")
-    payload[2] = request[2]  # session
-    # Opcode, size, the request's opcode, data: the error code.
-    payload[3], payload[4], payload[5], payload[12] = FTP_NAK, 1, request[3], FTP_UNKNOWN_COMMAND
-    sender = message.get_srcSystem(), message.get_srcComponent()
-    return [mavlink.MAVLink_file_transfer_protocol_message(0, *sender, bytes(payload))]
 
 
 def no_mission(message: Any) -> list[Any]:
@@ -59,7 +43,6 @@ def ping(message: Any) -> list[Any]:
 
 #: Message name -> function that returns the answers.
 PROTOCOLS = {
-    "FILE_TRANSFER_PROTOCOL": refuse_files,
     "MISSION_REQUEST_LIST": no_mission,
     "MISSION_COUNT": refuse_mission,
     "MISSION_CLEAR_ALL": clear_mission,

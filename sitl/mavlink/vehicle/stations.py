@@ -20,7 +20,7 @@ from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, listen, udp_socket
 # All chosen:
 #: Time budget of one `Stations.receive` and one `Stations.deliver`, s: an eighth of a control period at 250 Hz.
 BUDGET_S = 0.0005
-#: Answers sent to a station in one call; answers queued for it before its requests are ignored.
+#: Messages sent to a station in one call; answers queued for it before its requests are ignored.
 ANSWERS_PER_CALL, MAX_ANSWERS = 8, 100
 #: Most stations per transport; silence (s) after which a new station may replace one.
 MAX_STATIONS, SILENCE_S = 8, 10.0
@@ -43,17 +43,41 @@ class Station:
     ----------
     codec : Codec
         Packs messages to it and parses its messages.
+
+    Attributes
+    ----------
+    answers : deque
+        Messages to send soon.
+    stream : iterator or None
+        Messages to send when no answer is waiting: pieces of a log.
     """
 
     def __init__(self, codec: Codec) -> None:
         self.codec = codec
         self.heard = time.monotonic()
         self.answers: deque[Any] = deque(maxlen=2 * MAX_ANSWERS)
+        self.stream: Iterator[Any] | None = None
 
     @property
     def busy(self) -> bool:
         """Whether so many answers are queued for it that its requests are ignored."""
         return len(self.answers) >= MAX_ANSWERS
+
+    @property
+    def ready(self) -> bool:
+        """Whether what was sent before has left."""
+        return True
+
+    def take(self) -> Any | None:
+        """The next message to send; None: there is none now."""
+        if self.answers:
+            return self.answers.popleft()
+        if self.stream is None or not self.ready:
+            return None
+        message = next(self.stream, None)
+        if message is None:
+            self.stream = None
+        return message
 
     def send(self, message: Any) -> None:
         """Send one message; an unreachable station is no error."""
@@ -101,6 +125,12 @@ class TcpStation(Station):
             self.close()
         if len(self.unsent) > MAX_UNSENT:
             self.close()
+
+    @property
+    def ready(self) -> bool:  # noqa: D102
+        if self.unsent:
+            self.transmit(b"")
+        return self.open and not self.unsent
 
     def close(self) -> None:
         """Disconnect it."""
@@ -212,9 +242,10 @@ class Stations:
         """Send queued messages, to each station in turn, within the time budget."""
         end = time.perf_counter() + BUDGET_S
         for _ in range(ANSWERS_PER_CALL):
-            waiting = [station for station in self._all if station.answers]
-            for station in waiting:
-                station.send(station.answers.popleft())
+            waiting = [(station, station.take()) for station in self._all if station.answers or station.stream]
+            for station, message in waiting:
+                if message is not None:
+                    station.send(message)
             if not waiting or time.perf_counter() > end:
                 return
 

@@ -11,6 +11,7 @@ import socket
 import sys
 import time
 from collections import Counter
+from pathlib import Path
 
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -19,7 +20,9 @@ from mimopilot.common.console import print_table
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.excitation_injector import Injector
 from mimopilot.sitl.autopilot.flight_modes import Commander, Mode
+from mimopilot.sitl.mavlink.vehicle.flight_recorder import StoredLog
 from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
+from mimopilot.sitl.mavlink.vehicle.log_server import LogServer
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.stations import Stations
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
@@ -59,7 +62,9 @@ class VehicleUnderAttack:
         self.attacker = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.attacker.bind(("127.0.0.1", 0))
         self.stations = Stations(self.attacker.getsockname()[1], 0, 0, signer=self.signer)
-        self.ground = GroundStationLink(self.server, self.commands, telemetry, self.stations)
+        source = Path(__file__)
+        logs = LogServer([StoredLog(source, source.stat().st_size, 0, 0)])
+        self.ground = GroundStationLink(self.server, self.commands, telemetry, self.stations, logs)
         self.udp, self.tcp_address = self.stations.udp.getsockname(), self.stations.tcp.getsockname()
         self.tcp = socket.create_connection(self.tcp_address)
         self.friend = Codec(255, 190, Signer(key) if key else None)

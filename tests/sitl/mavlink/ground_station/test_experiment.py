@@ -186,6 +186,9 @@ def test_an_experiment_over_mavlink_produces_a_log_for_tuning(tmp_path, mimopilo
         assert_one_clear_line(wrong, "another mode", code=1)
         assert pilot.command(21) == 0
         pilot.hears("logged: flight.ulg")
+        fetched = mimopilot("logs", "--last", *link[:2], "--out", "logs")
+        assert "flight.ulg: " in fetched.stdout, fetched.stderr
+        assert (tmp_path / "logs" / "flight.ulg").read_bytes() == log.read_bytes()
         pilot.close()
     flown = read_log(log)
     excited = [np.flatnonzero(flown.u_bar[:, axis]) for axis in (0, 1)]

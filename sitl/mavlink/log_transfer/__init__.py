@@ -1,0 +1,1 @@
+"""Logs of a vehicle over its link: list, download, resume, verify."""
