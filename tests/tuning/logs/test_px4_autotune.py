@@ -1,4 +1,4 @@
-"""A stock PX4 that tunes itself is an experiment: its excitation of the rate setpoint is found, checked and tuned from."""
+"""A stock PX4 that tunes itself is an experiment: its excitation is found, checked and tuned from."""
 
 import numpy as np
 import pytest
