@@ -75,6 +75,8 @@ class SetpointReceiver:
             return f"setpoint refused: type_mask {mask}: thrust along body axes is not supported"
         if not all(abs(rate) <= MAX_RATE for rate in rates):
             return f"setpoint refused: expected body rates of at most {MAX_RATE:g} rad/s"
+        if rate_mode and any(mask & bit for bit in RATES_IGNORED):
+            return f"setpoint refused: type_mask {mask}: expected an attitude, or all three body rates"
         if rate_mode and mask & mavlink.ATTITUDE_TARGET_TYPEMASK_THROTTLE_IGNORE:
             return f"setpoint refused: type_mask {mask}: body rates need a thrust"
         if not rate_mode and (rates[0] != 0 or rates[1] != 0):

@@ -345,10 +345,13 @@ def test_attitude_setpoints_follow_the_type_mask(fixture):
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        ({"mask": IGNORE_RATES | IGNORE_ATTITUDE}, "only attitude is supported"),
-        ({"mask": IGNORE_RATES | 32}, "only attitude is supported"),
-        ({"mask": 3, "rates": (0, 0, 0.1)}, "body rates are not supported, add 7"),
-        ({"mask": 0, "rates": (math.nan, 0, 0)}, "body rates are not supported"),
+        ({"mask": IGNORE_RATES | IGNORE_ATTITUDE}, "expected an attitude, or all three body rates"),
+        ({"mask": 1 | IGNORE_ATTITUDE}, "expected an attitude, or all three body rates"),
+        ({"mask": 64 | IGNORE_ATTITUDE}, "body rates need a thrust"),
+        ({"mask": IGNORE_RATES | 32}, "thrust along body axes is not supported"),
+        ({"mask": 4, "rates": (0, 0.1, 0)}, "with an attitude only the yaw rate counts, add 3"),
+        ({"mask": 0, "rates": (math.nan, 0, 0)}, "expected body rates of at most 100 rad/s"),
+        ({"mask": IGNORE_ATTITUDE, "rates": (0, 0, 101.0)}, "expected body rates of at most 100 rad/s"),
         ({"mask": IGNORE_RATES, "q": (0, 0, 0, 0)}, "expected a quaternion"),
         ({"mask": IGNORE_RATES, "q": (math.nan, 0, 0, 0)}, "expected a quaternion"),
         ({"mask": IGNORE_RATES, "q": (math.cos(0.6), math.sin(0.6), 0, 0)}, "tilted by at most 60 degrees"),
@@ -363,6 +366,13 @@ def test_implausible_setpoints_are_refused_with_the_reason(fixture, arguments, r
     assert fixture.target(**arguments) == []  # reported once a second, not for every message
     fixture.wait_landed(1.1)
     assert len(fixture.target(**arguments)) == 1
+
+
+def test_body_rates_and_the_yaw_rate_of_an_attitude_are_taken_over(fixture):
+    assert fixture.target(mask=IGNORE_ATTITUDE, rates=(0.5, -0.25, 1.0), thrust=0.4) == []
+    assert fixture.vehicle.attitude.value == pytest.approx((0.5, -0.25, 1.0, 0.4, 0.0, True))
+    assert fixture.target(mask=3, rates=(0, 0, 0.75), thrust=0.4) == []
+    assert fixture.vehicle.attitude.value[3:] == pytest.approx((0.4, 0.75, False))
 
 
 def test_manual_control_sets_the_sticks(fixture):
