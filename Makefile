@@ -8,7 +8,7 @@ demo: $(VENV)/.installed
 	$(BIN)/mimopilot demo --out demo
 
 test: $(VENV)/.installed-test cross
-	$(BIN)/pytest -n $(JOBS)
+	$(BIN)/pytest -n $(JOBS) --dist loadfile
 
 # What emulates and builds for the vehicle's processor; installed when missing.
 CROSS = gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm

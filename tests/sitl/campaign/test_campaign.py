@@ -45,7 +45,7 @@ from tests.conftest import assert_one_clear_line
 from tests.paths import TOP
 from tests.sitl.mavlink.running import PATIENCE_S
 
-RUNS = 60 * CHUNK  # enough to interrupt the campaign while it flies
+RUNS = 40 * CHUNK  # enough to interrupt the campaign while it flies
 VARY = """
 mass = { normal = [1.0, 0.05], relative = true }
 delay = { uniform = [0.5, 3.5] }

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.flight.scenario import doublet
@@ -52,7 +53,11 @@ def test_the_off_diagonal_gains_match_the_inertia_on_the_coupled_vehicle_and_van
 
 
 def doublets(gains):
-    """RMS to the outer reference model and off-axis standard deviation, deg, of 18 degree doublets in simulation."""
+    """RMS to the outer reference model and off-axis standard deviation, deg, of 18 degree doublets in simulation.
+
+    Off the axis counts the direction of the thrust in the heading of the setpoint, which the law controls. At 18
+    degrees the motors saturate and the heading is up to 5 degrees off: by itself 1.5 degrees of the other Euler angle.
+    """
     body = load_airframe("px4_sih").airframe
     outer = second_order(10, 0.7, 0, TS)
     follow, offaxis = [], []
@@ -63,15 +68,17 @@ def doublets(gains):
         angles = flight.truth["attitude"][rows]
         away = angles[:, column] - outer.response(task.setpoint[:, column])[rows]
         follow.append(np.degrees(np.sqrt(np.mean(away**2))))
-        offaxis.append(np.degrees(np.std(angles[:, 1 - column])))
+        down = Rotation.from_euler("ZYX", angles[:, ::-1]).apply([0.0, 0.0, 1.0])
+        offaxis.append(np.degrees(np.std((-down[:, 1], down[:, 0])[1 - column])))
     return np.array(follow), np.array(offaxis)
 
 
 def test_the_simulation_flies_the_flown_gains_as_px4_did(logs):
     follow, offaxis = doublets(logs["coupled"].flown)
-    # PX4 flew 1.1 / 1.4 and 1.08 / 1.18 degrees; its estimate drifts by a degree, our true angle does not.
+    # PX4 flew 1.1 / 1.4 and 1.08 / 1.18 degrees (a law on Euler angles, so off the axis of these); its estimate drifts
+    # by a degree, our true angle does not.
     assert follow == pytest.approx([1.1, 1.4], abs=0.3)
-    assert offaxis == pytest.approx([1.08, 1.18], abs=0.1)
+    assert offaxis == pytest.approx([1.08, 1.18], abs=0.15)
 
 
 def test_tuned_gains_decouple_and_those_with_model_following_also_track_better_than_the_flown_ones(logs):
@@ -82,4 +89,4 @@ def test_tuned_gains_decouple_and_those_with_model_following_also_track_better_t
         assert best.verdict()[0] == Verdict.CERTIFIED
         follow, offaxis = doublets(best)
         assert (follow < ratio * flown_follow).all()
-        assert (offaxis < 0.3 * flown_offaxis).all()
+        assert (offaxis < 0.2 * flown_offaxis).all()

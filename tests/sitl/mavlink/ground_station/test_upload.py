@@ -205,7 +205,7 @@ def test_a_vehicle_that_does_not_publish_its_unit_of_torque_needs_moment_scale(m
         assert named(link.vehicle.values, new) == new
 
 
-@pytest.mark.parametrize(("profile", "autopilot", "count"), [("px4-stock", 12, 25), ("ardupilot-stock", 3, 24)])
+@pytest.mark.parametrize(("profile", "autopilot", "count"), [("px4-stock", 12, 26), ("ardupilot-stock", 3, 24)])
 def test_a_stock_autopilot_receives_the_diagonal_gains(mimopilot, certified, gains, profile, autopilot, count):
     wanted = make_plan(gains, profile, drop=True).values
     assert len(wanted) == count

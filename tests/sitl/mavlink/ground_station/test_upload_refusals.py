@@ -185,7 +185,7 @@ def test_an_incomplete_or_out_of_range_snapshot_is_refused_before_contacting_the
             ("".join(lines[:-5]), (f"holds {WRITTEN - 5} parameters, but its first line says {WRITTEN}",)),
             (text[:-4], ("it was cut short",)),
             (text.replace("0.13125", "0.13126"), ("damaged or edited",)),
-            ("".join(lines[1:-5]), (f"holds {REQUIRED - 3} of our {REQUIRED} gains", "lacks")),
+            ("".join(lines[1:-5]), (f"holds {REQUIRED - 1} of our {REQUIRED} gains", "lacks MIMO_D_POLE")),
             (unsealed.replace("\t0.13125001\t", "\t99\t"), ("MIMO_RP_RR: got 99, expected",)),
         ]:
             (tmp_path / "bad.params").write_text(content)

@@ -86,7 +86,7 @@ def test_the_parameter_list_holds_the_whole_table_in_order(server):
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_change_in_flight_does_not_change_the_torque_abruptly(server, value, rate):
     inputs = np.zeros(40, INPUT)
-    inputs["armed"] = 1
+    inputs["armed"] = inputs["attitude"][:, 0] = inputs["attitude_setpoint"][:, 0] = 1
     inputs["rates"][:, 0] = rate / 10
     before = server.controller.run(inputs)["moment"][-1]
     server.write("MIMO_RP_RR", value, 9)
