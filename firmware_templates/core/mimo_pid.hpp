@@ -22,8 +22,8 @@
 //   th(k)  = th(k-1) + Ts w(k)
 //
 // q_d in the law becomes the heading, then the tilt th. Turned by the yaw error into body axes, w adds Kff_o w to r_i
-// and al adds Kaff al to v. The model starts at the measured attitude, at rest, with the first armed sample without a
-// fault.
+// and al adds Kaff al to v. A heading that moves takes the tilt th with it: give tilted vehicles no heading steps. The
+// model starts at the measured attitude, at rest, with the first armed sample without a fault.
 //
 // Single precision, fixed period, no heap, no exceptions, no library calls: the same bits on every
 // IEEE 754 target. Quaternions are w, x, y, z, body FRD to earth NED.

@@ -275,7 +275,7 @@ class Commander:
     def _stop_when_lost(self, dt: float) -> None:
         """Stop the rotors when the vehicle is lost, see `sitl.autopilot.failure_detector`."""
         # As in PX4, any tilt is allowed in rate mode.
-        flies_rates = self.mode is Mode.OFFBOARD and self.attitude.value.rate_mode
+        flies_rates = self.mode is Mode.OFFBOARD and self.attitude.value.rate_mode and not self._timed_out
         self._tilted = 0.0 if flies_rates or self._within_tilt(MAX_TILT) else self._tilted + dt
         if self._tilted >= MAX_TILT_SECONDS:
             self.say(Severity.EMERGENCY, f"lost: tilted beyond {math.degrees(MAX_TILT):.0f} degrees, rotors stopped")

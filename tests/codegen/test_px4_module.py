@@ -194,6 +194,20 @@ def test_a_heading_reset_rotates_the_setpoint(program):
     assert out["rates"][0, 0] > 0.5
 
 
+def test_a_heading_reset_commands_nothing_while_the_setpoint_slews(program):
+    """The vehicle is at its setpoint, nose down; the estimator turns both by 90 degrees."""
+    before, after = quaternion(0, -0.35, 0), quaternion(0, -0.35, np.pi / 2)
+    step = quaternion(0, 0, np.pi / 2)
+    flown = [f"attitude {text(*before)} 0 1 0 0 0", f"setpoint {text(*before, 0, 0, 0, -0.5)}"]
+    reset = [f"attitude {text(*after)} 1 {text(*step)}", f"setpoint {text(*after, 0, 0, 0, -0.5)}"]
+    slow = [*START, "param MIMO_SP_SLEW 0.5", *AIRBORNE[len(START) :]]
+    out = drive(program, [*slow, *flown, *[STEP] * 400, *reset, *[STEP] * 50]).out
+    assert np.abs(out["rates"][-60:]).max() < 1e-4
+    # Without a reset the same turn of the setpoint is flown.
+    turned = drive(program, [*slow, *flown, *[STEP] * 400, reset[1], *[STEP] * 50]).out
+    assert np.abs(turned["rates"][-40:, 2]).max() > 0.05
+
+
 # The excitation.
 
 

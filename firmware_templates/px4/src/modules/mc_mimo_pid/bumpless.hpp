@@ -22,8 +22,8 @@ public:
 			// An integrator that the gains do not use would stay for ever.
 			const float used = i == 2 ? fabsf(gains.yaw_ki_i) : fabsf(gains.ki_i[i][0]) + fabsf(gains.ki_i[i][1]);
 			const float limit = used > 0.0F ? gains.integral_max[i] : 0.0F;
-			state.integral[i] = fminf(fmaxf(integral[i], -limit), limit);
-			_missing[i] = fminf(fmaxf(torque[i] - output.moment[i] - state.integral[i], -1.0F), 1.0F);
+			state.integral[i] = limited(integral[i], limit);
+			_missing[i] = limited(torque[i] - output.moment[i] - state.integral[i], 1.0F);
 		}
 	}
 
@@ -33,12 +33,20 @@ public:
 		constexpr float kFade = 0.1F;  // s; shorter than an attitude loop's response, longer than a motor's
 
 		for (int i = 0; i < kAxes; i++) {
-			torque[i] += _missing[i];
+			torque[i] = limited(torque[i] + _missing[i], kMaxExcitation);
 			_missing[i] -= kGains.period / kFade * _missing[i];
 		}
 	}
 
 private:
+	// NaN becomes 0.
+	static float limited(float value, float limit)
+	{
+		if (fabsf(value) <= limit) { return value; }
+
+		return value > 0.0F ? limit : (value < 0.0F ? -limit : 0.0F);
+	}
+
 	float _missing[kAxes] {};
 };
 

@@ -51,6 +51,13 @@ public:
 	enum class End : uint8_t { None, Finished, Cancelled, NotReady, Tilt, Sticks, Settings };
 
 	void configure(const ExcitationSettings &settings);
+
+	// Ends a run, also one that waits.
+	void cancel()
+	{
+		if (_phase != Phase::Off) { stop(End::NotReady); }
+	}
+
 	void step(const ExcitationConditions &conditions, float (&moment)[3]);
 
 	Phase phase() const { return _phase; }

@@ -72,6 +72,8 @@ void McMimoPid::update_attitude()
 		if (PX4_ISFINITE(turn)) { _sticks.shift(turn); }
 
 		if (attitude.timestamp > _setpoint_time) { rotate(attitude.delta_q_reset, _input.attitude_setpoint); }
+
+		_state.slewing = 0;  // a setpoint on its way is of the old heading: it starts again at the attitude
 	}
 
 	_attitude_seen = true;

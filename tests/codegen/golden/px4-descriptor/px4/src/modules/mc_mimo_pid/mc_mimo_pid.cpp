@@ -91,8 +91,9 @@ void McMimoPid::update_parameters()
 	if (_wrong_gain != nullptr) {
 		PX4_ERR("%s is out of its range: no gain changed", _wrong_gain);
 
-	} else if (memcmp(&gains, &_state.gains, sizeof(gains)) != 0) {
-		set_gains(_state, gains);
+	} else if (memcmp(&gains, &_state.gains, sizeof(gains)) != 0 && !set_gains(_state, gains)) {
+		_wrong_gain = "MIMO_SP_SLEW or MIMO_M_OMEGA";  // times the period
+		PX4_ERR("%s is too large for the gyro rate: no gain changed", _wrong_gain);
 	}
 
 	_excitation.configure(_parameters.excitation());
@@ -128,7 +129,10 @@ void McMimoPid::Run()
 
 	if (_vehicle_angular_velocity_sub.update(&angular_velocity)) {
 		sampled = _clock.advance(angular_velocity.timestamp_sample);
-		_rates_time = angular_velocity.timestamp;
+
+		// A sample that goes back in time counts as none: a gyro that goes on so is silent.
+		if (sampled) { _rates_time = angular_velocity.timestamp; }
+
 		memcpy(_input.rates, angular_velocity.xyz, sizeof(_input.rates));
 	}
 
@@ -232,7 +236,8 @@ bool McMimoPid::flies(hrt_abstime now)
 void McMimoPid::release()
 {
 	// An excitation ends here, and in the log.
-	_excitation.step(ExcitationConditions{}, _excited);
+	_excitation.cancel();
+	memset(_excited, 0, sizeof(_excited));
 	log();
 
 	_vehicle_torque_setpoint_pub.end();
