@@ -9,7 +9,7 @@ from mimopilot.tuning.parameters import PARAMETERS
 
 #: Values of PX4's parameter IMU_GYRO_RATEMAX (PX4 v1.16, imu_gyro_parameters.c) that the module is made for, Hz.
 PX4_RATES = (250, 400, 800, 1000)
-#: Largest relative difference of the gyro's rate from that of the gains with which the module starts.
+#: Largest relative difference of the gyro's rate from that of the gains with which the module takes over.
 PX4_RATE_TOLERANCE = 0.05
 
 

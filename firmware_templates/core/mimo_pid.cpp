@@ -159,8 +159,7 @@ struct Quaternion {
 }
 
 // Attitude controller. The attitude model moves one period ahead. Sets the flown rate setpoint, and the acceleration of
-// the attitude model in body axes.
-// In rate mode, r_i is given.
+// the attitude model in body axes. In rate mode r_i is given.
 [[gnu::noinline]] void outer_loop(State &state)
 {
 	if (unlikely(state.rate_mode != 0)) { return; }

@@ -14,6 +14,7 @@ from mimopilot.common.files import write_atomically
 from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 from mimopilot.sitl.physics.airframe import Airframe
+from mimopilot.sitl.physics.state_estimate import quaternion_of
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import IDENTITY, PARAMETERS
 
@@ -22,16 +23,8 @@ EXCITATION_NAME = b"MIMO_EXC"  # of the debug_vect topic that carries the excita
 
 def quaternions(angles: NDArray[Any]) -> NDArray[np.float32]:
     """Quaternions (N, 4), w first, of roll, pitch and yaw (N, 3), rad."""
-    half = np.asarray(angles, np.float64).T / 2
-    (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
-    return np.column_stack(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    ).astype(np.float32)
+    # As plain Python: compiling it for arrays would take longer than any log.
+    return np.column_stack(quaternion_of.py_func(*np.asarray(angles, np.float64).T)).astype(np.float32)
 
 
 def setpoint_quaternions(record: NDArray[Any]) -> NDArray[np.float32]:

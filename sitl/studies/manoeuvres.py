@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 from mimopilot.common.files import inside
 from mimopilot.common.html_report import ReportTable, Section, write_report
 from mimopilot.sitl.autopilot.autopilot import RECORD, Autopilot
-from mimopilot.sitl.flight.flight_log import quaternions
 from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.flight.simulator import TRUTH, Simulator
 from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.sitl.physics.state_estimate import euler_angles, quaternion_of
 from mimopilot.sitl.studies.reproduction import Reproduction
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.gains import Gains
@@ -86,7 +86,7 @@ def fly_manoeuvre(name: str, gains: Gains, manoeuvre: Manoeuvre, law: Law | None
     samples = len(scenario.setpoint)
     simulator = Simulator(airframe, scenario.Ts, 0, noise=False, altitude=ALTITUDE)
     state = simulator.state.copy()
-    state[6:10] = quaternions(np.array([manoeuvre.start]))[0]
+    state[6:10] = quaternion_of(*manoeuvre.start)
     simulator.restart(state)
     autopilot = Autopilot(airframe, gains, altitude=ALTITUDE)
     record, truth, still = np.zeros(samples, RECORD), np.zeros(samples, TRUTH), np.zeros((samples, 6))
@@ -99,8 +99,7 @@ def fly_manoeuvre(name: str, gains: Gains, manoeuvre: Manoeuvre, law: Law | None
     for k in range(samples):
         one = slice(k, k + 1)
         if not record["rate_mode"][k]:
-            w, x, y, z = simulator.state[6:10]
-            angles = Rotation.from_quat([x, y, z, w]).as_euler("ZYX")[::-1]
+            angles = np.array(euler_angles(*simulator.state[6:10]))
             record["setpoint"][k] = law(gains, angles, scenario.setpoint[k].copy(), float(record["yaw_rate"][k]))
             record["rate_mode"][k] = True
         simulator.fly(autopilot, still[one], record[one], truth[one])
@@ -233,16 +232,10 @@ def attitude_errors() -> list[tuple[str, NDArray[np.float64], NDArray[np.float64
     )
     found = []
     for name, attitude, setpoint in cases:
-        q, wanted = (_quaternion(angles) for angles in (attitude, setpoint))
+        q, wanted = (np.array(quaternion_of(*np.radians(angles))) for angles in (attitude, setpoint))
         flown = Controller(gains, np.float64).step(wanted, q, np.zeros(3)).rates_setpoint
         found.append((name, np.degrees(flown), np.subtract(setpoint, attitude).astype(float)))
     return found
-
-
-def _quaternion(angles_deg: Any) -> NDArray[np.float64]:
-    """Quaternion w, x, y, z of roll, pitch, yaw, deg."""
-    x, y, z, w = Rotation.from_euler("ZYX", np.asarray(angles_deg, float)[::-1], degrees=True).as_quat()
-    return np.array([w, x, y, z])
 
 
 def _errors_table() -> ReportTable:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+
+from mimopilot.tuning.errors import TuningError
 
 #: Bytes at the beginning of a file from which its format is detected: enough for the header line of a CSV file.
 HEAD_BYTES = 4096
@@ -99,3 +102,19 @@ SUFFIXES = tuple(suffix for row in FORMATS for suffix in row.suffixes)
 def known_formats() -> str:
     """All formats with their file endings, for messages and help texts."""
     return ", ".join(f"{row.name} ({', '.join(row.suffixes)})" for row in FORMATS)
+
+
+def log_format(path: Path) -> tuple[LogFormat | None, bytes]:
+    """Format of a file, by its content, and its beginning; None: not a flight log.
+
+    Raises
+    ------
+    TuningError
+        When it is a log of a format that cannot be read.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(HEAD_BYTES)
+    for beginning, advice in UNSUPPORTED.items():
+        if head.startswith(beginning):
+            raise TuningError(f"{path}: {advice}")
+    return next((row for row in FORMATS if row.matches(head)), None), head

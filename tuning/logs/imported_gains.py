@@ -18,7 +18,7 @@ from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains, Triple
 from mimopilot.tuning.logs.flown_gains import flown_gains
-from mimopilot.tuning.logs.formats import FORMATS, HEAD_BYTES, UNSUPPORTED
+from mimopilot.tuning.logs.formats import log_format
 from mimopilot.tuning.logs.parameter_file import read_parameter_file
 from mimopilot.tuning.logs.reader import open_log
 from mimopilot.tuning.logs.resample import sampling_period
@@ -125,12 +125,7 @@ def read_source(path: Path) -> ParameterSource:
     """
     if not path.is_file():
         raise TuningError(f"{path}: no such file; give a parameter file or a flight log")
-    with path.open("rb") as stream:
-        head = stream.read(HEAD_BYTES)
-    for beginning, advice in UNSUPPORTED.items():
-        if head.startswith(beginning):
-            raise TuningError(f"{path}: {advice}")
-    found = next((row for row in FORMATS if row.matches(head)), None)
+    found, _ = log_format(path)
     if found is None or found.suffixes == (".csv",):  # parameter files have commas, too
         values = {name: entry.value for name, entry in read_parameter_file(path).items()}
         return ParameterSource(path.name, "parameter file", values, sha256(read_bytes(path, "parameter file")))

@@ -14,7 +14,7 @@ from mimopilot.tuning.experiment import Experiment, manoeuvre_size
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.flight_phase import flying_parts
 from mimopilot.tuning.logs.flown_gains import flown_gains
-from mimopilot.tuning.logs.formats import FORMATS, HEAD_BYTES, UNSUPPORTED, known_formats
+from mimopilot.tuning.logs.formats import FORMATS, known_formats, log_format
 from mimopilot.tuning.logs.log_checks import check_angles, check_log
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, on_common_grid
@@ -57,12 +57,7 @@ def open_log(path: Path, columns: Columns | None = None) -> Recording:
     """
     if not path.is_file():
         raise TuningError(f"{path}: no such file; give the path of a flight log: {known_formats()}")
-    with path.open("rb") as stream:
-        head = stream.read(HEAD_BYTES)
-    for beginning, advice in UNSUPPORTED.items():
-        if head.startswith(beginning):
-            raise TuningError(f"{path}: {advice}")
-    found = next((row for row in FORMATS if row.matches(head)), None)
+    found, head = log_format(path)
     if found is None:
         raise TuningError(f"{path}: not a flight log: it begins with {head[:8]!r}; known formats: {known_formats()}")
     module, _, function = found.reader.partition(":")
