@@ -13,8 +13,37 @@ from mimopilot.tuning.motors import Motors
 
 Signal = NDArray[np.float64]
 
+#: Names of the signals of an experiment, and of those of its yaw axis.
+SIGNALS = ("u", "y_i", "y_o", "u_bar", "r_bar", "r_o", "r_i")
 #: Share of the samples that are within the size of a flight's manoeuvres.
 NEARLY_ALL = 0.999
+
+
+@dataclass(frozen=True, eq=False)
+class YawSignals:
+    """Signals of the yaw axis, in the rows of the experiment that holds them.
+
+    Attributes
+    ----------
+    u : (N,) array
+        Yaw torque (normalised) applied to the plant, after injection and saturation.
+    y_i, y_o : (N,) arrays, rad/s, rad
+        Measured yaw rate (body) and heading, without jumps of 2 pi.
+    u_bar : (N,) array or None
+        Injected excitation, part of u. None: not logged.
+    r_bar : (N,) array or None, rad/s
+        Excitation injected into the rate setpoint, part of r_i: PX4's own autotune. None: not logged.
+    r_o, r_i : (N,) arrays or None, rad, rad/s
+        Heading and yaw rate setpoints. None: not logged.
+    """
+
+    u: Signal
+    y_i: Signal
+    y_o: Signal
+    u_bar: Signal | None = None
+    r_bar: Signal | None = None
+    r_o: Signal | None = None
+    r_i: Signal | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +76,8 @@ class Experiment:
         Defects of a usable log: damage, parameters that changed.
     amplitude : float or None, rad
         Size of the manoeuvres of the whole flight, also outside of the experiment. None: not known.
+    yaw : YawSignals or None
+        The same of the yaw axis. None: its torque, rate or heading is not logged.
 
     Raises
     ------
@@ -69,25 +100,32 @@ class Experiment:
     motors: Motors | None = None
     warnings: tuple[str, ...] = ()
     amplitude: float | None = None
+    yaw: YawSignals | None = None
 
     def __post_init__(self) -> None:
         if not self.segments:
             object.__setattr__(self, "segments", ((0, len(self.u)),))
-        for name in ("u", "y_i", "y_o", "u_bar", "r_bar", "r_o", "r_i"):
-            signal = getattr(self, name)
-            if signal is None:
-                continue
-            if signal.ndim != 2 or signal.shape != self.u.shape:
-                raise TuningError(f"{self.source}: {name}: got shape {signal.shape}, expected {self.u.shape}")
-            for start, stop in self.segments:
-                if not 0 <= start < stop <= len(signal):
-                    raise TuningError(f"{self.source}: segment {start}..{stop}: expected a part of 0..{len(signal)}")
-                bad = np.flatnonzero(~np.isfinite(signal[start:stop]).all(axis=1))
-                if len(bad):
-                    raise TuningError(
-                        f"{self.source}: {name} is not finite at {len(bad)} samples, first at "
-                        f"{(start + bad[0]) * self.Ts:.3f} s; cut that stretch out of the log"
-                    )
+        for name in SIGNALS:
+            self._check(name, getattr(self, name), self.u.shape)
+            if self.yaw is not None:
+                self._check(f"yaw.{name}", getattr(self.yaw, name), self.u.shape[:1])
+
+    def _check(self, name: str, signal: Signal | None, shape: tuple[int, ...]) -> None:
+        """Refuse a signal of another shape, or with a sample in a segment that is not finite."""
+        if signal is None:
+            return
+        if signal.shape != shape or self.u.ndim != 2:
+            raise TuningError(f"{self.source}: {name}: got shape {signal.shape}, expected {shape}")
+        for start, stop in self.segments:
+            if not 0 <= start < stop <= len(signal):
+                raise TuningError(f"{self.source}: segment {start}..{stop}: expected a part of 0..{len(signal)}")
+            finite = np.isfinite(signal[start:stop])
+            bad = np.flatnonzero(~(finite if finite.ndim == 1 else finite.all(axis=1)))
+            if len(bad):
+                raise TuningError(
+                    f"{self.source}: {name} is not finite at {len(bad)} samples, first at "
+                    f"{(start + bad[0]) * self.Ts:.3f} s; cut that stretch out of the log"
+                )
 
     @property
     def seconds(self) -> float:
