@@ -49,8 +49,8 @@ from mimopilot.sitl.mavlink.wire.sockets import udp_socket
 GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
 #: Default baud rate: that of a SiK telemetry radio.
 BAUD = 57600
-#: Name of the DEBUG_VECT in which the vehicle reports its injector's state.
-EXCITATION = "MIMO_EXC"
+#: Names of the DEBUG_VECT in which the vehicle reports its injector's state, and the phases as z.
+EXCITATION, PHASES = ("MIMO_EXC", "MIMO_EXY"), (-1, 0, 1, 2, 3)
 FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
 #: Timeout of connecting and of a blocking write, s; chosen.
 CONNECT_S = 5.0
@@ -79,7 +79,7 @@ def from_mavlink(message: Any) -> Incoming | None:
         return AttitudeReport(*sender, message.roll, message.pitch)
     if kind == "EXTENDED_SYS_STATE":
         return LandedState(*sender, message.landed_state)
-    if kind == "DEBUG_VECT" and message.name == EXCITATION and message.z in (-1, 0, 1, 2):
+    if kind == "DEBUG_VECT" and message.name in EXCITATION and message.z in PHASES:
         return InjectorState(*sender, int(message.z), message.time_usec)
     if kind == "STATUSTEXT":
         return StatusText(*sender, message.text)

@@ -30,7 +30,7 @@ PX4 = 12  # MAV_AUTOPILOT_PX4
 #: Bits of SDLOG_PROFILE that tuning from a log needs: default, high rate, debug topics.
 LOG_PROFILE, NEEDED = "SDLOG_PROFILE", 1 | 16 | 32
 #: --axis -> value of `AXIS`.
-AXES = {"roll": 1, "pitch": 2, "both": 3}
+AXES = {"roll": 1, "pitch": 2, "both": 3, "yaw": 4, "all": 5}
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class ExcitationOptions:
     axis: str
     seconds_per_axis: float
     amplitude: float
+    yaw_amplitude: float
     bandwidth: float
     seed: int
     mode: str
@@ -63,6 +64,7 @@ def settings(excitation: ExcitationOptions, Ts: float) -> dict[str, float]:
     values = {
         AXIS: AXES[excitation.axis],
         "MIMO_EX_AMP": excitation.amplitude,
+        "MIMO_EX_AMPY": excitation.yaw_amplitude,
         "MIMO_EX_HMIN": hold_min,
         "MIMO_EX_HMAX": hold_max,
         "MIMO_EX_DUR": excitation.seconds_per_axis,
