@@ -20,17 +20,6 @@ Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
 
-def singular_values(matrices: Complex) -> tuple[Signal, Signal]:
-    """Largest and smallest singular value of 2x2 matrices (..., 2, 2), each (...).
-
-    In closed form: LAPACK's would take half of a tuning's time.
-    """
-    size = np.sum(np.abs(matrices) ** 2, axis=(-2, -1))
-    determinant = np.abs(matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0])
-    largest = np.sqrt((size + np.sqrt(np.maximum(size**2 - 4 * determinant**2, 0.0))) / 2)
-    return largest, determinant / np.where(largest > 0, largest, 1.0)
-
-
 @dataclass(frozen=True, eq=False)
 class CascadeLoop:
     """Frequency responses of a gain set around a plant, (K, 2, 2) each.

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop
 from mimopilot.tuning.parameter_row import ROLL_PITCH
+from mimopilot.tuning.two_by_two import inverse, singular_values
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
@@ -16,13 +17,12 @@ Signal = NDArray[np.float64]
 
 def sensitivity(loop: CascadeLoop) -> Complex:
     """S = (I + L_u)^-1 at the plant's input, (K, 2, 2)."""
-    S: Complex = np.linalg.inv(np.eye(2) + loop.L_u).astype(np.complex128)
-    return S
+    return inverse(np.eye(2) + loop.L_u)
 
 
 def peak(S: Complex) -> float:
     """Ms: the largest singular value of a sensitivity (K, 2, 2) over all frequencies."""
-    return float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
+    return float(singular_values(S)[0].max())
 
 
 def disk_margin(S: Complex) -> float:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mimopilot.tuning.analysis.closed_loop import singular_values
 from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, PERIODS, Manoeuvres, manoeuvres
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
@@ -15,6 +14,7 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import DesignLimits
+from mimopilot.tuning.two_by_two import singular_values
 
 #: Time after a doublet that its RMS counts, s.
 TAIL = 1.0
