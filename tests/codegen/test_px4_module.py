@@ -264,14 +264,14 @@ def test_yaw_follows_roll_and_pitch_with_its_own_amplitude_longer_pulses_and_nam
     assert set(np.abs(x[roll])) == {np.float32(0.1)} and set(np.abs(x[yaw])) == {np.float32(0.25)}
     assert x[yaw[-1] + 1] == 0 and code[yaw[-1] + 1] == -1
     short, long = (pulses(np.sign(values)) for values in (x[roll], x[yaw]))
-    assert 2 <= short.min() and short.max() <= 9 and 4 <= long.min() and long.max() <= 18 and long.max() > 9
+    assert short.min() >= 2 and short.max() <= 9 and long.min() >= 4 and long.max() <= 18 and long.max() > 9
     # The core gets it, and the topic says how far the vehicle has turned: it stands still here.
     injected = np.column_stack([np.where(on_yaw, 0, x), np.where(on_yaw, 0, y), np.where(on_yaw, x, 0)])
     assert_same_bits(result.out["torque"], native_outputs(gains, level_inputs(len(x), excitation=injected))["moment"])
     assert not y[on_yaw].any()
 
 
-@pytest.mark.parametrize(("rate", "samples"), [(2.1, 0), (-2.1, 0), (1.9, 105), (-1.0, 200)])
+@pytest.mark.parametrize(("rate", "samples"), [(2.1, 0), (-2.1, 0), (1.9, 105), (-1.2, 166)])
 def test_yaw_stops_when_it_turns_faster_than_2_rad_s_or_by_more_than_0_8_rad(program, rate, samples):
     setup = ["param MIMO_EX_DUR 10", *AIRBORNE, *[STEP] * 300, "param MIMO_EX_AX 4", *[STEP] * 300]
     result = drive(program, [*setup, *[f"gyro 4000 0 0 {rate}"] * 300, "status"])
