@@ -18,7 +18,8 @@ from mimopilot.sitl.physics.state_estimate import quaternion_of
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import IDENTITY, PARAMETERS
 
-EXCITATION_NAME = b"MIMO_EXC"  # of the debug_vect topic that carries the excitation, as in the firmware
+#: Names of the debug_vect messages with the injected torque, as in the firmware: x, y on roll and pitch; x on yaw.
+EXCITATION_NAME, YAW_EXCITATION_NAME = b"MIMO_EXC", b"MIMO_EXY"
 
 
 def quaternions(angles: NDArray[Any]) -> NDArray[np.float32]:
@@ -45,7 +46,7 @@ def flight_log_bytes(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
         Gains in flight, logged as parameters of the vehicle.
     """
     truth = flight.truth
-    topics = _autopilot_topics(flight.record, len(airframe.rotors)) | {
+    topics = _autopilot_topics(flight.record, len(airframe.rotors), flight.scenario.Ts) | {
         "vehicle_attitude_groundtruth": {"q": quaternions(truth["attitude"])},
         "vehicle_angular_velocity_groundtruth": {"xyz": truth["rates"].astype(np.float32)},
         "vehicle_local_position_groundtruth": {
@@ -75,7 +76,7 @@ def vehicle_log(
     gains : (36,) float32 array
         Gains in flight, in the order of `tuning.parameters.PARAMETERS`.
     """
-    topics = _autopilot_topics(record, len(airframe.rotors)) | {
+    topics = _autopilot_topics(record, len(airframe.rotors), Ts) | {
         "vehicle_land_detected": {"landed": landed.astype(np.uint8)},
         "actuator_armed": {"armed": np.ones(len(record), np.uint8)},
     }
@@ -96,11 +97,12 @@ def _ulog_file(
     return ulog_bytes(Ts, topics, parameters, information)
 
 
-def _autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, NDArray[Any]]]:
+def _autopilot_topics(record: NDArray[Any], rotors: int, Ts: float) -> dict[str, dict[str, NDArray[Any]]]:
     """Topics of the inputs and outputs of the autopilot."""
     excitation = record["excitation"]
-    # z is the excited axis: 0 roll, 1 pitch, -1 none.
-    active = np.where(excitation[:, 0] != 0, 0, np.where(excitation[:, 1] != 0, 1, -1)).astype(np.float32)
+    # One message a period, as in the firmware; z is the excited axis, numbered as `ExcitationPhase`.
+    on_yaw = excitation[:, 2] != 0
+    active = np.select([excitation[:, 0] != 0, excitation[:, 1] != 0, on_yaw], [0, 1, 3], -1).astype(np.float32)
     thrust = np.zeros_like(excitation)
     thrust[:, 2] = -record["collective"]
     return {
@@ -120,12 +122,18 @@ def _autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, 
         "actuator_motors": {"control": record["commands"][:, :rotors]},
         "control_allocator_status": {"unallocated_torque": record["unallocated"]},
         "debug_vect": {
-            "x": excitation[:, 0],
-            "y": excitation[:, 1],
+            "x": np.where(on_yaw, excitation[:, 2], excitation[:, 0]),
+            "y": np.where(on_yaw, _turned(record["rates"][:, 2], on_yaw, Ts), excitation[:, 1]),
             "z": active,
-            "name": np.full(len(record), EXCITATION_NAME, "S10"),
+            "name": np.where(on_yaw, np.array(YAW_EXCITATION_NAME, "S10"), np.array(EXCITATION_NAME, "S10")),
         },
     }
+
+
+def _turned(rate: NDArray[Any], on_yaw: NDArray[np.bool_], Ts: float) -> NDArray[np.float32]:
+    """How far the vehicle has turned since yaw's excitation began, rad, as y of MIMO_EXY says."""
+    turned = np.cumsum(np.where(on_yaw, rate, 0.0)) * Ts
+    return turned.astype(np.float32)
 
 
 def save_flight(path: Path, flight: Flight, airframe: Airframe, gains: Gains) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.beyond_band import loop_gain_above
-from mimopilot.tuning.analysis.closed_loop import CascadeLoop, singular_values, slow_growth, whole_loop
+from mimopilot.tuning.analysis.closed_loop import CascadeLoop, slow_growth, whole_loop
 from mimopilot.tuning.analysis.stability_figures import nominal_and_drawn_loops, stability_figures
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.certificate import Verdict
@@ -27,6 +27,7 @@ from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.plant.frequency_response import DRAWS, MIN_FREQUENCIES, PlantResponse
 from mimopilot.tuning.plant.rigid_body_fit import continued_below, rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel
+from mimopilot.tuning.small_matrices import singular_values
 
 #: sigma_max(S_d X), error included, above which the cross terms count: below it they change the sensitivity by at most
 #: a ninth, as much as the certificate's own errors.

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from mimopilot.tuning.design.free_gains import ACCELERATION, FreeGains
 from mimopilot.tuning.law import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, model_response, rate_response
 from mimopilot.tuning.plant.wide_response import WideResponse
+from mimopilot.tuning.small_matrices import inverse
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
@@ -109,7 +110,7 @@ class LoopGradient:
     @cached_property
     def S(self) -> Complex:  # noqa: N802
         """Sensitivity at u, (K, n, n)."""
-        return np.linalg.inv(np.eye(self.plant.axes) + self.L_u).astype(np.complex128)
+        return inverse(np.eye(self.plant.axes) + self.L_u)
 
     @cached_property
     def _model(self) -> tuple[Complex, Complex, Complex]:

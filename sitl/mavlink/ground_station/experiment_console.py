@@ -12,7 +12,8 @@ import typer
 from mimopilot.common.console import print_json, print_table
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
+from mimopilot.sitl.flight.excitation_flight import VEHICLE_YAW_AMPLITUDE
+from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
 from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import (
     INTEGERS,
     NAMES,
@@ -30,7 +31,7 @@ PX4 = 12  # MAV_AUTOPILOT_PX4
 #: Bits of SDLOG_PROFILE that tuning from a log needs: default, high rate, debug topics.
 LOG_PROFILE, NEEDED = "SDLOG_PROFILE", 1 | 16 | 32
 #: --axis -> value of `AXIS`.
-AXES = {"roll": 1, "pitch": 2, "both": 3}
+AXES = {"roll": 1, "pitch": 2, "both": 3, "yaw": 4, "all": 5}
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class ExcitationOptions:
     seed: int
     mode: str
     tilt_deg: float
+    yaw_amplitude: float = VEHICLE_YAW_AMPLITUDE
 
 
 def settings(excitation: ExcitationOptions, Ts: float) -> dict[str, float]:
@@ -63,6 +65,7 @@ def settings(excitation: ExcitationOptions, Ts: float) -> dict[str, float]:
     values = {
         AXIS: AXES[excitation.axis],
         "MIMO_EX_AMP": excitation.amplitude,
+        "MIMO_EX_AMPY": excitation.yaw_amplitude,
         "MIMO_EX_HMIN": hold_min,
         "MIMO_EX_HMAX": hold_max,
         "MIMO_EX_DUR": excitation.seconds_per_axis,
@@ -97,8 +100,7 @@ def experiment(options: LinkOptions, excitation: ExcitationOptions) -> None:
         wanted = settings(excitation, Ts)
         monitor = vehicle.run(start_monitor(vehicle.client, round(wanted["MIMO_EX_MODE"])))
         on_px4 = vehicle.vehicle.autopilot == PX4
-        if on_px4:
-            _check_log(round(vehicle.read([LOG_PROFILE])[LOG_PROFILE]))
+        check_log(vehicle)
         if not options.as_json:
             rows = [[s.name, shortest(wanted[s.name]), s.unit, s.description] for s in EXCITATION]
             print_table(f"vehicle {vehicle.vehicle.system} hovers", ["parameter", "value", "unit", "description"], rows)
@@ -111,7 +113,15 @@ def experiment(options: LinkOptions, excitation: ExcitationOptions) -> None:
     _report(result, wanted, on_px4, options)
 
 
-def _check_log(profile: int) -> None:
+def check_log(vehicle: Session) -> None:
+    """Refuse a PX4 whose log would be too slow for tuning.
+
+    Raises
+    ------
+    SitlError
+        With the parameter and its value.
+    """
+    profile = round(vehicle.read([LOG_PROFILE])[LOG_PROFILE]) if vehicle.vehicle.autopilot == PX4 else NEEDED
     if profile & NEEDED != NEEDED:
         raise SitlError(
             f"{LOG_PROFILE} is {profile}: the log rate would be too low for tuning; land, set it to {NEEDED}, and "
