@@ -14,7 +14,7 @@ from mimopilot.sitl.flight.flight_log import autopilot_topics, log_information, 
 from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 from mimopilot.sitl.physics.airframe import Airframe
 
-#: Topic -> interval (s) in the default log profile and in that for high rates (logged_topics.cpp of v1.16); 0: each one.
+#: Topic -> interval (s) in the default log profile and in that for high rates (logged_topics.cpp of v1.16); 0: all.
 INTERVALS = {
     "vehicle_angular_velocity": (0.02, 0.0),
     "vehicle_attitude": (0.05, 0.0),

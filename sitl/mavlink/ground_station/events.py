@@ -45,7 +45,7 @@ REASONS = {
 
 
 class Heartbeat(NamedTuple):
-    """HEARTBEAT of an autopilot."""
+    """HEARTBEAT of an autopilot; `simulated`: it says that no real motors turn (MAV_MODE_FLAG_HIL_ENABLED)."""
 
     system: int
     component: int
@@ -53,6 +53,7 @@ class Heartbeat(NamedTuple):
     armed: bool
     mode: int = 0
     type: int = GENERIC
+    simulated: bool = False
 
 
 class ParameterValue(NamedTuple):
@@ -86,7 +87,7 @@ class CommandAck(NamedTuple):
 
 
 class AttitudeReport(NamedTuple):
-    """ATTITUDE: roll and pitch, rad; time since boot, s; body rates, rad/s."""
+    """ATTITUDE: roll and pitch, rad; time since boot, s; body rates, rad/s; yaw, rad."""
 
     system: int
     component: int
@@ -94,6 +95,7 @@ class AttitudeReport(NamedTuple):
     pitch: float
     time: float = 0.0
     rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    yaw: float = 0.0
 
 
 class LandedState(NamedTuple):
@@ -114,11 +116,20 @@ class PowerReport(NamedTuple):
 
 
 class AltitudeReport(NamedTuple):
-    """VFR_HUD: altitude, m."""
+    """VFR_HUD: altitude, m; climb, m/s."""
 
     system: int
     component: int
     altitude: float
+    climb: float = 0.0
+
+
+class ThrustReport(NamedTuple):
+    """ATTITUDE_TARGET: collective (0 to 1) that the vehicle flies with."""
+
+    system: int
+    component: int
+    thrust: float
 
 
 class StorageReport(NamedTuple):
@@ -230,6 +241,17 @@ class SendCommand(NamedTuple):
     params: tuple[float, ...] = ()
 
 
+class AttitudeTarget(NamedTuple):
+    """SET_ATTITUDE_TARGET: roll, pitch and yaw (rad), and collective (0 to 1); body rates are ignored."""
+
+    system: int
+    component: int
+    roll: float
+    pitch: float
+    yaw: float
+    thrust: float
+
+
 class FileRequest(NamedTuple):
     """FILE_TRANSFER_PROTOCOL."""
 
@@ -267,7 +289,16 @@ class EndLogs(NamedTuple):
 #: Pieces of a vehicle's files and logs.
 TransferReport = FileReply | LogEntry | LogData
 #: Flight state that a vehicle streams.
-FlightReport = AttitudeReport | LandedState | PowerReport | AltitudeReport | StorageReport | InjectorState | StatusText
+FlightReport = (
+    AttitudeReport
+    | LandedState
+    | PowerReport
+    | AltitudeReport
+    | ThrustReport
+    | StorageReport
+    | InjectorState
+    | StatusText
+)
 Incoming = Heartbeat | ParameterValue | ParameterRefusal | CommandAck | FlightReport | TransferReport
 Outgoing = (
     GroundHeartbeat
@@ -277,6 +308,7 @@ Outgoing = (
     | SetMessageInterval
     | RequestMessage
     | SendCommand
+    | AttitudeTarget
     | FileRequest
     | RequestLogs
     | RequestLogData

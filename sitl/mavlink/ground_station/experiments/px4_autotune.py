@@ -157,7 +157,7 @@ class Px4Autotune(ExperimentProfile):
             )
         if options.mode not in EXCITED_MODES:
             raise SitlError(f"--mode: got {options.mode!r}, expected one of {', '.join(EXCITED_MODES)}")
-        if options.axis is not None:
+        if options.axis not in (None, "all"):
             raise SitlError("--axis: PX4's autotune excites roll, pitch and yaw, one after the other; leave it out")
         self.runs = DEFAULT_RUNS if options.runs is None else options.runs
         self.amplitude = single(amplitude)
