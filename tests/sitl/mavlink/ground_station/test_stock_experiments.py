@@ -10,7 +10,10 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
 from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import experiment_profile
 from mimopilot.sitl.mavlink.ground_station.profiles import make_restore_plan
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
+from mimopilot.tuning.experiment import external_signal
+from mimopilot.tuning.logs.reader import read_log
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
+from tests.sitl.mavlink.running import Pilot, running_sitl, start
 from tests.sitl.mavlink.stock_vehicles import HOLD, SimulatedSession, StockCopter, StockPx4
 
 PREPARED = {"MC_AT_EN": 1, "MC_AT_APPLY": 0, "SDLOG_PROFILE": 17}
@@ -51,7 +54,7 @@ def test_a_stock_px4_is_prepared_rebooted_excited_and_restored(loss):
     assert (result.complete, result.reason, result.stopped) == (True, "", True)
     assert vehicle.runs == 2
     # Roll, pitch and yaw of two runs.
-    assert result.seconds == pytest.approx(2 * (7.1 + 7.1 + 12.0), abs=6.0 if loss else 3.0)
+    assert result.seconds == pytest.approx(2 * (5.1 + 5.1 + 10.0), abs=8.0 if loss else 2.0)
     restored = profile.restore(session)
     assert restored.complete
     assert vehicle.values == vehicle.before == saved[-1]
@@ -266,3 +269,33 @@ def test_the_command_is_never_sent_to_a_running_px4_as_a_stop():
     profile.excite(session, monitor)
     stops = [m for _, m in session.link.log if isinstance(m, SendCommand) and m.params[0] == 0]
     assert (stops, vehicle.mode) == ([], HOLD)
+
+
+# The command, against `mimopilot sitl --autopilot px4-stock`.
+
+
+def test_the_command_prepares_and_excites_a_stock_px4_whose_log_is_an_experiment(tmp_path, mimopilot):
+    log, old = tmp_path / "flight.ulg", tmp_path / "old.params"
+    with running_sitl("--autopilot", "px4-stock", "--speed", "8", "--log", log) as sitl:
+        pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
+        pilot.ready()
+        assert pilot.beat.autopilot == 12
+        link = ("--connect", f"tcp:127.0.0.1:{sitl.tcp}")
+        options = ("--profile", "px4-stock", "--runs", 1, "--snapshot", old, "--yes")
+        client = start("experiment", *link, *options)
+        client.until("4 parameters set, rebooted; take off and hover now")
+        pilot.ready()
+        assert pilot.command(400, 1) == 0
+        assert pilot.command(22, 0, 0, 0, 0, 0, 0, 5) == 0
+        pilot.wait(lambda: client.process.poll() is not None)
+        client.end()
+        assert client.process.returncode == 0, client.output
+        assert "excited for" in client.output
+        assert pilot.command(21) == 0
+        pilot.hears("logged: flight.ulg")
+        same = mimopilot("restore", old, *link, "--dry-run")
+        assert same.returncode == 0, same.stderr
+        pilot.close()
+    assert "MC_AT_EN\t0.0\t6" in old.read_text()
+    signal, name = external_signal(read_log(log))
+    assert (name, signal.any(axis=0).all()) == ("r_bar", True)
