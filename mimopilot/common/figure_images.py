@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from mimopilot.common.charts import PIXELS_PER_INCH, svg
-from mimopilot.common.figures import Chart, HeatMap, LimitLine, Line, Panel, Spread, SpanMark
+from mimopilot.common.figures import Chart, HeatMap, Line, Panel, SpanMark, Spread
 from mimopilot.common.files import inside, write_atomically
 
 #: Width of a figure, inches, and pixels of `Panel.height` in an inch.
@@ -70,7 +69,7 @@ def _draw(axes: Any, panel: Panel, figure: Figure) -> None:
         if isinstance(mark, SpanMark):
             span = axes.axhspan if mark.across else axes.axvspan
             span(mark.begin, mark.end, color=mark.colour, alpha=mark.opacity, linewidth=0, label=mark.label or None)
-        elif isinstance(mark, LimitLine):
+        else:
             straight = axes.axvline if mark.upright else axes.axhline
             straight(mark.at, color=mark.colour, linestyle=mark.dash, linewidth=0.9)
             if mark.label:
@@ -80,16 +79,6 @@ def _draw(axes: Any, panel: Panel, figure: Figure) -> None:
                     {"rotation": 90, "ha": "left", "va": "top"} if mark.upright else {"ha": "right", "va": "bottom"}
                 )
                 axes.text(*place, mark.label, transform=to, color=mark.colour, fontsize=7, clip_on=True, **turned)
-        else:
-            axes.annotate(
-                mark.text,
-                (mark.x, mark.y),
-                xytext=(14, 12),
-                textcoords="offset points",
-                fontsize=7,
-                color=mark.colour,
-                arrowprops={"arrowstyle": "-", "color": mark.colour},
-            )
     axes.set_title(panel.title, loc="left", fontsize=10)
     axes.set_xlabel(panel.x_label, fontsize=9)
     axes.set_ylabel(panel.y_label, fontsize=9)
@@ -120,8 +109,7 @@ def _draw_line(axes: Any, line: Line) -> None:
         "alpha": line.opacity,
         "label": line.label or None,
     }
-    x = np.arange(len(line.x)) if len(line.x) and isinstance(line.x[0], str) else line.x
     if line.error is not None:
-        axes.errorbar(x, line.y, yerr=line.error, capsize=2, **look)
+        axes.errorbar(line.x, line.y, yerr=line.error, capsize=2, **look)
     else:
-        axes.plot(x, line.y, drawstyle="steps-post" if line.step else "default", **look)
+        axes.plot(line.x, line.y, drawstyle="steps-post" if line.step else "default", **look)

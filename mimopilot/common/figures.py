@@ -105,16 +105,6 @@ class LimitLine:
     dash: str = "--"
 
 
-@dataclass(frozen=True)
-class TextMark:
-    """A short text at a point of the panel, with its arrow."""
-
-    x: float
-    y: float
-    text: str
-    colour: str = "#1a1a1a"
-
-
 @dataclass(frozen=True, eq=False)
 class Panel:
     """One pair of axes.
@@ -125,7 +115,7 @@ class Panel:
         With units.
     lines : sequence of Line, Spread or HeatMap
         Drawn in this order.
-    marks : sequence of SpanMark, LimitLine or TextMark
+    marks : sequence of SpanMark or LimitLine
     log_x, log_y : bool
     equal : bool
         One unit of x is as long as one of y.
@@ -140,7 +130,7 @@ class Panel:
     x_label: str
     y_label: str
     lines: Sequence[Line | Spread | HeatMap]
-    marks: Sequence[SpanMark | LimitLine | TextMark] = ()
+    marks: Sequence[SpanMark | LimitLine] = ()
     log_x: bool = False
     log_y: bool = False
     equal: bool = False

@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from mimopilot.common.figures import Chart, HeatMap, LimitLine, Line, Panel, Spread, SpanMark, TextMark
+from mimopilot.common.figures import Chart, HeatMap, LimitLine, Line, Panel, SpanMark, Spread
 
 #: matplotlib's line styles in plotly.
 _DASHES = {"-": "solid", "--": "dash", ":": "dot", "-.": "dashdot"}
 _MARKERS = {"o": "circle", "x": "x-thin-open", "s": "square"}
 #: Largest deviation of x from equal steps, in steps, that is drawn as equal steps: a hundredth of a pixel.
 _UNIFORM = 0.02
-GRID = "#dddddd"
 #: Colours of heat maps: even in lightness, for colour blindness and print.
 SCALE = "Cividis"
 #: Most significant digits of a coordinate in the page: finer than a pixel at any zoom that makes sense.
@@ -65,14 +64,12 @@ def panel_json(panel: Panel) -> dict[str, Any]:
     notes: list[dict[str, Any]] = []
     for mark in panel.marks:
         if isinstance(mark, SpanMark):
-            _add_span(mark, shapes, notes)
-        elif isinstance(mark, LimitLine):
-            _add_limit(mark, panel, shapes, notes)
+            _add_span(mark, shapes)
         else:
-            notes.append(_note(mark, panel))
+            _add_limit(mark, panel, shapes, notes)
     return {
         "data": data,
-        "layout": {**axes, "shapes": shapes, "annotations": notes, "title": {"text": _text(panel.title)}},
+        "layout": {**axes, "shapes": shapes, "annotations": notes},
         "height": panel.height,
     }
 
@@ -140,7 +137,7 @@ def _heat(heat: HeatMap) -> list[dict[str, Any]]:
     ]
 
 
-def _add_span(mark: SpanMark, shapes: list[dict[str, Any]], notes: list[dict[str, Any]]) -> None:
+def _add_span(mark: SpanMark, shapes: list[dict[str, Any]]) -> None:
     along, other = ("y", "x") if mark.across else ("x", "y")
     place = {f"{along}0": _number(mark.begin), f"{along}1": _number(mark.end), f"{other}0": 0, f"{other}1": 1}
     shapes.append(
@@ -173,20 +170,12 @@ def _add_limit(mark: LimitLine, panel: Panel, shapes: list[dict[str, Any]], note
         notes.append({**where, "text": _text(mark.label), "showarrow": False, "font": {"color": mark.colour}})
 
 
-def _note(mark: TextMark, panel: Panel) -> dict[str, Any]:
-    x = _number(np.log10(mark.x) if panel.log_x else mark.x)
-    y = _number(np.log10(mark.y) if panel.log_y else mark.y)
-    font = {"color": mark.colour}
-    arrow = {"showarrow": True, "arrowhead": 0, "arrowwidth": 1, "arrowcolor": mark.colour, "ax": 24, "ay": -22}
-    return {"x": x, "y": y, "text": _text(mark.text), "font": font, "bgcolor": "rgba(255,255,255,0.7)", **arrow}
-
-
 def _legend(label: str) -> dict[str, Any]:
     return {"name": _text(label), "showlegend": bool(label)} if label else {"showlegend": False, "hoverinfo": "skip"}
 
 
 def _abscissa(x: Any) -> dict[str, Any]:
-    """x of a line; equal steps take two numbers."""
+    """Abscissa of a line; equal steps take two numbers."""
     if not isinstance(x, np.ndarray) or x.dtype.kind not in "fi" or len(x) < 3:
         return {"x": _array(x)}
     step = (x[-1] - x[0]) / (len(x) - 1)
@@ -196,9 +185,7 @@ def _abscissa(x: Any) -> dict[str, Any]:
 
 
 def _array(values: Any) -> Any:
-    """Numbers in single precision, as bytes that plotly.js reads; names stay names."""
-    if len(values) and isinstance(values[0], str):
-        return [_text(value) for value in values]
+    """Numbers in single precision, as bytes that plotly.js reads."""
     return _packed(np.asarray(values, "<f4"), "f4")
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mimopilot.common.errors import Error
-from mimopilot.common.html_report import Headline, Section, write_report
-from mimopilot.sitl.field.report.flight_data import GainCase, ReportedFlight, gain_cases, read_flights
+from mimopilot.common.figures import Chart
+from mimopilot.common.html_report import Headline, ReportTable, Section, write_report
+from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight, gain_cases, read_flights
 from mimopilot.sitl.field.report.headline import headline, lead
 from mimopilot.sitl.field.report.sections.compare import compare_section
 from mimopilot.sitl.field.report.sections.frequency import frequency_section
@@ -37,6 +38,16 @@ class FlightReport:
     flights: list[ReportedFlight]
     cases: list[GainCase]
 
+    @property
+    def tables(self) -> list[ReportTable]:
+        """The tables of all sections."""
+        return [table for section in self.sections for table in section.tables]
+
+    @property
+    def charts(self) -> list[Chart]:
+        """The figures of all sections."""
+        return [chart for section in self.sections for chart in section.charts]
+
     def write(self, out: Path, figures: Path | None = None) -> list[Path]:
         """Write the page, and its figures as PNG and SVG into a folder; returns the files."""
         write_report(out, self.title, self.lead, self.sections, self.headline)
@@ -44,8 +55,7 @@ class FlightReport:
             return [out]
         from mimopilot.common.figure_images import write_images
 
-        charts = [chart for section in self.sections for chart in section.charts]
-        return [out, *write_images(charts, figures)]
+        return [out, *write_images(self.charts, figures)]
 
 
 def make_report(

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from mimopilot.common.html_report import Headline
-from mimopilot.sitl.field.report.filters_advice import least_phase
-from mimopilot.sitl.field.report.flight_data import GainCase, ReportedFlight
+from mimopilot.sitl.field.report.analysis.filters_advice import least_phase
+from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight
 from mimopilot.tuning.certificate import Verdict
 
 #: Verdict -> colour of the conclusion.
@@ -52,7 +52,7 @@ def headline(flights: Sequence[ReportedFlight], cases: Sequence[GainCase]) -> He
             f"Find better gains from this flight: mimopilot tune {log} --out my.gains.toml --report tuned.html"
         )
     elif certificate.verdict == Verdict.CERTIFIED:
-        steps.append("Put them on the vehicle: mimopilot upload FILE.gains.toml --connect DEVICE,BAUD")
+        steps.append("Put them on the vehicle: mimopilot upload GAINS --connect DEVICE,BAUD")
     else:
         steps.append(f"Do not fly them: tune again (mimopilot tune {log} --out my.gains.toml). {certificate.reason}.")
     return Headline(sentence, steps, "bad" if crashed else TONES.get(certificate.verdict, "bad"))

@@ -9,11 +9,13 @@ import numpy as np
 from mimopilot.common.charts import NEW
 from mimopilot.common.figures import Chart, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.filters_advice import least_phase, torque_rms
-from mimopilot.sitl.field.report.flight_data import GainCase
+from mimopilot.sitl.field.report.analysis.filters_advice import least_phase, torque_rms
+from mimopilot.sitl.field.report.analysis.flight_data import GainCase
+from mimopilot.sitl.field.report.sections.gain_sets import PREDICTED, predicted
 from mimopilot.sitl.field.report.sections.spectra import FlightSpectra
 from mimopilot.sitl.field.report.sections.steps import step_estimates
 from mimopilot.sitl.field.report.sections.tracking import tracking_error
+from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.inspection import AXES
 
 HEADING = "Before and after"
@@ -31,7 +33,7 @@ def compare_section(found: Sequence[FlightSpectra], cases: Sequence[GainCase]) -
         )
     elif len(cases) > 1:
         pair = cases[0], cases[-1]
-        figures, labels, charts = [_set_figures(one) for one in pair], (pair[0].label, pair[1].label), []
+        figures, labels, charts = [_set_figures(one, pair[1].gains) for one in pair], (pair[0].label, pair[1].label), []
         text = f"Before: {labels[0]}. After: {labels[1]}, around the vehicle of {pair[1].flight.label}."
     else:
         return None
@@ -49,7 +51,7 @@ def difference_table(labels: tuple[str, str], figures: Sequence[Mapping[str, flo
         if np.isfinite(before) and np.isfinite(after):
             share = f"{(after / before - 1):+.0%}" if before else "-"
             rows.append([name, f"{before:.4g}", f"{after:.4g}", f"{after - before + 0.0:+.3g}", share])
-    return ReportTable(HEADING, ("", *labels, "difference", "in percent"), rows)
+    return ReportTable("Figures", ("", *labels, "difference", "in percent"), rows)
 
 
 def _flight_figures(one: FlightSpectra) -> dict[str, float]:
@@ -67,11 +69,11 @@ def _flight_figures(one: FlightSpectra) -> dict[str, float]:
         power = one.gyro.density[above].sum(axis=0) * one.gyro.hertz[0]
         if above.any():
             figures["gyro above 30 Hz, RMS, largest axis [deg/s]"] = float(np.degrees(np.sqrt(power.max())))
-    figures["torque above 30 Hz, RMS, larger axis"] = torque_rms(one.torque)
+    figures["torque above 30 Hz, RMS, larger axis"] = torque_rms(one.own_torque)
     return figures
 
 
-def _set_figures(case: GainCase) -> dict[str, float]:
+def _set_figures(case: GainCase, model: Gains) -> dict[str, float]:
     certificate = case.gains.certificate
     if case.problem or certificate is None or not certificate.figures:
         return {}
@@ -79,6 +81,10 @@ def _set_figures(case: GainCase) -> dict[str, float]:
     figures["disk margin"] = certificate.figures["disk_margin"]
     for axis in AXES:
         figures[f"delay margin, {axis} [ms]"] = certificate.figures["delay_margin_ms"][axis]
+    found = predicted(case, model)
+    for name, title in PREDICTED.items() if found else ():
+        for axis, value in zip(AXES, getattr(found, name), strict=True):
+            figures[f"{title}, {axis}"] = value
     return figures
 
 

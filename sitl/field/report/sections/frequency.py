@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.common.charts import LIMIT
-from mimopilot.common.figures import Chart, LimitLine, Line, Panel, Spread, SpanMark
+from mimopilot.common.figures import Chart, LimitLine, Line, Panel, SpanMark, Spread
 from mimopilot.common.html_report import Section
-from mimopilot.sitl.field.report.flight_data import GainCase, ReportedFlight
+from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight
 from mimopilot.tuning.logs.inspection import AXES
 from mimopilot.tuning.plant.frequency_response import COHERENT, GROWTH, PlantResponse
 from mimopilot.tuning.plant.local_polynomial import FREEDOM

@@ -9,10 +9,16 @@ import numpy as np
 from mimopilot.common.charts import MODEL_COLOUR, SETPOINT_COLOUR
 from mimopilot.common.figures import Chart, Line, Panel, Spread
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.flight_data import GainCase
-from mimopilot.sitl.field.report.predicted_motion import PERIOD, PredictedMotion, doublet_setpoint, predicted_motion
+from mimopilot.sitl.field.report.analysis.flight_data import GainCase
+from mimopilot.sitl.field.report.analysis.predicted_motion import (
+    PERIOD,
+    PredictedMotion,
+    doublet_setpoint,
+    predicted_motion,
+)
 from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, STEP_ACCELERATION, manoeuvres
-from mimopilot.tuning.design.prediction import predict
+from mimopilot.tuning.design.prediction import Prediction, predict
+from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.inspection import AXES
 from mimopilot.tuning.parameter_row import Shape
 from mimopilot.tuning.parameters import rows
@@ -45,11 +51,14 @@ def gains_section(cases: Sequence[GainCase]) -> Section:
         panels.append(Panel(name, "output<-error", unit, lines, x_names=ELEMENTS, height=240))
     order = [f"{name} {element}" for name in names for element in ELEMENTS]
     columns = ["", *(case.label for case in cases)]
-    values = {(row[0], row[1]): row[2] for row in table}
-    body = [[element, *(values.get((element, case.label), "") for case in cases)] for element in order]
+    cells = {(row[0], row[1]): row[2] for row in table}
+    body = [[element, *(cells.get((element, case.label), "") for case in cases)] for element in order]
     body.append(["derivative filter", *(_hertz(case.gains.derivative_cutoff_hz) for case in cases)])
     body.append(["control rate", *(f"{1 / case.gains.Ts:g} Hz" for case in cases)])
-    caption = "Bars: two standard deviations, the spread to expect if the flight were repeated. A set without bars was not estimated."
+    caption = (
+        "Bars: two standard deviations, the spread to expect if the flight were repeated. A set without bars was not "
+        "estimated."
+    )
     return Section(
         "Gains",
         charts=[Chart("gains", caption, panels, linked=False)],
@@ -148,26 +157,33 @@ def _torque_panel(motions: Sequence[tuple[GainCase, PredictedMotion]], axis: int
     return Panel(f"step of torque on {AXES[axis]}: {AXES[axis]}", "time [s]", "[deg]", lines)
 
 
+#: Predicted figures -> what they are.
+PREDICTED = {
+    "follow_deg": "error to the model in doublets [deg]",
+    "offaxis_deg": "other axis in doublets [deg]",
+    "disturbance_deg": "after the step of torque [deg]",
+    "noise": "torque at hover from noise",
+}
+
+
+def predicted(case: GainCase, model: Gains) -> Prediction | None:
+    """The figures that `tune` compares sets by, against the attitude model of `model`; None: they cannot be had."""
+    wide = case.flight.wide
+    if wide is None or not _is_stable(case) or abs(case.gains.Ts / wide.Ts - 1) > SAME_PERIOD:
+        return None
+    outer = (model.provenance.outer_model or (None,))[0]
+    task = manoeuvres(wide, outer.discretise(wide.Ts) if outer else model.reference_models(0)[1])
+    return predict(case.gains, wide, task)
+
+
 def _figures(motions: Sequence[tuple[GainCase, PredictedMotion]]) -> ReportTable:
-    """The figures that `tune` compares sets by, against one attitude model."""
+    """The predicted figures of all sets, against one attitude model."""
     model = next((c.gains for c, _ in reversed(motions) if c.gains.provenance.outer_model), motions[0][0].gains)
-    table: dict[str, list[str]] = {}
-    names = {
-        "follow_deg": f"error to the model ({model.reference_models(0)[1].label}) in doublets [deg]",
-        "offaxis_deg": "other axis in doublets [deg]",
-        "disturbance_deg": "after the step of torque [deg]",
-        "noise": "torque at hover from noise",
-    }
-    for case, _ in motions:
-        wide = case.flight.wide
-        assert wide is not None
-        assert abs(case.gains.Ts / wide.Ts - 1) <= SAME_PERIOD
-        outer = (model.provenance.outer_model or (None,))[0]
-        task = manoeuvres(wide, outer.discretise(wide.Ts) if outer else model.reference_models(0)[1])
-        found = predict(case.gains, wide, task)
-        for name, title in names.items():
-            pair = getattr(found, name)
-            digits = 4 if name == "noise" else 2
-            table.setdefault(title, []).append(" / ".join(f"{value:.{digits}f}" for value in pair))
-    rows_ = [[title, *cells] for title, cells in table.items()]
-    return ReportTable("Predicted figures, RMS, roll / pitch", ("", *(case.label for case, _ in motions)), rows_)
+    found = [predicted(case, model) for case, _ in motions]
+    rows_ = []
+    for name, title in PREDICTED.items():
+        digits = 4 if name == "noise" else 2
+        pairs = [getattr(one, name) for one in found if one is not None]
+        rows_.append([title, *(" / ".join(f"{value:.{digits}f}" for value in pair) for pair in pairs)])
+    caption = f"Predicted figures, RMS, roll / pitch; the model is {model.reference_models(0)[1].label}"
+    return ReportTable(caption, ("", *(case.label for case, _ in motions)), rows_)

@@ -10,12 +10,10 @@ import numpy as np
 from mimopilot.common.charts import FLOWN, NEW, SISO
 from mimopilot.common.figures import Chart, HeatMap, LimitLine, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.filters_advice import NOISE_FROM, FilterChange, filter_changes, least_phase
-from mimopilot.sitl.field.report.flight_data import GainCase, ReportedFlight
-from mimopilot.sitl.field.report.loop_filters import LoopFilter, filters_of
-from mimopilot.sitl.field.report.sections.stability import crossover, loops_of
-from mimopilot.sitl.field.report.sections.steps import usable
-from mimopilot.sitl.field.report.vibration import (
+from mimopilot.sitl.field.report.analysis.filters_advice import NOISE_FROM, FilterChange, filter_changes, least_phase
+from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight
+from mimopilot.sitl.field.report.analysis.loop_filters import LoopFilter, filters_of
+from mimopilot.sitl.field.report.analysis.vibration import (
     AirSpectrum,
     Tone,
     air_spectrum,
@@ -24,6 +22,8 @@ from mimopilot.sitl.field.report.vibration import (
     over_thrust,
     spectrogram,
 )
+from mimopilot.sitl.field.report.sections.stability import crossover, loops_of
+from mimopilot.sitl.field.report.sections.steps import usable
 from mimopilot.tuning.certificate import Thresholds
 from mimopilot.tuning.logs.resample import Series
 
@@ -35,11 +35,12 @@ SLOW = 50.0
 
 @dataclass(frozen=True, eq=False)
 class FlightSpectra:
-    """Spectra of one flight; None: not logged, or too slowly."""
+    """Spectra of one flight; None: not logged, or too slowly. `own_torque` is without the injected part."""
 
     flight: ReportedFlight
     gyro: AirSpectrum | None
     torque: AirSpectrum | None
+    own_torque: AirSpectrum | None
     motors: AirSpectrum | None
     slices: tuple[np.ndarray, np.ndarray, np.ndarray] | None  # type: ignore[type-arg]
     thrust: np.ndarray | None  # type: ignore[type-arg]
@@ -62,7 +63,27 @@ def flight_spectra(flight: ReportedFlight) -> FlightSpectra:
     of_gyro = spectrum(gyro)
     motors = flight.since_begin(flight.further.motors) if flight.further.motors is not None else None
     tones = find_tones(of_gyro, slices, thrust) if of_gyro is not None and of_gyro.rate >= SLOW else []
-    return FlightSpectra(flight, of_gyro, spectrum(flight.signal("u")), spectrum(motors), slices, thrust, tones)
+    torque = flight.signal("u")
+    return FlightSpectra(
+        flight,
+        of_gyro,
+        spectrum(torque),
+        spectrum(_without_excitation(flight)),
+        spectrum(motors),
+        slices,
+        thrust,
+        tones,
+    )
+
+
+def _without_excitation(flight: ReportedFlight) -> Series | None:
+    """The torque of the controller alone: without what was injected."""
+    torque, injected = flight.signal("u"), flight.signal("u_bar")
+    if torque is None or injected is None:
+        return torque
+    last = np.searchsorted(injected.time, torque.time + 1e-6, side="right") - 1
+    part = np.where((last >= 0)[:, None], injected.values[np.maximum(last, 0)], 0.0)
+    return Series(torque.time, torque.values - part, torque.topic)
 
 
 def spectra_section(found: Sequence[FlightSpectra]) -> Section:
@@ -74,11 +95,14 @@ def spectra_section(found: Sequence[FlightSpectra]) -> Section:
         panels = _panels(one)
         if panels:
             text = f"{label}Power spectral density in the air. Dotted: the tones that stand out of their surroundings."
-            charts.append(Chart(f"spectra-{number + 1}", text, panels))
+            charts.append(Chart(f"spectra-{number + 1}", text, panels, columns=len(panels)))
         maps = _maps(one)
         if maps:
-            text = f"{label}The gyro's spectrum over time and over thrust: propellers move with the thrust, a frame does not."
-            charts.append(Chart(f"spectrogram-{number + 1}", text, maps, linked=False))
+            text = (
+                f"{label}The gyro's spectrum over time and over thrust: propellers move with the thrust, a frame does "
+                "not."
+            )
+            charts.append(Chart(f"spectrogram-{number + 1}", text, maps, columns=len(maps), linked=False))
         points += [label + point for point in _in_words(one)]
     text = "" if charts else "Not shown: no gyro, torque or motor command is logged fast and long enough in the air."
     return Section("Spectra and vibration", text, charts=charts, points=points)
@@ -106,7 +130,7 @@ def filter_section(found: Sequence[FlightSpectra], cases: Sequence[GainCase], th
             "What a change of a filter costs or gives is not said: no gains have a certificate of this flight."
         )
         return Section(heading, "", tables=tables, points=points)
-    changes = filter_changes(case, filters, first.tones, first.torque, thresholds)
+    changes = filter_changes(case, filters, first.tones, first.own_torque, thresholds)
     tables.append(_change_table(changes, case))
     points += advice(changes, first)
     text = (
@@ -206,7 +230,7 @@ def _panels(one: FlightSpectra) -> list[Panel]:
 
 def _floored(density: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
     """A density without zeros, which a logarithm does not show."""
-    return np.maximum(density, 1e-12 * max(float(density.max()), 1e-30))
+    return np.asarray(np.maximum(density, 1e-12 * max(float(density.max()), 1e-30)))
 
 
 def _maps(one: FlightSpectra) -> list[Panel]:
@@ -248,8 +272,6 @@ def _in_words(one: FlightSpectra) -> list[str]:
             False: ", stays while the thrust changes: a mode of the frame, or a resonance",
             None: "",
         }[tone.follows_thrust]
-        axis = AXIS_NAMES[tone.axis]
-        told.append(
-            f"Vibration at {tone.hertz:.1f} Hz{harmonic}: {tone.above_db:.0f} dB above its surroundings, strongest on {axis}{moves}."
-        )
+        loud = f"{tone.above_db:.0f} dB above its surroundings, strongest on {AXIS_NAMES[tone.axis]}"
+        told.append(f"Vibration at {tone.hertz:.1f} Hz{harmonic}: {loud}{moves}.")
     return told

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.common.charts import LIMIT
-from mimopilot.common.figures import Chart, LimitLine, Line, Panel, SpanMark, Spread, TextMark
+from mimopilot.common.figures import Chart, LimitLine, Line, Panel, SpanMark, Spread
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.flight_data import GainCase
+from mimopilot.sitl.field.report.analysis.flight_data import GainCase
 from mimopilot.tuning.analysis import margins
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop, singular_values
 from mimopilot.tuning.analysis.stability_figures import nominal_and_drawn_loops
@@ -76,21 +76,27 @@ def stability_section(cases: Sequence[GainCase], thresholds: Thresholds) -> Sect
         return Section(HEADING, text, points=reasons)
     charts = [
         Chart("sensitivity", _SENSITIVITY, [_sensitivity(found, thresholds), _bode(found)], linked=True),
-        Chart("nyquist", _NYQUIST, [*(_nyquist(found, axis, thresholds) for axis in range(2)), _determinant(found)]),
+        Chart(
+            "nyquist",
+            _NYQUIST,
+            [*(_nyquist(found, axis, thresholds) for axis in range(2)), _determinant(found)],
+            columns=3,
+            linked=False,
+        ),
     ]
     return Section(HEADING, charts=charts, tables=[margin_table([one.case for one in found])], points=reasons)
 
 
 _SENSITIVITY = (
-    "Left: the largest singular value of the sensitivity, cut at both torques; its peak is Ms. Below 1 the loop rejects "
-    "disturbances, above 1 it amplifies them. Bands: two standard deviations. Right: the loop of each axis with the "
-    "other one closed, with its phase margin at the crossover."
+    "Left: the largest singular value of the sensitivity, cut at both torques; its peak is Ms. Below 1 the loop "
+    "rejects disturbances, above 1 it amplifies them. Bands: two standard deviations. Right: the loop of each axis "
+    "with the other one closed; dots and numbers: crossover and phase margin."
 )
 _NYQUIST = (
-    "The loop of each axis with the other one closed: its distance from -1 is the margin. It must stay out of the circle "
-    "about -1, whose radius is 1 over the limit of Ms. Dots: where its gain is 1 (phase margin). Last: the determinant "
-    "det(I + L) - 1 of both axes at once, whose encirclements of -1 decide stability; thin: plants within the log's "
-    "error."
+    "The loop of each axis with the other one closed: its distance from -1 is the margin. It must stay out of the "
+    "circle about -1, whose radius is 1 over the limit of Ms. Dots: where its gain is 1 (phase margin); squares: where "
+    "its phase is -180 degrees (gain margin). Last: the determinant det(I + L) - 1 of both axes at once, whose "
+    "encirclements of -1 decide stability; thin: plants within the log's error."
 )
 
 
@@ -164,14 +170,14 @@ def _band(found: Sequence[CaseLoops]) -> list[SpanMark]:
 
 def _bode(found: Sequence[CaseLoops]) -> Panel:
     lines: list[Line | Spread] = []
-    marks: list[LimitLine | SpanMark | TextMark] = [LimitLine(1.0, colour="#888888"), *_band(found)]
+    marks: list[LimitLine | SpanMark] = [LimitLine(1.0, colour="#888888"), *_band(found)]
     for loops in found:
         for axis, loop in enumerate(loops.axis_loops):
-            label = f"{loops.case.label}, {AXES[axis]}"
-            lines.append(Line(loops.omega, np.abs(loop), label, loops.case.colour, ("-", "--")[axis]))
-            at = crossover(loop, loops.omega)
+            label, at = f"{loops.case.label}, {AXES[axis]}", crossover(loop, loops.omega)
+            phase, _ = margins.phase_margin(loop, loops.omega)
+            margin = f": {phase:.0f} deg" if np.isfinite(phase) else ""
+            lines.append(Line(loops.omega, np.abs(loop), label + margin, loops.case.colour, ("-", "--")[axis]))
             if at > 0:
-                phase, _ = margins.phase_margin(loop, loops.omega)
                 lines.append(
                     Line(
                         np.array([at]),
@@ -182,8 +188,6 @@ def _bode(found: Sequence[CaseLoops]) -> Panel:
                         text=[f"{label}: phase margin {phase:.0f} deg at {at:.0f} rad/s"],
                     )
                 )
-                if not axis:
-                    marks.append(TextMark(at, 1.0, f"{phase:.0f} deg", loops.case.colour))
     return Panel(
         "Loop gain and crossover",
         "frequency [rad/s]; shaded: known",
@@ -220,6 +224,12 @@ def _nyquist(found: Sequence[CaseLoops], axis: int, thresholds: Thresholds) -> P
         points = loop[at] / size[at]
         if len(at):
             lines.append(Line(points.real, points.imag, colour=loops.case.colour, width=0, marker="o", text=text))
+        at = np.flatnonzero((loop.imag[:-1] * loop.imag[1:] < 0) & (loop.real[:-1] < 0))
+        at = at[np.abs(loop.real[at]) < NYQUIST]
+        if len(at):
+            text = [f"{loops.case.label}: gain margin {abs(20 * np.log10(abs(loop[k]))):.0f} dB" for k in at]
+            zero = np.zeros(len(at))
+            lines.append(Line(loop.real[at], zero, colour=loops.case.colour, width=0, marker="s", text=text))
     return _plane(f"Nyquist: {AXES[axis]} loop", lines)
 
 
@@ -245,4 +255,4 @@ def _curve(values: Complex, loops: CaseLoops, width: float, label: str, opacity:
 
 def _plane(title: str, lines: Sequence[Line | Spread]) -> Panel:
     span = (-NYQUIST, NYQUIST)
-    return Panel(title, "real", "imaginary", lines, equal=True, x_range=span, y_range=span, height=420)
+    return Panel(title, "real", "imaginary", lines, equal=True, x_range=span, y_range=span, height=380)

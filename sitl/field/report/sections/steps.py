@@ -9,8 +9,8 @@ import numpy as np
 from mimopilot.common.charts import MODEL_COLOUR
 from mimopilot.common.figures import Chart, LimitLine, Line, Panel, Spread
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.flight_data import ReportedFlight
-from mimopilot.sitl.field.report.step_response import StepEstimate, estimate_step
+from mimopilot.sitl.field.report.analysis.flight_data import ReportedFlight
+from mimopilot.sitl.field.report.analysis.step_response import StepEstimate, estimate_step
 from mimopilot.tuning.logs.flight_phase import BEFORE_TUMBLE, intersection
 from mimopilot.tuning.logs.inspection import AXES
 from mimopilot.tuning.logs.resample import Interval

@@ -9,7 +9,7 @@ import numpy as np
 from mimopilot.common.charts import FLOWN, SISO
 from mimopilot.common.figures import Chart, LimitLine, Line, Panel, thinned
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.flight_data import PHASES, ReportedFlight
+from mimopilot.sitl.field.report.analysis.flight_data import PHASES, ReportedFlight
 from mimopilot.tuning.logs.inspection import AXES
 
 #: Names of the signals, their factor from SI and unit in the table.
@@ -84,8 +84,8 @@ def timeline(flights: Sequence[ReportedFlight], number: int) -> Chart | None:
     named = f" of {flight.label}" if len(flights) > 1 else ""
     return Chart(
         f"timeline-{number + 1}",
-        f"Time{named} from the beginning of the log. Used: what gains are tuned from. Saturated: a torque or a motor at "
-        "its limit in the air. Gaps: pauses of more than five periods in torque, rates or angles.",
+        f"Time{named} from the beginning of the log. Used: what gains are tuned from. Saturated: a torque or a motor "
+        "at its limit in the air. Gaps: pauses of more than five periods in torque, rates or angles.",
         panels,
         columns=1,
     )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mimopilot.common.charts import FURTHER, MODEL_COLOUR, SETPOINT_COLOUR
 from mimopilot.common.figures import Chart, Line, Panel, thinned
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.flight_data import ReportedFlight
+from mimopilot.sitl.field.report.analysis.flight_data import ReportedFlight
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.inspection import AXES
 from mimopilot.tuning.logs.resample import Interval, Series, sampling_period

@@ -1,12 +1,12 @@
 """Step response of a flight whose setpoint moves, by regularised deconvolution.
 
 The setpoint and the answer are cut into stretches that overlap by half. In each the answer is the setpoint convolved
-with the impulse response h, plus a constant: all stretches together are one least squares problem for h. Its prior is a
-zero-mean Gaussian whose variance decays with time and whose neighbours are alike (the tuned/correlated kernel of T. Chen,
-H. Ohlsson, L. Ljung, "On the estimation of transfer functions, regularizations and Gaussian processes", Automatica 48,
-2012); its size and decay are those that make the record most likely. The band holds two parts: the spread of the
-estimates without each stretch in turn (jackknife), and what the prior says about the frequencies at which the setpoint
-does not move.
+with the impulse response h, plus a constant: all stretches together are one least squares problem for h. Its prior is
+a zero-mean Gaussian whose variance decays with time and whose neighbours are alike (the tuned/correlated kernel of T.
+Chen, H. Ohlsson, L. Ljung, "On the estimation of transfer functions, regularizations and Gaussian processes",
+Automatica 48, 2012); its size and decay are those that make the record most likely. The band holds two parts: the
+spread of the estimates without each stretch in turn (jackknife), and what the prior says about the frequencies at
+which the setpoint does not move.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def estimate_step(
     """
     rate = min(RATE, 1 / sampling_period(answer.time), 1 / sampling_period(setpoint.time))
     Ts = 1 / rate
-    length = max(int(round(LENGTH * rate)), 8)
+    length = max(round(LENGTH * rate), 8)
     pieces = []
     for begin, end in parts:
         begin, end = max(begin, setpoint.time[0], answer.time[0]), min(end, setpoint.time[-1], answer.time[-1])
@@ -175,7 +175,7 @@ def _estimated(pieces: Sequence[tuple[Signal, Signal]], length: int, Ts: float, 
     doubt = np.einsum("ij,jk,ik->i", summed @ unseen, prior, summed @ unseen)
     left = power - 2 * h @ right + h @ total @ h
     return StepEstimate(
-        time=np.arange(length) * Ts + early,
+        time=np.asarray(np.arange(length) * Ts + early, np.float64),
         step=np.cumsum(h),
         band=2 * np.sqrt(spread + np.maximum(doubt, 0.0)),
         stretches=n,

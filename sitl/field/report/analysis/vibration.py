@@ -100,7 +100,7 @@ def air_spectrum(series: Series, parts: Sequence[Interval]) -> AirSpectrum | Non
 
     period, pieces = air_pieces(series, parts)
     longest = max((len(piece) for piece in pieces), default=0)
-    length = min(int(round(1 / (RESOLUTION * period))), 2 * longest // (FEWEST_WINDOWS + 1))
+    length = min(round(1 / (RESOLUTION * period)), 2 * longest // (FEWEST_WINDOWS + 1))
     if length < 32 or held_samples(series.values) > 1:
         return None
     total, windows = 0.0, 0
@@ -161,7 +161,7 @@ def spectrogram(series: Series, parts: Sequence[Interval]) -> tuple[Signal, Sign
     from scipy.signal import spectrogram as transform
 
     period = sampling_period(series.time)
-    length = int(round(2 * SLICE / period))
+    length = round(2 * SLICE / period)
     if length < 16 or held_samples(series.values) > 1:
         return None
     times, columns = [], []

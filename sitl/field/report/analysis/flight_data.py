@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.common.charts import FLOWN, FURTHER, NEW, SISO
-from mimopilot.sitl.field.report.further_signals import FurtherSignals, further_signals
+from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals, further_signals
 from mimopilot.tuning.design.cascade import certify_from_log
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
@@ -130,7 +130,7 @@ class ReportedFlight:
         for name in ("u_bar", "r_bar"):
             series = self.signal(name)
             if series is not None and series.values.any():
-                return self._inside(bridged(intervals(series.time, series.values.any(axis=1)), BRIDGE))
+                return self._inside(bridged(intervals(series.time, np.any(series.values != 0, axis=1)), BRIDGE))
         return ()
 
     def _saturated(self) -> tuple[Interval, ...]:
@@ -138,11 +138,11 @@ class ReportedFlight:
         torque, flown, motors = self.signal("u"), self.found.flown, self.further.motors
         if torque is not None and flown is not None:
             limit = np.array(flown.limits.moment_max[:2])
-            parts += intervals(torque.time, (np.abs(torque.values) >= AT_LIMIT * limit).any(axis=1))
+            parts += intervals(torque.time, np.any(np.abs(torque.values) >= AT_LIMIT * limit, axis=1))
         if motors is not None:
             motors = self.since_begin(motors)
             at_end = (motors.values >= 1 - END) | (motors.values <= END)
-            parts += intervals(motors.time, at_end.any(axis=1))
+            parts += intervals(motors.time, np.any(at_end, axis=1))
         return intersection(self._inside(bridged(tuple(sorted(parts)), BRIDGE)), self.airborne)
 
     def _gaps(self) -> tuple[Interval, ...]:

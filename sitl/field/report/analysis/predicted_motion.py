@@ -51,17 +51,20 @@ def predicted_motion(gains: Gains, plant: WideResponse) -> PredictedMotion | Non
     if abs(gains.Ts / plant.Ts - 1) > SAME_PERIOD:
         return None
     time = np.linspace(-BEFORE, SHOWN, POINTS)
-    fine = (np.arange(FREQUENCIES) + 0.5) * (np.pi / plant.Ts * 0.999 / FREQUENCIES)
+    fine: Signal = np.asarray((np.arange(FREQUENCIES) + 0.5) * (np.pi / plant.Ts * 0.999 / FREQUENCIES), np.float64)
     step = fine[1] - fine[0]
     turn = np.exp(1j * np.outer(time, fine)) * (step / np.pi)
     sharp = AMPLITUDE * doublet_spectrum(fine, PERIOD)
-    torque = STEP_ACCELERATION / np.abs(np.diag(plant.body.B)) / (1j * fine[:, None])
+    torque = STEP_ACCELERATION / np.abs(np.diag(plant.body.B))
 
     def motion(around: WideResponse) -> tuple[Signal, Signal]:
         free = free_gains(gains, around.body)
         loop = LoopGradient(around, free, free.vector(gains))
-        T, D = (_between(fine, around.omega, response) for response in (loop.T, loop.D))
-        answers = (T * sharp[:, None, None], D * torque[:, None, :])
+        # D / (j w), the answer to a step, hardly changes where D falls like w: it is what is continued below.
+        answers = (
+            _between(fine, around.omega, loop.T) * sharp[:, None, None],
+            _between(fine, around.omega, loop.D / (1j * around.omega[:, None, None])) * torque,
+        )
         doublet, pushed = ((turn @ one.reshape(len(fine), 4)).real.reshape(-1, 2, 2) for one in answers)
         return np.degrees(doublet), np.degrees(pushed)
 
