@@ -73,6 +73,13 @@ def write_report_of(
     make_report(logs, sets, spec, load_columns(columns) if columns else None).write(out)
 
 
+def check_count(logs: Sequence[Path]) -> None:
+    """Refuse more logs than a page has room for, before the work begins."""
+    from mimopilot.sitl.field.report.flight_report import check_count as check
+
+    check(len(logs))
+
+
 def name_of(gains: Path) -> str:
     """Name of a gains file in a report."""
     return gains.name.removesuffix(".toml").removesuffix(".gains")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ReportOption, warn
-from mimopilot.cli.report import name_of, write_report_of
+from mimopilot.cli.report import check_count, name_of, write_report_of
 from mimopilot.common.console import print_json, print_table, progress_console
 from mimopilot.common.errors import check_not_given
 
@@ -115,6 +115,8 @@ def tune(
         check_not_given(text, instrument=instrument, repeat=repeat, window=window)
     else:
         check_not_given("belongs to the design; leave out --inner and --outer", follow_model=follow_model or None)
+    if report is not None:
+        check_count(logs)
     experiments = [read_warned(log, columns) for log in logs]
     second = read_warned(repeat, columns) if repeat else None
     gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)

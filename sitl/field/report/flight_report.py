@@ -23,8 +23,8 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.spec import TuningSpec
 
-#: Most logs of one page: each adds about a third of a megabyte to plotly's five.
-MOST_LOGS = 3
+#: Most logs of one page, which stays below 6 MB: plotly.js has 4.8, a first log 0.5.
+MOST_LOGS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +58,17 @@ class FlightReport:
         return [out, *write_images(self.charts, figures)]
 
 
+def check_count(logs: int) -> None:
+    """Refuse more logs than a page has room for.
+
+    Raises
+    ------
+    Error
+    """
+    if not 1 <= logs <= MOST_LOGS:
+        raise Error(f"{logs} logs: a report has room for 1 to {MOST_LOGS}; make more than one")
+
+
 def make_report(
     logs: Sequence[Path],
     sets: Sequence[tuple[str, Gains]] = (),
@@ -82,8 +93,7 @@ def make_report(
     Error
         When there are too many logs, a file is no flight log, or two sets have one name.
     """
-    if not 1 <= len(logs) <= MOST_LOGS:
-        raise Error(f"{len(logs)} logs: expected 1 to {MOST_LOGS}; make a report for each of the others")
+    check_count(len(logs))
     task = spec or TuningSpec()
     flights = read_flights(logs, columns)
     cases = gain_cases(flights, sets, task)

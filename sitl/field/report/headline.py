@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from mimopilot.common.html_report import Headline
 from mimopilot.sitl.field.report.analysis.filters_advice import least_phase
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight
-from mimopilot.tuning.certificate import Verdict
+from mimopilot.tuning.certificate import ACCEPTED, Verdict
 
 #: Verdict -> colour of the conclusion.
 TONES = {Verdict.CERTIFIED: "good", Verdict.THIN: "doubt"}
@@ -40,7 +40,7 @@ def headline(flights: Sequence[ReportedFlight], cases: Sequence[GainCase]) -> He
     certificate = case.gains.certificate
     assert certificate is not None
     name = "The gains that flew" if case.flown and len(flights) == 1 else f"The gains '{case.label}'"
-    if certificate.figures:
+    if certificate.verdict in ACCEPTED:
         margins = f"Ms {certificate.figures['Ms']:.2f}, phase margin {least_phase(certificate):.0f} degrees or more"
         sentence = f"{before}{name} are {certificate.verdict} on this vehicle: {margins}."
     else:
@@ -54,7 +54,7 @@ def headline(flights: Sequence[ReportedFlight], cases: Sequence[GainCase]) -> He
     elif certificate.verdict == Verdict.CERTIFIED:
         steps.append("Put them on the vehicle: mimopilot upload GAINS --connect DEVICE,BAUD")
     else:
-        steps.append(f"Do not fly them: tune again (mimopilot tune {log} --out my.gains.toml). {certificate.reason}.")
+        steps.append(f"Tune again before flying them: mimopilot tune {log} --out my.gains.toml")
     return Headline(sentence, steps, "bad" if crashed else TONES.get(certificate.verdict, "bad"))
 
 

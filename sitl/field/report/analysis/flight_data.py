@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.common.charts import FLOWN, FURTHER, NEW, SISO
+from mimopilot.common.figures import MOST_SAMPLES
 from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals, further_signals
 from mimopilot.tuning.design.cascade import certify_from_log
 from mimopilot.tuning.errors import TuningError
@@ -58,6 +59,8 @@ class ReportedFlight:
     further : FurtherSignals
     colour, dash : str
         Of its curves.
+    samples : int
+        Most samples of a line over its time.
     """
 
     label: str
@@ -65,6 +68,7 @@ class ReportedFlight:
     further: FurtherSignals
     colour: str
     dash: str
+    samples: int = MOST_SAMPLES
 
     @property
     def recording(self) -> Recording:
@@ -224,7 +228,8 @@ def read_flights(logs: Sequence[Path], columns: Columns | None) -> list[Reported
     for place, (path, label) in enumerate(zip(logs, labels, strict=True)):
         found = inspect_log(path, columns)
         colour, dash = LOOKS[place % len(LOOKS)]
-        flights.append(ReportedFlight(label, found, further_signals(found.recording), colour, dash))
+        samples = MOST_SAMPLES if len(logs) == 1 else 2 * MOST_SAMPLES // (len(logs) + 1)
+        flights.append(ReportedFlight(label, found, further_signals(found.recording), colour, dash, samples))
     return flights
 
 

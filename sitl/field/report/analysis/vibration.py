@@ -21,8 +21,12 @@ AROUND, STANDS_OUT, LOWEST_TONE = 1.35, 10.0, 12.0
 CHANCE = 1e-3
 #: Largest number of tones named, strongest first.
 MOST_TONES = 6
+#: Maxima closer than this share of their frequency are one tone, such as that of a motor whose speed changes.
+SAME_TONE = 0.06
+#: Range of the thrust, share of the largest, below which it counts as constant.
+STEADY = 0.05
 #: Largest relative distance from a multiple that counts as a harmonic.
-HARMONIC = 0.015
+HARMONIC = 0.005
 #: Rank correlation with the thrust above which a tone counts as moving with it, and fewest slices for it.
 MOVES, FEWEST_SLICES = 0.5, 12
 #: Share of its frequency within which a tone is followed from slice to slice.
@@ -142,16 +146,17 @@ def find_tones(
     ratio = power / background
     peaks = np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:]) & (ratio[1:-1] > least)) + 1
     peaks = peaks[found.hertz[peaks] >= LOWEST_TONE]
-    peaks = peaks[np.argsort(-ratio[peaks], kind="stable")][:MOST_TONES]
+    peaks = peaks[np.argsort(-ratio[peaks], kind="stable")]
     tones: list[Tone] = []
     for place in peaks:
-        if any(abs(found.hertz[place] - tone.hertz) < 3 * found.hertz[0] for tone in tones):
+        if any(abs(found.hertz[place] / tone.hertz - 1) < SAME_TONE for tone in tones):
             continue
         hertz = _refined(found.hertz, power, int(place))
         axis = int(np.argmax(found.density[place]))
         tones.append(
             Tone(hertz, float(10 * np.log10(ratio[place])), axis, follows_thrust=_follows(hertz, slices, thrust))
         )
+    tones = tones[:MOST_TONES]
     bases = sorted(tone.hertz for tone in tones)
     return [Tone(t.hertz, t.above_db, t.axis, _base(t.hertz, bases), t.follows_thrust) for t in tones]
 
@@ -198,7 +203,7 @@ def coarse(
 def over_thrust(density: Signal, thrust: Signal) -> tuple[Signal, Signal] | None:
     """Thrust (B,) and mean density (F, B) of the slices in each stretch of thrust; None if it hardly changes."""
     low, high = np.quantile(thrust, (0.01, 0.99))
-    if high - low < 0.05:
+    if high - low < STEADY:
         return None
     edges = np.linspace(low, high, THRUST_BINS + 1)
     of = np.clip(np.digitize(thrust, edges) - 1, 0, THRUST_BINS - 1)
@@ -239,7 +244,9 @@ def _follows(hertz: float, slices: tuple[Signal, Signal, Signal] | None, thrust:
     """Whether the maximum near a tone moves with the thrust, slice by slice."""
     from scipy.stats import spearmanr
 
-    if slices is None or thrust is None or len(thrust) < FEWEST_SLICES or np.ptp(thrust) <= 0:
+    if slices is None or thrust is None or len(thrust) < FEWEST_SLICES:
+        return None
+    if np.diff(np.quantile(thrust, (0.01, 0.99)))[0] < STEADY:
         return None
     _, places, density = slices
     near = np.flatnonzero(np.abs(places / hertz - 1) < FOLLOWED)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,8 @@ HEADING = "Stability and margins"
 NYQUIST = 3.0
 #: Loops of drawn plants that are shown in the determinant's plot.
 SHOWN_DRAWS = 8
+#: Instead of a margin, for a loop whose gain is never 1.
+NEVER = "gain below 1"
 #: Points of a circle.
 CIRCLE = 181
 
@@ -107,15 +110,12 @@ def margin_table(cases: Sequence[GainCase]) -> ReportTable:
     rows.append(["verdict", *(str(certificate.verdict) for _, certificate in shown)])
     rows.append(["Ms", *(f"{c.figures['Ms']:.2f} +- {c.figures['Ms_error']:.2f}" for _, c in shown)])
     for axis in AXES:
-        phases = [
-            f"{c.figures['phase_margin_deg'][axis]:.0f} +- {c.figures['phase_margin_error_deg'][axis]:.0f} deg"
-            for _, c in shown
-        ]
-        rows.append([f"phase margin, {axis}", *phases])
+        rows.append([f"phase margin, {axis}", *(_phase_margin(c.figures, axis) for _, c in shown)])
     for axis in AXES:
         rows.append([f"gain margin, {axis}", *(_gain_margin(c.figures, axis) for _, c in shown)])
     for axis in AXES:
-        rows.append([f"delay margin, {axis}", *(f"{c.figures['delay_margin_ms'][axis]:.1f} ms" for _, c in shown)])
+        delays = [c.figures["delay_margin_ms"][axis] for _, c in shown]
+        rows.append([f"delay margin, {axis}", *(f"{ms:.1f} ms" if np.isfinite(ms) else NEVER for ms in delays)])
     rows.append(["disk margin", *(f"{c.figures['disk_margin']:.2f}" for _, c in shown)])
     at_once = "{simultaneous_gain_db:.1f} dB, {simultaneous_phase_deg:.0f} deg"
     rows.append(["all axes at once", *(at_once.format(**c.figures) for _, c in shown)])
@@ -123,11 +123,16 @@ def margin_table(cases: Sequence[GainCase]) -> ReportTable:
     return ReportTable("Margins by the certificate", ("", *(case.label for case, _ in shown)), rows)
 
 
-def _gain_margin(figures: dict[str, dict[str, object]] | object, axis: str) -> str:
-    kind = figures["gain_margin"][axis]  # type: ignore[index]
+def _phase_margin(figures: Mapping[str, Any], axis: str) -> str:
+    phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
+    return f"{phase:.0f} +- {error:.0f} deg" if np.isfinite(phase) else NEVER
+
+
+def _gain_margin(figures: Mapping[str, Any], axis: str) -> str:
+    kind = figures["gain_margin"][axis]
     if kind == "not known":
         return "not known"
-    return f"{'at least ' if kind == 'at least' else ''}{figures['gain_margin_db'][axis]:.1f} dB"  # type: ignore[index]
+    return f"{'at least ' if kind == 'at least' else ''}{figures['gain_margin_db'][axis]:.1f} dB"
 
 
 def _sensitivity(found: Sequence[CaseLoops], thresholds: Thresholds) -> Panel:

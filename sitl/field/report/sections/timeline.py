@@ -64,7 +64,7 @@ def timeline(flights: Sequence[ReportedFlight], number: int) -> Chart | None:
     if angles is not None:
         lines = []
         for axis, colour in enumerate((FLOWN, SISO)):
-            x, y = thinned(angles.time, np.degrees(angles.values[:, axis]))
+            x, y = thinned(angles.time, np.degrees(angles.values[:, axis]), flight.samples)
             lines.append(Line(x, y, AXES[axis], colour, width=1.0))
         panels.append(Panel("Angles", "time [s]", "[deg]", lines, x_range=span, height=220))
     lines = []
@@ -72,11 +72,11 @@ def timeline(flights: Sequence[ReportedFlight], number: int) -> Chart | None:
         motors = flight.since_begin(flight.further.motors)
         for column in range(motors.values.shape[1]):
             shade = ("#bbbbbb", "#999999", "#777777", "#555555")[column % 4]
-            x, y = thinned(motors.time, motors.values[:, column], 800)
+            x, y = thinned(motors.time, motors.values[:, column], flight.samples // 2)
             lines.append(Line(x, y, f"motor {column + 1}", shade, width=0.8))
     if thrust is not None:
         thrust = flight.since_begin(thrust)
-        lines.append(Line(*thinned(thrust.time, thrust.values[:, 0]), "thrust", "#1a1a1a", width=1.4))
+        lines.append(Line(*thinned(thrust.time, thrust.values[:, 0], flight.samples), "thrust", "#1a1a1a", width=1.4))
     if lines:
         panels.append(Panel("Thrust and motors", "time [s]", "share of the largest", lines, x_range=span, height=220))
     if not panels:

@@ -104,7 +104,7 @@ def _panels(flight: ReportedFlight, part: Interval, model: Gains | None) -> list
                 series = flight.signal(signal) if signal else None
                 if series is not None:
                     inside = (series.time >= part[0]) & (series.time <= part[1])
-                    x, y = thinned(series.time[inside], factor * series.values[inside, axis])
+                    x, y = thinned(series.time[inside], factor * series.values[inside, axis], flight.samples)
                     if len(y) > 1 and (label != "injected" or y.any()):
                         lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
             if any(line.label in ("answer", "torque u") for line in lines):
@@ -130,7 +130,7 @@ def _reference(flight: ReportedFlight, part: Interval, axis: int, gains: Gains) 
     held = setpoint.values[np.maximum(np.searchsorted(setpoint.time, grid, side="right") - 1, 0), axis]
     answer = model.response(held[:, None] - held[0])[:, 0] + held[0]
     inside = (grid >= part[0]) & (grid <= part[1])
-    x, y = thinned(grid[inside], np.degrees(answer[inside]))
+    x, y = thinned(grid[inside], np.degrees(answer[inside]), flight.samples)
     return [Line(x, y, "reference", MODEL_COLOUR, width=2.4)]
 
 
