@@ -66,7 +66,7 @@ def _without_certificate(flights: Sequence[ReportedFlight], cases: Sequence[Gain
         steps = ["What the log does show is below. For gains, mend this and fly again; mimopilot inspect checks a log."]
         return Headline(sentence, steps, "bad" if before else "doubt")
     if cases:
-        problem = next(case for case in cases if case.problem)
+        problem = next(case for case in cases if case.problem or not case.gains.certificate)
         return Headline(f"{before}No certificate for '{problem.label}': {problem.problem}.", (), "doubt")
     names = " and ".join(flight.label for flight in flights)
     step = f"Find gains: mimopilot tune {flights[0].recording.path.name} --out my.gains.toml, then report --gains."

@@ -18,6 +18,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.flight_phase import TUMBLE, bridged, intersection, intervals
+from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.logs.inspection import Inspection, inspect_log
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import MAX_GAP, Interval, Series, sampling_period
@@ -28,6 +29,8 @@ from mimopilot.tuning.spec import TuningSpec
 
 #: Share of the largest torque from which on it is saturated.
 AT_LIMIT = 0.999
+#: Parameters of the control rate, Hz, and the period (s) if none is logged: that of this project's controllers.
+RATES, USUAL_PERIOD = ("SCHED_LOOP_RATE", "IMU_GYRO_RATEMAX"), 0.004
 #: Pauses in saturation or excitation that do not end a phase, s.
 BRIDGE = 0.5
 #: Colours and line styles of gain sets and flights in their order: what was, what is new, further ones.
@@ -139,7 +142,7 @@ class ReportedFlight:
 
     def _saturated(self) -> tuple[Interval, ...]:
         parts: tuple[Interval, ...] = ()
-        torque, flown, motors = self.signal("u"), self.found.flown, self.further.motors
+        torque, flown, motors = self.signal("u"), self.flown, self.further.motors
         if torque is not None and flown is not None:
             limit = np.array(flown.limits.moment_max[:2])
             parts += intervals(torque.time, np.any(np.abs(torque.values) >= AT_LIMIT * limit, axis=1))
@@ -179,8 +182,18 @@ class ReportedFlight:
 
     @property
     def why_not(self) -> str:
-        """Why there is no frequency response."""
-        return self.found.reason or ""
+        """Why there is no frequency response; the whole reason is the page's conclusion."""
+        return "gains cannot be tuned from the log, see the top" if self.found.reason else ""
+
+    @cached_property
+    def flown(self) -> Gains | None:
+        """The gains that flew, also of a log that gains cannot be tuned from; None: not logged."""
+        if self.found.flown is not None or not self.recording.parameters:
+            return self.found.flown
+        begin = self.span[0] + (self.airborne[0][0] if self.airborne else 0.0)
+        parameters, _ = self.recording.parameters_during(begin, begin)
+        hertz = next((parameters[name] for name in RATES if parameters.get(name, 0) > 0), 0.0)
+        return flown_gains(parameters, parameters.get("MIMO_TS", 1 / hertz if hertz else 0.0) or USUAL_PERIOD)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +260,7 @@ def gain_cases(
     """
     cases = []
     for flight in flights:
-        flown = flight.found.flown
+        flown = flight.flown
         if flown is not None:
             label = "flown" if len(flights) == 1 else f"flown in {flight.label}"
             cases.append(GainCase(label, flight.colour, flight.dash, flown, flight, True))

@@ -6,7 +6,8 @@ a zero-mean Gaussian whose variance decays with time and whose neighbours are al
 Chen, H. Ohlsson, L. Ljung, "On the estimation of transfer functions, regularizations and Gaussian processes",
 Automatica 48, 2012); its size and decay are those that make the record most likely. The band holds two parts: the
 spread of the estimates without each stretch in turn (jackknife), and what the prior says about the frequencies at
-which the setpoint does not move.
+which the setpoint does not move. The estimate also looks into the time before the step: an answer there means that the
+setpoint follows the vehicle, as that of a position controller in a gust, and not the vehicle the setpoint.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from mimopilot.tuning.logs.resample import Interval, Series, sampling_period
 
 #: Length of the response, s: the time in which a multirotor's attitude settles.
 LENGTH = 1.2
+#: Time before the step that is estimated, too, s, and the largest answer in it, as a share of the step.
+BEFORE, ACAUSAL = 0.1, 0.15
 #: Highest rate of the samples that are used, Hz: 10 times the fastest attitude loop's bandwidth, and the problem stays
 #: small.
 RATE = 100.0
@@ -44,6 +47,7 @@ class StepEstimate:
     Attributes
     ----------
     time : (K,) array, s
+        From the step on.
     step : (K,) array
         Answer to a setpoint that steps from 0 to 1.
     band : (K,) array
@@ -52,6 +56,8 @@ class StepEstimate:
         How many were used.
     explained : float
         Share of the answer's variance that the response explains.
+    early : float
+        Largest answer before the step, either sign.
     """
 
     time: Signal
@@ -59,6 +65,7 @@ class StepEstimate:
     band: Signal
     stretches: int
     explained: float
+    early: float
 
     @property
     def width(self) -> float:
@@ -67,7 +74,7 @@ class StepEstimate:
 
     @property
     def refused(self) -> bool:
-        """Whether the band is wider than the answer."""
+        """Whether the band is wider than the response."""
         return not self.width < WIDEST
 
     def rise(self) -> float:
@@ -128,7 +135,12 @@ def estimate_step(
     if found.refused:
         return None, (
             f"the band of its estimate from {found.stretches} stretches is {found.width:.1f} times as wide as the "
-            "answer: the setpoint moves too little or too slowly; fly sharper steps of the sticks"
+            "response: the setpoint moves too little or too slowly; fly sharper steps of the sticks"
+        )
+    if found.early > ACAUSAL:
+        return None, (
+            f"the response begins before the step ({found.early:.2f} of it): the setpoint follows the vehicle, as that "
+            "of a position controller does; fly steps of the sticks"
         )
     return found, ""
 
@@ -149,17 +161,21 @@ def _averaged(series: Series, axis: int, grid: Signal, Ts: float, hold: bool) ->
 def _estimated(pieces: Sequence[tuple[Signal, Signal]], length: int, Ts: float, early: float) -> StepEstimate:
     from scipy.linalg import toeplitz
 
+    ahead = round(BEFORE / Ts)
+    length += ahead
     A, b, power, count = [], [], 0.0, 0
     for r, y in pieces:
+        # Row k holds r(k), r(k-1)...: the answer `ahead` samples earlier has lags from -ahead on.
         # The first `length` answers also depend on the setpoint before the stretch: they are left out.
         X = toeplitz(r, np.zeros(length))[length:]
-        X, rest = X - X.mean(axis=0), y[length:] - y[length:].mean()
+        late = y[length - ahead : len(y) - ahead]
+        X, rest = X - X.mean(axis=0), late - late.mean()
         A.append(X.T @ X)
         b.append(X.T @ rest)
         power, count = power + float(rest @ rest), count + len(rest)
     total, right = np.sum(A, axis=0), np.sum(b, axis=0)
     # Stretches overlap by half: half of the samples are new.
-    noise, prior = _most_likely(total, right, power, count, length)
+    noise, prior = _most_likely(total, right, power, count, np.maximum(np.arange(length) - ahead, 0) + 1)
     solve = np.linalg.inv(total + noise * np.linalg.inv(prior))
     h = solve @ right
     certainty = noise * np.linalg.inv(prior)
@@ -174,21 +190,28 @@ def _estimated(pieces: Sequence[tuple[Signal, Signal]], length: int, Ts: float, 
     summed = np.tril(np.ones((length, length)))
     doubt = np.einsum("ij,jk,ik->i", summed @ unseen, prior, summed @ unseen)
     left = power - 2 * h @ right + h @ total @ h
+    step, band = np.cumsum(h), 2 * np.sqrt(spread + np.maximum(doubt, 0.0))
     return StepEstimate(
-        time=np.asarray(np.arange(length) * Ts + early, np.float64),
-        step=np.cumsum(h),
-        band=2 * np.sqrt(spread + np.maximum(doubt, 0.0)),
+        time=np.asarray(np.arange(length - ahead) * Ts + early, np.float64),
+        step=step[ahead:],
+        band=band[ahead:],
         stretches=n,
         explained=float(1 - left / power),
+        early=float(np.abs(step[:ahead]).max(initial=0.0)),
     )
 
 
-def _most_likely(total: Signal, right: Signal, power: float, count: int, length: int) -> tuple[float, Signal]:
-    """Variance of the noise, and the prior that makes the answers most likely: (length, length)."""
+def _most_likely(
+    total: Signal, right: Signal, power: float, count: int, places: NDArray[np.intp]
+) -> tuple[float, Signal]:
+    """Variance of the noise, and the prior that makes the answers most likely, (length, length).
+
+    `places` (length,) are the lags, of which those before the step count as the first.
+    """
+    length = len(places)
     least = np.linalg.lstsq(total + 1e-9 * np.trace(total) / length * np.eye(length), right, rcond=None)[0]
     noise = max((power - float(least @ right)) / max(count - length, 1), 1e-12 * power / count)
     best, chosen = np.inf, np.eye(length)
-    places = np.arange(1, length + 1)
     for left in DECAYS:
         decay = left ** (np.maximum(places[:, None], places) / length)
         for size in SIZES:

@@ -30,9 +30,10 @@ def frequency_section(flights: Sequence[ReportedFlight], cases: Sequence[GainCas
         return Section(HEADING, "Not shown: it needs an excited flight that gains can be tuned from.", points=reasons)
     band = next((c.gains.certificate.band for c in cases if c.gains.certificate and c.gains.certificate.band[1]), None)
     caption = (
-        "From torque (normalised) to body rate, measured from the injected signal, which is consistent in closed loop. "
-        "Bands: two standard deviations. Full lines: roll by roll torque, pitch by pitch torque; broken: the coupling. "
-        "Shaded: the band in which the response is known, on which certificates rest."
+        "From torque (normalised) to body rate, measured from what moves the vehicle from outside (injected torque or "
+        "rate, else the setpoint), which is consistent in closed loop. Bands: two standard deviations. Full lines: roll "
+        "by roll torque, pitch by pitch torque; broken: the coupling. Shaded: the band in which the response is known, "
+        "on which certificates rest."
     )
     panels = [_magnitude(shown, axis, band) for axis in range(2)]
     panels += [_phase(shown, axis, band) for axis in range(2)]
@@ -91,6 +92,8 @@ def _phase(flights: Sequence[ReportedFlight], axis: int, band: tuple[float, floa
             continue
         phase = np.full(len(G), np.nan)
         phase[good] = np.degrees(np.unwrap(np.angle(G[good])))
+        # A vehicle's response begins between -90 and 0 degrees: the turn in which its phase is counted.
+        phase -= 360.0 * round((float(phase[good][0]) + 90.0) / 360.0)
         error = 2 * np.degrees(np.arcsin(np.minimum(deviation / np.abs(G), 0.99)))
         label = flight.label if len(flights) > 1 else f"by {AXES[axis]} torque"
         lines.append(Spread(plant.omega, phase - error, phase + error, colour=flight.colour))
@@ -104,7 +107,7 @@ def _coherence(flights: Sequence[ReportedFlight], axis: int, band: tuple[float, 
     for flight in flights:
         assert flight.measured is not None
         plant = flight.measured.response
-        label = flight.label if len(flights) > 1 else "with the injected signal"
+        label = flight.label if len(flights) > 1 else "with the excitation"
         value = np.clip(plant.coherence[:, axis], 0.0, 1.0)
         low, high = coherence_band(value, plant.omega, flight.measured.experiment.seconds)
         lines.append(Spread(plant.omega, low, high, colour=flight.colour))

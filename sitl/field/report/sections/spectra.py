@@ -114,7 +114,7 @@ def filter_section(found: Sequence[FlightSpectra], cases: Sequence[GainCase], th
     first = next((one for one in found if one.flight.measured is not None), found[0])
     mine = [case for case in cases if case.flight is first.flight and not case.problem]
     case = mine[-1] if mine else None
-    filters = filters_of(first.flight.recording.parameters, case.gains if case else first.flight.found.flown)
+    filters = filters_of(first.flight.recording.parameters, case.gains if case else first.flight.flown)
     if not filters:
         return Section(heading, "The log names no filter of the rates: it holds no parameters, or they are all off.")
     loops = loops_of(case) if case else None
@@ -234,7 +234,7 @@ def _floored(density: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
 
 
 def _maps(one: FlightSpectra) -> list[Panel]:
-    if one.slices is None:
+    if one.slices is None or one.gyro is None or one.gyro.rate < SLOW:
         return []
     time, hertz, density = one.slices
     to_db = (180 / np.pi) ** 2

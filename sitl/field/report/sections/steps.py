@@ -39,7 +39,7 @@ def step_estimates(flight: ReportedFlight) -> tuple[dict[str, StepEstimate], lis
             else:
                 reasons.append(f"{flight.label}, {name} {what}: not shown: {why}.")
         return found, reasons
-    return {}, [f"{flight.label}: not shown: the log lacks a setpoint, or the angles or rates that answer it."]
+    return {}, [f"{flight.label}: not shown: the log lacks a setpoint, or the angles or rates that respond to it."]
 
 
 def step_section(flights: Sequence[ReportedFlight]) -> Section:
@@ -71,12 +71,12 @@ def step_section(flights: Sequence[ReportedFlight]) -> Section:
             )
         if lines:
             marks = [LimitLine(1.0, colour=MODEL_COLOUR)]
-            title = f"{name}: answer to a unit step"
+            title = f"{name}: response to a unit step"
             panels.append(Panel(title, "time after the step [s]", "angle over setpoint", lines, marks, height=280))
     caption = (
         "Estimated from the whole flight by deconvolution, with its band of two standard deviations: the spread over "
         "the stretches of flight, and what the setpoint does not excite. An estimate whose band is wider than the "
-        "answer is not shown."
+        "response is not shown."
     )
     columns = ("", "rise 10 to 90 %", "overshoot", "last value", "width of the band", "stretches", "explained")
     return Section(

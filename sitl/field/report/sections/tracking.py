@@ -1,4 +1,4 @@
-"""Setpoint, reference model and answer of each axis over time."""
+"""Setpoint, reference model and response of each axis over time."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ def tracking_section(flights: Sequence[ReportedFlight], sets: Sequence[Gains]) -
     rows: list[list[str]] = []
     for number, flight in enumerate(flights):
         charts += tracking_charts(flight, number, len(flights), next((one for one in sets if _models(one)), None))
+        charts += yaw_charts(flight, number, len(flights))
         rows += _errors(flight, len(flights) > 1)
     if not charts:
-        return Section("Setpoint and answer", "Neither angles nor rates are logged: there is no answer to show.")
+        return Section("Setpoint and response", "Neither angles nor rates are logged: there is no response to show.")
     columns = ("", "roll RMS", "pitch RMS", "roll largest", "pitch largest")
-    tables = [ReportTable("Setpoint minus answer in the air", columns, rows)] if rows else []
+    tables = [ReportTable("Setpoint minus response in the air", columns, rows)] if rows else []
     missing = "" if rows else "No setpoint is logged, so there is no tracking error."
-    return Section("Setpoint and answer", missing, charts=charts, tables=tables)
+    return Section("Setpoint and response", missing, charts=charts, tables=tables)
 
 
 def tracking_charts(flight: ReportedFlight, number: int, count: int, model: Gains | None) -> list[Chart]:
@@ -62,6 +63,37 @@ def tracking_charts(flight: ReportedFlight, number: int, count: int, model: Gain
         text = f"The same in detail, where most happens: {detail[0]:.1f} to {detail[1]:.1f} s{named}."
         charts.append(Chart(f"tracking-detail-{number + 1}", text, _panels(flight, detail, model)))
     return charts
+
+
+def yaw_charts(flight: ReportedFlight, number: int, count: int) -> list[Chart]:
+    """Heading, yaw rate and yaw torque of the used part; none if the log lacks one of them."""
+    experiment = flight.found.experiment
+    yaw = experiment.yaw if experiment else None
+    if experiment is None or yaw is None:
+        return []
+    time: Signal = np.asarray(np.arange(len(yaw.u)) * experiment.Ts, np.float64)
+    used = np.zeros(len(time), bool)
+    for start, stop in experiment.segments:
+        used[start:stop] = True
+    panels = []
+    for title, unit, setpoint, response, injected, factor in (
+        ("heading", "[deg]", yaw.r_o, yaw.y_o, None, 180 / np.pi),
+        ("yaw rate", "[deg/s]", yaw.r_i, yaw.y_i, yaw.r_bar, 180 / np.pi),
+        ("yaw torque", "(normalised)", None, yaw.u, yaw.u_bar, 1.0),
+    ):
+        lines = []
+        for values, label, look in (
+            (setpoint, "setpoint", {"colour": SETPOINT_COLOUR, "width": 1.0, "step": True}),
+            (response, "response" if unit.startswith("[") else "torque u", {"colour": flight.colour, "width": 1.3}),
+            (injected, "injected", {"colour": FURTHER, "width": 0.9, "step": True}),
+        ):
+            if values is not None:
+                x, y = thinned(time, np.where(used, factor * values, np.nan), flight.samples)
+                lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
+        panels.append(Panel(title, "time [s]", unit, lines, height=230))
+    named = f" in {flight.label}" if count > 1 else ""
+    text = f"Yaw{named}, in the part that gains are tuned from; time from its beginning."
+    return [Chart(f"tracking-yaw-{number + 1}", text, panels, columns=3)]
 
 
 def busiest(flight: ReportedFlight, whole: Interval) -> Interval | None:
@@ -98,7 +130,7 @@ def _panels(flight: ReportedFlight, part: Interval, model: Gains | None) -> list
                 lines += _reference(flight, part, axis, model)
             for signal, label, look in (
                 (setpoint, "setpoint", {"colour": SETPOINT_COLOUR, "width": 1.0, "step": True}),
-                (answer, "torque u" if answer == "u" else "answer", {"colour": flight.colour, "width": 1.3}),
+                (answer, "torque u" if answer == "u" else "response", {"colour": flight.colour, "width": 1.3}),
                 (injected, "injected", {"colour": FURTHER, "width": 0.9, "step": True}),
             ):
                 series = flight.signal(signal) if signal else None
@@ -107,7 +139,7 @@ def _panels(flight: ReportedFlight, part: Interval, model: Gains | None) -> list
                     x, y = thinned(series.time[inside], factor * series.values[inside, axis], flight.samples)
                     if len(y) > 1 and (label != "injected" or y.any()):
                         lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
-            if any(line.label in ("answer", "torque u") for line in lines):
+            if any(line.label in ("response", "torque u") for line in lines):
                 panels.append(Panel(f"{name} {what}", "time [s]", unit, lines, x_range=part, height=230))
     return panels
 
@@ -146,7 +178,7 @@ def _errors(flight: ReportedFlight, several: bool) -> list[list[str]]:
 
 
 def tracking_error(setpoint: Series | None, answer: Series | None, parts: Sequence[Interval]) -> Signal | None:
-    """Setpoint minus answer at the times of the answer in some intervals, (N, 2), degrees; None: not logged."""
+    """Setpoint minus response at the times of the answer in some intervals, (N, 2), degrees; None: not logged."""
     if setpoint is None or answer is None or sampling_period(answer.time) <= 0:
         return None
     inside = np.any([(answer.time >= a) & (answer.time <= b) for a, b in parts], axis=0) if parts else np.zeros(1, bool)

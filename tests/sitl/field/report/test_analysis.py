@@ -27,7 +27,7 @@ from mimopilot.sitl.field.report.sections.tracking import tracking_error
 from mimopilot.tuning.certificate import Thresholds
 from mimopilot.tuning.logs.resample import Series
 from mimopilot.tuning.reference_model import second_order
-from tests.tuning.logs.flights import make_flight, microseconds, px4_topics, write_ulog
+from tests.tuning.logs.flights import make_flight, px4_topics, write_ulog
 
 
 def steps(Ts, seconds=40.0, size=0.2, hold=0.5):
