@@ -16,7 +16,9 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     INT32,
     SOLE_PEER,
     Address,
+    AltitudeReport,
     AttitudeReport,
+    AttitudeTarget,
     CommandAck,
     EndLogs,
     FileReply,
@@ -31,26 +33,34 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     Outgoing,
     ParameterRefusal,
     ParameterValue,
+    PowerReport,
     ReadParameter,
     Received,
     RequestLogData,
     RequestLogs,
     RequestMessage,
+    SendCommand,
     SetMessageInterval,
     SetParameter,
     StatusText,
+    ThrustReport,
 )
 from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.ftp import FtpPacket
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from mimopilot.sitl.mavlink.wire.sockets import udp_socket
+from mimopilot.sitl.physics.state_estimate import quaternion_of
 
 #: System and component number that ground stations use.
 GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
 #: Default baud rate: that of a SiK telemetry radio.
 BAUD = 57600
+#: Bit of SYS_STATUS for logging.
+LOGGING = mavlink.MAV_SYS_STATUS_LOGGING
 #: Name of the DEBUG_VECT in which the vehicle reports its injector's state.
 EXCITATION = "MIMO_EXC"
+#: SET_ATTITUDE_TARGET.type_mask: ignore the body rates.
+RATES_IGNORED = 7
 FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
 #: Timeout of connecting and of a blocking write, s; chosen.
 CONNECT_S = 5.0
@@ -66,7 +76,8 @@ def from_mavlink(message: Any) -> Incoming | None:
         if message.type == mavlink.MAV_TYPE_GCS or message.autopilot == mavlink.MAV_AUTOPILOT_INVALID:
             return None
         armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
-        return Heartbeat(*sender, message.autopilot, armed, message.custom_mode, message.type)
+        simulated = bool(message.base_mode & mavlink.MAV_MODE_FLAG_HIL_ENABLED)
+        return Heartbeat(*sender, message.autopilot, armed, message.custom_mode, message.type, simulated)
     if kind == "PARAM_VALUE":
         value = message.param_value
         whole = struct.unpack("<i", struct.pack("<f", value))[0] if message.param_type == INT32 else value
@@ -76,11 +87,20 @@ def from_mavlink(message: Any) -> Incoming | None:
     if kind == "COMMAND_ACK":
         return CommandAck(*sender, message.command, message.result)
     if kind == "ATTITUDE":
-        return AttitudeReport(*sender, message.roll, message.pitch)
+        rates = message.rollspeed, message.pitchspeed, message.yawspeed
+        return AttitudeReport(*sender, message.roll, message.pitch, 1e-3 * message.time_boot_ms, rates, message.yaw)
     if kind == "EXTENDED_SYS_STATE":
         return LandedState(*sender, message.landed_state)
     if kind == "DEBUG_VECT" and message.name == EXCITATION and message.z in (-1, 0, 1, 2):
         return InjectorState(*sender, int(message.z), message.time_usec)
+    if kind == "VFR_HUD":
+        return AltitudeReport(*sender, message.alt, message.climb)
+    if kind == "ATTITUDE_TARGET":
+        return ThrustReport(*sender, message.thrust)
+    if kind == "SYS_STATUS":
+        known = message.onboard_control_sensors_present & message.onboard_control_sensors_enabled & LOGGING
+        works = bool(message.onboard_control_sensors_health & LOGGING) if known else None
+        return PowerReport(*sender, message.battery_remaining, works)
     if kind == "STATUSTEXT":
         return StatusText(*sender, message.text)
     if kind == "FILE_TRANSFER_PROTOCOL":
@@ -116,13 +136,22 @@ def to_mavlink(order: Outgoing) -> Any:
         return mavlink.MAVLink_log_request_data_message(order.system, order.component, *place)
     if isinstance(order, EndLogs):
         return mavlink.MAVLink_log_request_end_message(order.system, order.component)
+    if isinstance(order, AttitudeTarget):
+        q = [float(part) for part in quaternion_of.py_func(order.roll, order.pitch, order.yaw)]
+        return mavlink.MAVLink_set_attitude_target_message(
+            0, order.system, order.component, RATES_IGNORED, q, 0.0, 0.0, 0.0, order.thrust
+        )
+    parameters: tuple[float, ...]
     if isinstance(order, SetMessageInterval):
         command, parameters = mavlink.MAV_CMD_SET_MESSAGE_INTERVAL, (order.message, order.interval)
     elif isinstance(order, RequestMessage):
-        command, parameters = mavlink.MAV_CMD_REQUEST_MESSAGE, (order.message, 0)
+        command, parameters = mavlink.MAV_CMD_REQUEST_MESSAGE, (order.message,)
+    elif isinstance(order, SendCommand):
+        command, parameters = order.command, order.params
     else:
-        command, parameters = mavlink.MAV_CMD_PREFLIGHT_STORAGE, (1, 0)
-    return mavlink.MAVLink_command_long_message(order.system, order.component, command, 0, *parameters, 0, 0, 0, 0, 0)
+        command, parameters = mavlink.MAV_CMD_PREFLIGHT_STORAGE, (1,)
+    filled = [*parameters, *[0.0] * (7 - len(parameters))]
+    return mavlink.MAVLink_command_long_message(order.system, order.component, command, 0, *filled)
 
 
 class Connection:

@@ -43,7 +43,7 @@ REASONS = {
 
 
 class Heartbeat(NamedTuple):
-    """HEARTBEAT of an autopilot."""
+    """HEARTBEAT of an autopilot; `simulated`: it says that no real motors turn (MAV_MODE_FLAG_HIL_ENABLED)."""
 
     system: int
     component: int
@@ -51,6 +51,7 @@ class Heartbeat(NamedTuple):
     armed: bool
     mode: int = 0
     type: int = GENERIC
+    simulated: bool = False
 
 
 class ParameterValue(NamedTuple):
@@ -82,12 +83,15 @@ class CommandAck(NamedTuple):
 
 
 class AttitudeReport(NamedTuple):
-    """ATTITUDE: roll and pitch, rad."""
+    """ATTITUDE: roll and pitch, rad; time since boot, s; body rates, rad/s; yaw, rad."""
 
     system: int
     component: int
     roll: float
     pitch: float
+    time: float = 0.0
+    rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    yaw: float = 0.0
 
 
 class LandedState(NamedTuple):
@@ -96,6 +100,32 @@ class LandedState(NamedTuple):
     system: int
     component: int
     state: int
+
+
+class PowerReport(NamedTuple):
+    """SYS_STATUS: charge left (%; -1: unknown), and whether logging works (None: not reported)."""
+
+    system: int
+    component: int
+    charge: int
+    logging: bool | None = None
+
+
+class AltitudeReport(NamedTuple):
+    """VFR_HUD: altitude, m; climb, m/s."""
+
+    system: int
+    component: int
+    altitude: float
+    climb: float = 0.0
+
+
+class ThrustReport(NamedTuple):
+    """ATTITUDE_TARGET: collective (0 to 1) that the vehicle flies with."""
+
+    system: int
+    component: int
+    thrust: float
 
 
 class InjectorState(NamedTuple):
@@ -190,6 +220,26 @@ class RequestMessage(NamedTuple):
     message: int
 
 
+class SendCommand(NamedTuple):
+    """COMMAND_LONG: a MAV_CMD and its first parameters; the others are 0."""
+
+    system: int
+    component: int
+    command: int
+    params: tuple[float, ...] = ()
+
+
+class AttitudeTarget(NamedTuple):
+    """SET_ATTITUDE_TARGET: roll, pitch and yaw (rad), and collective (0 to 1); body rates are ignored."""
+
+    system: int
+    component: int
+    roll: float
+    pitch: float
+    yaw: float
+    thrust: float
+
+
 class FileRequest(NamedTuple):
     """FILE_TRANSFER_PROTOCOL."""
 
@@ -227,7 +277,7 @@ class EndLogs(NamedTuple):
 #: Pieces of a vehicle's files and logs.
 TransferReport = FileReply | LogEntry | LogData
 #: Flight state that a vehicle streams.
-FlightReport = AttitudeReport | LandedState | InjectorState | StatusText
+FlightReport = AttitudeReport | LandedState | PowerReport | AltitudeReport | ThrustReport | InjectorState | StatusText
 Incoming = Heartbeat | ParameterValue | ParameterRefusal | CommandAck | FlightReport | TransferReport
 Outgoing = (
     GroundHeartbeat
@@ -236,6 +286,8 @@ Outgoing = (
     | StoreParameters
     | SetMessageInterval
     | RequestMessage
+    | SendCommand
+    | AttitudeTarget
     | FileRequest
     | RequestLogs
     | RequestLogData

@@ -12,7 +12,7 @@ import typer
 from mimopilot.common.console import print_json, print_table
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
+from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
 from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import (
     INTEGERS,
     NAMES,
@@ -97,8 +97,7 @@ def experiment(options: LinkOptions, excitation: ExcitationOptions) -> None:
         wanted = settings(excitation, Ts)
         monitor = vehicle.run(start_monitor(vehicle.client, round(wanted["MIMO_EX_MODE"])))
         on_px4 = vehicle.vehicle.autopilot == PX4
-        if on_px4:
-            _check_log(round(vehicle.read([LOG_PROFILE])[LOG_PROFILE]))
+        check_log(vehicle)
         if not options.as_json:
             rows = [[s.name, shortest(wanted[s.name]), s.unit, s.description] for s in EXCITATION]
             print_table(f"vehicle {vehicle.vehicle.system} hovers", ["parameter", "value", "unit", "description"], rows)
@@ -111,7 +110,15 @@ def experiment(options: LinkOptions, excitation: ExcitationOptions) -> None:
     _report(result, wanted, on_px4, options)
 
 
-def _check_log(profile: int) -> None:
+def check_log(vehicle: Session) -> None:
+    """Refuse a PX4 whose log would be too slow for tuning.
+
+    Raises
+    ------
+    SitlError
+        With the parameter and its value.
+    """
+    profile = round(vehicle.read([LOG_PROFILE])[LOG_PROFILE]) if vehicle.vehicle.autopilot == PX4 else NEEDED
     if profile & NEEDED != NEEDED:
         raise SitlError(
             f"{LOG_PROFILE} is {profile}: the log rate would be too low for tuning; land, set it to {NEEDED}, and "

@@ -52,9 +52,15 @@ class LinkSession:
     ----------
     options : LinkOptions
         How to reach the vehicle.
+
+    Attributes
+    ----------
+    heeds_interrupts : bool
+        False: Ctrl-C ends nothing.
     """
 
     client: VehicleLinkState
+    heeds_interrupts = True
 
     def __init__(self, options: LinkOptions) -> None:
         self.options = options
@@ -66,7 +72,7 @@ class LinkSession:
         from rich.progress import Progress
 
         def interrupt(number: int, frame: object) -> None:
-            self.client.interrupted = True
+            self.client.interrupted |= self.heeds_interrupts
 
         numbers = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
         before = {number: signal.signal(number, interrupt) for number in numbers}

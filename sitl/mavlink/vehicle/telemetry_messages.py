@@ -46,9 +46,10 @@ MODE_FLAGS = {
 
 
 def heartbeat(s: VehicleState) -> Any:
-    """HEARTBEAT."""
+    """HEARTBEAT; it says that the vehicle is simulated."""
     vehicle = s.vehicle
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
+    base |= mavlink.MAV_MODE_FLAG_HIL_ENABLED
     base |= MODE_FLAGS[vehicle.mode] | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0)
     status = mavlink.MAV_STATE_ACTIVE if vehicle.armed else mavlink.MAV_STATE_STANDBY
     if "plant" in vehicle.arming_blockers:

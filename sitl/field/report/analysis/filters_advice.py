@@ -94,8 +94,11 @@ def filter_changes(
         Of the torque in the air, without the injected part.
     thresholds : Thresholds
     """
-    if case.flight.measured is None or case.gains.certificate is None or not case.gains.certificate.figures:
+    measured = case.flight.measured
+    if measured is None or case.gains.certificate is None or not case.gains.certificate.figures:
         return []
+    # Of roll and pitch alone, as behind the changes.
+    case = replace(case, gains=replace(case.gains, certificate=_examined(case.gains, measured.response, thresholds)))
     changes = []
     for old in filters:
         if old.kind == LOW_PASS or old.acts_on == DERIVATIVE:

@@ -23,6 +23,7 @@ from mimopilot.tuning.logs.inspection import Inspection, inspect_log
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import MAX_GAP, Interval, Series, sampling_period
 from mimopilot.tuning.motors import END
+from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
 from mimopilot.tuning.spec import TuningSpec
@@ -171,6 +172,14 @@ class ReportedFlight:
     def measured(self) -> PlantEstimates | None:
         """Plant estimates; None if gains cannot be tuned from the log."""
         return PlantEstimates(self.found.experiment) if self.found.experiment and not self.found.reason else None
+
+    @cached_property
+    def yaw_response(self) -> PlantResponse | None:
+        """Response of yaw; None where the log does not excite it."""
+        try:
+            return self.measured.yaw.response if self.measured else None
+        except TuningError:
+            return None
 
     @cached_property
     def wide(self) -> WideResponse | None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import doublet_spectrum
-from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, STEP_ACCELERATION
+from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, ROLL_PITCH_FAMILY
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.gains import Gains
@@ -55,7 +55,7 @@ def predicted_motion(gains: Gains, plant: WideResponse) -> PredictedMotion | Non
     step = fine[1] - fine[0]
     turn = np.exp(1j * np.outer(time, fine)) * (step / np.pi)
     sharp = AMPLITUDE * doublet_spectrum(fine, PERIOD)
-    torque = STEP_ACCELERATION / np.abs(np.diag(plant.body.B))
+    torque = ROLL_PITCH_FAMILY.acceleration / np.abs(np.diag(plant.body.B))
 
     def motion(around: WideResponse) -> tuple[Signal, Signal]:
         free = free_gains(gains, around.body)

@@ -16,7 +16,7 @@ from mimopilot.sitl.field.report.analysis.predicted_motion import (
     doublet_setpoint,
     predicted_motion,
 )
-from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, STEP_ACCELERATION, manoeuvres
+from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, ROLL_PITCH_FAMILY, manoeuvres
 from mimopilot.tuning.design.prediction import Prediction, predict
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.inspection import AXES
@@ -106,7 +106,7 @@ def prediction_section(cases: Sequence[GainCase]) -> Section:
     caption = (
         f"Predicted from the measured response: a doublet of {size:g} degrees and {PERIOD:g} s on roll, then on pitch "
         "(left: the axis that is moved, right: the other one), and a step of torque that would accelerate by "
-        f"{STEP_ACCELERATION:g} rad/s^2. Bands: two standard deviations, from the error of the response."
+        f"{ROLL_PITCH_FAMILY.acceleration:g} rad/s^2. Bands: two standard deviations, from the error of the response."
     )
     return Section(
         heading,

@@ -14,11 +14,15 @@ from mimopilot.common.figures import Chart, LimitLine, Line, Panel, SpanMark, Sp
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
 from mimopilot.tuning.analysis import margins
-from mimopilot.tuning.analysis.closed_loop import CascadeLoop, singular_values
+from mimopilot.tuning.analysis.closed_loop import CascadeLoop
 from mimopilot.tuning.analysis.stability_figures import nominal_and_drawn_loops
+from mimopilot.tuning.axes import law_of
 from mimopilot.tuning.certificate import Thresholds
+from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.inspection import AXES
+from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES, PlantResponse
 from mimopilot.tuning.plant.rigid_body_fit import continued_below, rigid_body
+from mimopilot.tuning.small_matrices import singular_values
 
 HEADING = "Stability and margins"
 #: Half width of a Nyquist plot: the critical point and the unit circle, with some room.
@@ -53,9 +57,27 @@ def loops_of(case: GainCase) -> CaseLoops | None:
     """The loops that the certificate's figures are made of; None without a certificate of the flight."""
     if case.problem or case.flight.measured is None or not (case.gains.certificate and case.gains.certificate.figures):
         return None
-    plant = case.flight.measured.response.at_period(case.gains.Ts)
+    return _loops(case, case.flight.measured.response)
+
+
+def yaw_loops_of(case: GainCase) -> CaseLoops | None:
+    """The loop of yaw alone; None if the flight does not show it."""
+    response = case.flight.yaw_response
+    if response is None or case.problem or not (case.gains.certificate and "yaw" in case.gains.certificate.figures):
+        return None
+    try:
+        return _loops(case, response)
+    except TuningError:
+        return None
+
+
+def _loops(case: GainCase, response: PlantResponse) -> CaseLoops | None:
+    plant = response.at_period(case.gains.Ts)
     known = plant.at(plant.known_run())
-    dense, nominal, draws = nominal_and_drawn_loops(case.gains, continued_below(known, rigid_body(plant)))
+    if len(known.omega) < MIN_FREQUENCIES:
+        return None
+    law = law_of(case.gains, plant.axes)
+    dense, nominal, draws = nominal_and_drawn_loops(law, continued_below(known, rigid_body(plant)))
     return CaseLoops(case, dense.omega, nominal, draws)
 
 
@@ -82,11 +104,15 @@ def stability_section(cases: Sequence[GainCase], thresholds: Thresholds) -> Sect
         Chart(
             "nyquist",
             _NYQUIST,
-            [*(_nyquist(found, axis, thresholds) for axis in range(2)), _determinant(found)],
+            [*(_nyquist(found, axis, thresholds, f"{AXES[axis]} loop") for axis in range(2)), _determinant(found)],
             columns=3,
             linked=False,
         ),
     ]
+    yaws = [loops for case in cases if (loops := yaw_loops_of(case))]
+    if yaws:
+        panels = [_sensitivity(yaws, thresholds), _nyquist(yaws, 0, thresholds, "yaw loop")]
+        charts.append(Chart("stability-yaw", "Sensitivity and loop of yaw.", panels, linked=False))
     return Section(HEADING, charts=charts, tables=[margin_table([one.case for one in found])], points=reasons)
 
 
@@ -116,11 +142,27 @@ def margin_table(cases: Sequence[GainCase]) -> ReportTable:
     for axis in AXES:
         delays = [c.figures["delay_margin_ms"][axis] for _, c in shown]
         rows.append([f"delay margin, {axis}", *(f"{ms:.1f} ms" if np.isfinite(ms) else NEVER for ms in delays)])
+    rows += _yaw_rows([c.figures.get("yaw", {}) for _, c in shown])
     rows.append(["disk margin", *(f"{c.figures['disk_margin']:.2f}" for _, c in shown)])
     at_once = "{simultaneous_gain_db:.1f} dB, {simultaneous_phase_deg:.0f} deg"
     rows.append(["all axes at once", *(at_once.format(**c.figures) for _, c in shown)])
     rows.append(["known band", *(f"{c.band[0]:.1f} to {c.band[1]:.0f} rad/s" for _, c in shown)])
     return ReportTable("Margins by the certificate", ("", *(case.label for case, _ in shown)), rows)
+
+
+def _yaw_rows(yaws: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Rows of yaw; none where no set's yaw was examined."""
+    if not any("Ms" in yaw for yaw in yaws):
+        return []
+
+    def cells(text: str) -> list[str]:
+        return [text.format(**yaw) if "Ms" in yaw else "not examined" for yaw in yaws]
+
+    return [
+        ["Ms, yaw", *cells("{Ms:.2f} +- {Ms_error:.2f}")],
+        ["phase margin, yaw", *cells("{phase_margin_deg:.0f} +- {phase_margin_error_deg:.0f} deg")],
+        ["delay margin, yaw", *cells("{delay_margin_ms:.1f} ms")],
+    ]
 
 
 def _phase_margin(figures: Mapping[str, Any], axis: str) -> str:
@@ -165,7 +207,7 @@ def _sensitivity(found: Sequence[CaseLoops], thresholds: Thresholds) -> Panel:
 
 
 def _peaks(loop: CascadeLoop) -> Signal:
-    return 1 / np.maximum(singular_values(np.eye(2) + loop.L_u)[1], 1e-6)
+    return np.asarray(1 / np.maximum(singular_values(np.eye(loop.L_u.shape[-1]) + loop.L_u)[1], 1e-6))
 
 
 def _band(found: Sequence[CaseLoops]) -> list[SpanMark]:
@@ -206,7 +248,7 @@ def _bode(found: Sequence[CaseLoops]) -> Panel:
     )
 
 
-def _nyquist(found: Sequence[CaseLoops], axis: int, thresholds: Thresholds) -> Panel:
+def _nyquist(found: Sequence[CaseLoops], axis: int, thresholds: Thresholds, name: str) -> Panel:
     turn = np.linspace(0, 2 * np.pi, CIRCLE)
     lines: list[Line | Spread] = [
         Line(np.cos(turn), np.sin(turn), colour="#aaaaaa", width=0.8),
@@ -235,7 +277,7 @@ def _nyquist(found: Sequence[CaseLoops], axis: int, thresholds: Thresholds) -> P
             text = [f"{loops.case.label}: gain margin {abs(20 * np.log10(abs(loop[k]))):.0f} dB" for k in at]
             zero = np.zeros(len(at))
             lines.append(Line(loop.real[at], zero, colour=loops.case.colour, width=0, marker="s", text=text))
-    return _plane(f"Nyquist: {AXES[axis]} loop", lines)
+    return _plane(f"Nyquist: {name}", lines)
 
 
 def _determinant(found: Sequence[CaseLoops]) -> Panel:
