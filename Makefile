@@ -13,7 +13,8 @@ test: $(VENV)/.installed-test cross
 # What emulates and builds for the vehicle's processor, and the browser that opens reports; installed when missing.
 CROSS = gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm chromium
 cross:
-	@test -f "$$(arm-none-eabi-g++ -print-file-name=librdimon.a 2>&1)" && command -v qemu-system-arm chromium >/dev/null \
+	@test -f "$$(arm-none-eabi-g++ -print-file-name=librdimon.a 2>&1)" && command -v qemu-system-arm >/dev/null \
+	&& command -v chromium >/dev/null \
 	|| { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && export DEBIAN_FRONTEND=noninteractive \
 	&& apt-get update -qq && apt-get install -qq -y --no-install-recommends $(CROSS); } \
 	|| { echo "the tests need a cross compiler, QEMU and Chromium; on Debian, as root: apt-get install $(CROSS)"; exit 1; }

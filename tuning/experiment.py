@@ -149,6 +149,17 @@ class Experiment:
         """Usable length of the flight, s."""
         return sum(stop - start for start, stop in self.segments) * self.Ts
 
+    @property
+    def all_segments(self) -> tuple[tuple[int, int], ...]:
+        """Stretches without a gap that tell about roll and pitch, or about yaw, in samples, stop excluded."""
+        joined: list[tuple[int, int]] = []
+        for start, stop in sorted((*self.segments, *(self.yaw.segments if self.yaw else ()))):
+            if joined and start <= joined[-1][1]:
+                before = joined.pop()
+                start, stop = before[0], max(stop, before[1])
+            joined.append((start, stop))
+        return tuple(joined)
+
 
 def external_signal(experiment: Experiment) -> tuple[Signal, str]:
     """External signal, (N, n), and its name: injected torque, else injected rate setpoint, else attitude setpoint.

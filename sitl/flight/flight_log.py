@@ -46,7 +46,7 @@ def flight_log_bytes(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
         Gains in flight, logged as parameters of the vehicle.
     """
     truth = flight.truth
-    topics = _autopilot_topics(flight.record, len(airframe.rotors)) | {
+    topics = _autopilot_topics(flight.record, len(airframe.rotors), flight.scenario.Ts) | {
         "vehicle_attitude_groundtruth": {"q": quaternions(truth["attitude"])},
         "vehicle_angular_velocity_groundtruth": {"xyz": truth["rates"].astype(np.float32)},
         "vehicle_local_position_groundtruth": {
@@ -76,7 +76,7 @@ def vehicle_log(
     gains : (36,) float32 array
         Gains in flight, in the order of `tuning.parameters.PARAMETERS`.
     """
-    topics = _autopilot_topics(record, len(airframe.rotors)) | {
+    topics = _autopilot_topics(record, len(airframe.rotors), Ts) | {
         "vehicle_land_detected": {"landed": landed.astype(np.uint8)},
         "actuator_armed": {"armed": np.ones(len(record), np.uint8)},
     }
@@ -97,7 +97,7 @@ def _ulog_file(
     return ulog_bytes(Ts, topics, parameters, information)
 
 
-def _autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, NDArray[Any]]]:
+def _autopilot_topics(record: NDArray[Any], rotors: int, Ts: float) -> dict[str, dict[str, NDArray[Any]]]:
     """Topics of the inputs and outputs of the autopilot."""
     excitation = record["excitation"]
     # One message a period, as in the firmware; z is the excited axis, numbered as `ExcitationPhase`.
@@ -123,18 +123,17 @@ def _autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, 
         "control_allocator_status": {"unallocated_torque": record["unallocated"]},
         "debug_vect": {
             "x": np.where(on_yaw, excitation[:, 2], excitation[:, 0]),
-            "y": np.where(on_yaw, _turned(record["attitude"][:, 2], on_yaw), excitation[:, 1]),
+            "y": np.where(on_yaw, _turned(record["rates"][:, 2], on_yaw, Ts), excitation[:, 1]),
             "z": active,
             "name": np.where(on_yaw, np.array(YAW_EXCITATION_NAME, "S10"), np.array(EXCITATION_NAME, "S10")),
         },
     }
 
 
-def _turned(heading: NDArray[np.float32], on_yaw: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """How far the vehicle has turned since yaw's excitation began, rad, as y of MIMO_EXY says; 0 without one."""
-    if not on_yaw.any():
-        return np.zeros_like(heading)
-    return np.remainder(heading - heading[np.argmax(on_yaw)] + np.pi, 2 * np.pi).astype(np.float32) - np.float32(np.pi)
+def _turned(rate: NDArray[Any], on_yaw: NDArray[np.bool_], Ts: float) -> NDArray[np.float32]:
+    """How far the vehicle has turned since yaw's excitation began, rad, as y of MIMO_EXY says."""
+    turned = np.cumsum(np.where(on_yaw, rate, 0.0)) * Ts
+    return turned.astype(np.float32)
 
 
 def save_flight(path: Path, flight: Flight, airframe: Airframe, gains: Gains) -> None:

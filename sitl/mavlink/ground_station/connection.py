@@ -57,8 +57,8 @@ GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
 BAUD = 57600
 #: Bit of SYS_STATUS for logging.
 LOGGING = mavlink.MAV_SYS_STATUS_LOGGING
-#: Name of the DEBUG_VECT in which the vehicle reports its injector's state.
-EXCITATION = "MIMO_EXC"
+#: Names of the DEBUG_VECT in which the vehicle reports its injector's state, and the phases as z.
+EXCITATION, PHASES = ("MIMO_EXC", "MIMO_EXY"), (-1, 0, 1, 2, 3)
 #: SET_ATTITUDE_TARGET.type_mask: ignore the body rates.
 RATES_IGNORED = 7
 FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
@@ -91,7 +91,7 @@ def from_mavlink(message: Any) -> Incoming | None:
         return AttitudeReport(*sender, message.roll, message.pitch, 1e-3 * message.time_boot_ms, rates, message.yaw)
     if kind == "EXTENDED_SYS_STATE":
         return LandedState(*sender, message.landed_state)
-    if kind == "DEBUG_VECT" and message.name == EXCITATION and message.z in (-1, 0, 1, 2):
+    if kind == "DEBUG_VECT" and message.name in EXCITATION and message.z in PHASES:
         return InjectorState(*sender, int(message.z), message.time_usec)
     if kind == "VFR_HUD":
         return AltitudeReport(*sender, message.alt, message.climb)

@@ -12,6 +12,7 @@ import typer
 from mimopilot.common.console import print_json, print_table
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.flight.excitation_flight import VEHICLE_YAW_AMPLITUDE
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
 from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import (
     INTEGERS,
@@ -30,7 +31,7 @@ PX4 = 12  # MAV_AUTOPILOT_PX4
 #: Bits of SDLOG_PROFILE that tuning from a log needs: default, high rate, debug topics.
 LOG_PROFILE, NEEDED = "SDLOG_PROFILE", 1 | 16 | 32
 #: --axis -> value of `AXIS`.
-AXES = {"roll": 1, "pitch": 2, "both": 3}
+AXES = {"roll": 1, "pitch": 2, "both": 3, "yaw": 4, "all": 5}
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class ExcitationOptions:
     seed: int
     mode: str
     tilt_deg: float
+    yaw_amplitude: float = VEHICLE_YAW_AMPLITUDE
 
 
 def settings(excitation: ExcitationOptions, Ts: float) -> dict[str, float]:
@@ -63,6 +65,7 @@ def settings(excitation: ExcitationOptions, Ts: float) -> dict[str, float]:
     values = {
         AXIS: AXES[excitation.axis],
         "MIMO_EX_AMP": excitation.amplitude,
+        "MIMO_EX_AMPY": excitation.yaw_amplitude,
         "MIMO_EX_HMIN": hold_min,
         "MIMO_EX_HMAX": hold_max,
         "MIMO_EX_DUR": excitation.seconds_per_axis,

@@ -37,7 +37,9 @@ class VehicleState:
     load : float
         Share of the last second in which the control loop did not sleep.
     excitation_phase : int
-        0 roll, 1 pitch, 2 between them, -1 off.
+        0 roll, 1 pitch, 2 between two axes, 3 yaw, -1 off.
+    excitation_turn : float, rad
+        Since yaw's excitation began.
     """
 
     vehicle: Commander
@@ -49,6 +51,7 @@ class VehicleState:
     home: tuple[int, ...] = ()
     load: float = 0.0
     excitation_phase: int = -1
+    excitation_turn: float = 0.0
 
     @property
     def milliseconds(self) -> int:

@@ -16,6 +16,9 @@ from mimopilot.tuning.plant.frequency_response import COHERENT, GROWTH, PlantRes
 from mimopilot.tuning.plant.local_polynomial import FREEDOM
 
 Signal = NDArray[np.float64]
+#: Flights with the response that is drawn; a band of frequencies (rad/s), None: not known.
+Measured = Sequence[tuple[ReportedFlight, PlantResponse]]
+Band = tuple[float, float] | None
 
 HEADING = "Frequency response of the vehicle"
 #: Relative error above which an element is not drawn: its phase is anything.
@@ -33,8 +36,8 @@ def frequency_section(flights: Sequence[ReportedFlight], cases: Sequence[GainCas
     caption = (
         "From torque (normalised) to body rate, measured from what moves the vehicle from outside (injected torque or "
         "rate, else the setpoint), which is consistent in closed loop. Bands: two standard deviations. Full lines: "
-        "roll by roll torque, pitch by pitch torque; broken: the coupling. Shaded: the band in which the response is known, "
-        "on which certificates rest."
+        "roll by roll torque, pitch by pitch torque; broken: the coupling. Shaded: the band in which the response is "
+        "known, on which certificates rest."
     )
     panels = [_magnitude(responses, axis, band) for axis in range(2)]
     panels += [_phase(responses, axis, band) for axis in range(2)]
@@ -42,11 +45,8 @@ def frequency_section(flights: Sequence[ReportedFlight], cases: Sequence[GainCas
     charts = [Chart("frequency-response", caption, panels)]
     yaws = [(flight, response) for flight in shown if (response := flight.yaw_response) is not None]
     if yaws:
-        panels = [
-            _magnitude(yaws, 0, yaw_band(cases)),
-            _phase(yaws, 0, yaw_band(cases)),
-            _coherence(yaws, 0, yaw_band(cases)),
-        ]
+        band = yaw_band(cases)
+        panels = [_magnitude(yaws, 0, band), _phase(yaws, 0, band), _coherence(yaws, 0, band)]
         charts.append(Chart("frequency-response-yaw", "The same of yaw.", panels, columns=3))
     return Section(HEADING, charts=charts, points=reasons)
 
@@ -71,6 +71,10 @@ def coherence_band(coherence: Signal, omega: Signal, seconds: float) -> tuple[Si
     return np.tanh(np.maximum(middle - half, 0.0)) ** 2, np.tanh(middle + half) ** 2
 
 
+def _name(flights: Measured, axis: int) -> str:
+    return axis_names(flights[0][1].axes)[axis]
+
+
 def _seconds(flight: ReportedFlight) -> float:
     return flight.measured.experiment.seconds if flight.measured else 0.0
 
@@ -90,9 +94,7 @@ def _element(plant: PlantResponse, i: int, j: int) -> tuple[NDArray[np.complex12
     return G, deviation, deviation < SHOWN * np.abs(G)
 
 
-def _magnitude(
-    flights: Sequence[tuple[ReportedFlight, PlantResponse]], axis: int, band: tuple[float, float] | None
-) -> Panel:
+def _magnitude(flights: Measured, axis: int, band: Band) -> Panel:
     lines: list[Line | Spread] = []
     for flight, plant in flights:
         for column, dash in ((axis, "-"), (1 - axis, "--"))[: plant.axes]:
@@ -102,14 +104,10 @@ def _magnitude(
             label = f"by {axis_names(plant.axes)[column]} torque{f', {flight.label}' if len(flights) > 1 else ''}"
             lines.append(Spread(plant.omega, low, size + 2 * deviation, colour=flight.colour))
             lines.append(Line(plant.omega, size, label, flight.colour, dash))
-    return _panel(
-        f"{axis_names(flights[0][1].axes)[axis]} rate: magnitude", "[rad/s per unit]", lines, band, log_y=True
-    )
+    return _panel(f"{_name(flights, axis)} rate: magnitude", "[rad/s per unit]", lines, band, log_y=True)
 
 
-def _phase(
-    flights: Sequence[tuple[ReportedFlight, PlantResponse]], axis: int, band: tuple[float, float] | None
-) -> Panel:
+def _phase(flights: Measured, axis: int, band: Band) -> Panel:
     lines: list[Line | Spread] = []
     for flight, plant in flights:
         G, deviation, good = _element(plant, axis, axis)
@@ -124,12 +122,10 @@ def _phase(
         lines.append(Spread(plant.omega, phase - error, phase + error, colour=flight.colour))
         lines.append(Line(plant.omega, phase, label, flight.colour))
     marks = [LimitLine(-180.0, colour="#888888", dash=":")]
-    return _panel(f"{axis_names(flights[0][1].axes)[axis]} rate: phase", "[deg]", lines, band, marks=marks)
+    return _panel(f"{_name(flights, axis)} rate: phase", "[deg]", lines, band, marks=marks)
 
 
-def _coherence(
-    flights: Sequence[tuple[ReportedFlight, PlantResponse]], axis: int, band: tuple[float, float] | None
-) -> Panel:
+def _coherence(flights: Measured, axis: int, band: Band) -> Panel:
     lines: list[Line | Spread] = []
     for flight, plant in flights:
         label = flight.label if len(flights) > 1 else "with the excitation"
@@ -138,6 +134,4 @@ def _coherence(
         lines.append(Spread(plant.omega, low, high, colour=flight.colour))
         lines.append(Line(plant.omega, value, label, flight.colour))
     marks = [LimitLine(COHERENT, f"coherent above {COHERENT:g}", LIMIT)]
-    return _panel(
-        f"{axis_names(flights[0][1].axes)[axis]} rate: coherence", "", lines, band, marks=marks, y_range=(0.0, 1.05)
-    )
+    return _panel(f"{_name(flights, axis)} rate: coherence", "", lines, band, marks=marks, y_range=(0.0, 1.05))
