@@ -95,7 +95,7 @@ COMMANDS = {
     "identify": ("identify", "flight.ulg"),
     "certify": ("certify", "flight.ulg", "--gains", "my.gains.toml"),
     "fly": ("fly", "adam0", "--gains", "my.gains.toml"),
-    "faults": ("faults", "adam0", "--seeds", "1", "--fault", "motor:1=0.7@0.6", "--workers", "1"),
+    "faults": ("faults", "adam0", "--runs", "1", "--fault", "motor:1=0.7@0.6", "--workers", "1"),
     "reproduce": ("reproduce", "numerical-example", "--out", "study"),
     "campaign": ("campaign", "adam0", "--runs", "2", "--workers", "1", "--out", "campaign"),
     "replay": ("replay", "campaign", "--run", "1"),
