@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from typing import Any
 
 from mimopilot.common.blas import reproducible
@@ -13,6 +14,7 @@ from mimopilot.sitl.field.autotune_run import ANSWER_S, CHECK, FLIGHT, GAINS, SN
 from mimopilot.sitl.field.check_flight import check_flight
 from mimopilot.sitl.field.flight_watch import start_watch
 from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, save_snapshot, set_names, write_set
+from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.log_transfer.log_session import LogSession
 from mimopilot.sitl.mavlink.log_transfer.vehicle_logs import VehicleLog
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
@@ -20,7 +22,6 @@ from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
-from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.inspection import inspect_log
 from mimopilot.tuning.logs.reader import read_log
@@ -31,6 +32,8 @@ from mimopilot.tuning.parameters import IDENTITY
 MIN_CHARGE = 40
 #: Time (s) in which a vehicle closes its log after disarming, and the pause between two looks.
 LOG_TIMEOUT_S, LOG_PAUSE_S = 30.0, 1.0
+#: Relative difference of values that are the same but for rounding to single precision.
+SAME = 1e-6
 #: Folder of a download that is not finished.
 DOWNLOADS = "download"
 
@@ -217,7 +220,7 @@ def judge(run: AutotuneRun) -> Found:
         If the log does not tell.
     """
     flight, gains = read_log(run.log(CHECK)), load_gains(run.file(GAINS))
-    _check_flown(flight, gains)
+    _check_flown(run, flight)
     result = check_flight(flight, read_log(run.log(FLIGHT)), gains)
     run.dialogue.show_check(result)
     write_autotune_report(run, gains, result)
@@ -226,13 +229,14 @@ def judge(run: AutotuneRun) -> Found:
     return result.as_table()
 
 
-def _check_flown(flight: Experiment, gains: Gains) -> None:
+def _check_flown(run: AutotuneRun, flight: Experiment) -> None:
+    """Refuse a log of a flight with other gains than the new ones."""
     if flight.flown is None:
         raise SitlError(f"{flight.source}: does not say which gains flew", exit_code=1)
-    flown, wanted = flight.flown.elements(), gains.elements()
-    other = [code for code in wanted if code != "TS" and flown[code] != wanted[code]]
+    flown, wanted = make_plan(flight.flown, run.options.profile).values, new_plan(run).values
+    other = [name for name, value in wanted.items() if not math.isclose(flown[name], value, rel_tol=SAME)]
     if other:
-        raise SitlError(f"{flight.source}: was flown with other gains ({other[0]}, ...)", exit_code=1)
+        raise SitlError(f"{flight.source}: was flown with other gains ({', '.join(other[:3])}, ...)", exit_code=1)
 
 
 def keep(run: AutotuneRun) -> Found:
