@@ -41,7 +41,7 @@ class AutotuneOptions:
     yes: bool = False
     arm: bool = False
     seconds_per_axis: float = 20.0
-    amplitude: float = 0.1
+    amplitude: float | None = None
     system: int = 0
     timeout: float = 12.0
     signing_key: Path | None = None

@@ -14,6 +14,12 @@ from mimopilot.sitl.field.autotune_run import ANSWER_S, CHECK, FLIGHT, GAINS, SN
 from mimopilot.sitl.field.check_flight import check_flight
 from mimopilot.sitl.field.flight_watch import start_watch
 from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, save_snapshot, set_names, write_set
+from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+    FLIGHT_STREAMS,
+    request_status,
+    request_streams,
+    supplies_problem,
+)
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.log_transfer.log_session import LogSession
 from mimopilot.sitl.mavlink.log_transfer.vehicle_logs import VehicleLog
@@ -28,8 +34,6 @@ from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import IDENTITY
 
 # All chosen:
-#: Charge (%) below which nothing is flown: an autotune is two flights of some minutes.
-MIN_CHARGE = 40
 #: Time (s) in which a vehicle closes its log after disarming, and the pause between two looks.
 LOG_TIMEOUT_S, LOG_PAUSE_S = 30.0, 1.0
 #: Relative difference of values that are the same but for rounding to single precision.
@@ -55,13 +59,12 @@ def check_vehicle(run: AutotuneRun) -> Found:
                 "--take-off: nobody can be asked whether to arm the vehicle, and --yes is no answer to that unless the "
                 "vehicle says that it is simulated: give --arm"
             )
-        if 0 <= watch.charge < MIN_CHARGE:
-            raise SitlError(
-                f"the battery is at {watch.charge} %, expected {MIN_CHARGE} % or more: charge it", exit_code=1
-            )
-        if watch.logging is False:
-            raise SitlError("the vehicle reports that it cannot log: check its card", exit_code=1)
-        if watch.charge < 0:
+        monitor = session.run(request_streams(session.client, FLIGHT_STREAMS))
+        session.run(request_status(session.client, monitor))
+        problem = supplies_problem(monitor)
+        if problem:
+            raise SitlError(problem, exit_code=1)
+        if monitor.charge < 0:
             run.dialogue.tell("the vehicle does not report its battery's charge: watch it yourself")
         vehicle = session.vehicle
     list_logs(run)

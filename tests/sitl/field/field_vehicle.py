@@ -22,8 +22,6 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     EndLogs,
     FileRequest,
     Heartbeat,
-    InjectorState,
-    LandedState,
     PowerReport,
     RequestLogData,
     RequestLogs,

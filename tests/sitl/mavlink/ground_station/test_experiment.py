@@ -9,9 +9,10 @@ import pytest
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SetParameter, run_exchange
-from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions, settings
+from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
+from mimopilot.sitl.mavlink.ground_station.experiments.module_injector import INTEGERS, excite, start_monitor
+from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import injector_settings
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
-from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import INTEGERS, excite, start_monitor
 from mimopilot.tuning.logs.reader import read_log
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
@@ -19,7 +20,7 @@ from tests.sitl.mavlink.running import PATIENCE_S, Pilot, running_sitl, start
 from tests.sitl.mavlink.scripted_vehicle import SimulatedLink
 
 CHOICE = ExcitationOptions("both", 8.0, 0.2, 50.0, 3, "hold", 25.0)
-WANTED = settings(CHOICE, 0.004)
+WANTED = injector_settings(CHOICE, 0.004)
 PLANNED = 2 * 8.0 + 1.0
 
 
@@ -159,7 +160,7 @@ def test_the_injection_is_not_started_if_a_setting_is_refused():
 )
 def test_settings_out_of_range_are_refused_before_sending(change, parts):
     with pytest.raises(SitlError, match=parts):
-        settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
+        injector_settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
 
 
 # The commands, against `mimopilot sitl`.
