@@ -76,12 +76,20 @@ def experiment(
     ] = None,
     gains: GainsOption = None,
     axis: Annotated[
-        str | None, typer.Option(help="With --connect: roll, pitch, or both, one after the other (the default).")
+        str | None,
+        typer.Option(
+            help="One after the other: all (roll, pitch, yaw), both (roll, pitch), roll, pitch, or yaw.",
+            show_default="all",
+        ),
     ] = None,
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
     amplitude: Annotated[
         float | None,
-        typer.Option(help="Of the injected torque (normalised); 0.15, or less if the motors would saturate."),
+        typer.Option(help="Of the torque on roll and pitch (normalised); 0.15, or less if the motors would saturate."),
+    ] = None,
+    yaw_amplitude: Annotated[
+        float | None,
+        typer.Option(help="Of the torque on yaw; 0.3 (a vehicle: 0.2), or less if the motors would saturate."),
     ] = None,
     bandwidth: Annotated[float, typer.Option(help="Of the injected torque, rad/s.")] = 50.0,
     seed: SeedOption = 0,
@@ -117,7 +125,7 @@ def experiment(
     system: SystemOption = 0,
     as_json: JsonOption = False,
 ) -> None:
-    """Fly with a PRBS added to the torque on roll, then on pitch (--both-axes: on both at once), and log it.
+    """Fly with a PRBS added to the torque on roll, then pitch, then yaw (--both-axes: roll and pitch at once); log it.
 
     Simulated in process; or with --connect on a vehicle in the air, by its own injector. The flight is then monitored:
     tilt, flight mode, a lost link and Ctrl-C end the excitation, and the vehicle's parameters are restored. With a
@@ -153,19 +161,29 @@ def experiment(
                 mode=mode or "hold",
                 tilt_deg=TILT_DEG if tilt_deg is None else tilt_deg,
                 runs=runs,
+                yaw_amplitude=yaw_amplitude,
             ),
         )
         return
     from mimopilot.api import vehicle
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, default_amplitude
 
-    reason = "belong to --connect; a simulated flight excites both axes (one after the other, or --both-axes)"
-    check_not_given(reason, axis=axis, mode=mode, tilt_deg=tilt_deg, profile=profile, snapshot=snapshot)
+    check_not_given("belong to --connect", mode=mode, tilt_deg=tilt_deg, profile=profile, snapshot=snapshot)
     if out is None:
         raise SitlError("--out: name the log to write, FILE.ulg")
     body, controller = vehicle(airframe or "", gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
-    plan = ExperimentPlan(body, controller, seconds_per_axis, strength, bandwidth, excitation_seed, both_axes)
+    plan = ExperimentPlan(
+        body,
+        controller,
+        seconds_per_axis,
+        strength,
+        bandwidth,
+        excitation_seed,
+        both_axes,
+        axis or "all",
+        yaw_amplitude,
+    )
     if runs is None:
         simulate_experiment(plan, out, seed)
     else:
@@ -186,9 +204,11 @@ def simulate_experiment(plan: ExperimentPlan, out: Path, seed: int) -> None:
     from mimopilot.sitl.flight.excitation_flight import check_survived
 
     flight = plan.record(out, seed)
-    tilt = np.degrees(np.abs(flight.truth["attitude"][:, :2]).max(axis=0))
+    angles = np.degrees(np.abs(flight.truth["attitude"]).max(axis=0))
     seconds = len(flight.record) * plan.gains.Ts
-    print(f"{out}: {seconds:.1f} s, largest roll {tilt[0]:.1f} deg, pitch {tilt[1]:.1f} deg")
+    print(
+        f"{out}: {seconds:.1f} s, largest roll {angles[0]:.1f} deg, pitch {angles[1]:.1f} deg, yaw {angles[2]:.1f} deg"
+    )
     check_survived(flight)
 
 

@@ -22,7 +22,6 @@ from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
 from mimopilot.sitl.mavlink.ground_station.session import Session
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
-from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import ENABLE
 
 # All chosen:
@@ -95,7 +94,7 @@ def fly_check(run: AutotuneRun) -> Found:
         If the flight was ended for another reason.
     """
     before = list_logs(run)
-    plan = doublet_plan(read_log(run.log(FLIGHT)).amplitude)
+    plan = doublet_plan(run.experiment(FLIGHT).amplitude)
     with run.vehicle(integers={ENABLE.name}) as session:
         if compare_set(run, session) != NEW:
             raise SitlError("the vehicle does not hold the new gains", exit_code=1)

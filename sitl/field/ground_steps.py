@@ -30,7 +30,6 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.inspection import inspect_log
-from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import IDENTITY
 
 # All chosen:
@@ -168,9 +167,8 @@ def tune_gains(run: AutotuneRun) -> Found:
     Decided
         If the flown gains are better.
     """
-    path = run.log(FLIGHT)
     try:
-        gains = tune([read_log(path)])
+        gains = tune([run.experiment(FLIGHT)])
         warning = check_verdict(gains, allow=False)
     except TuningError as error:
         run.decisions.forget_from("experiment")
@@ -222,9 +220,9 @@ def judge(run: AutotuneRun) -> Found:
     SitlError
         If the log does not tell.
     """
-    flight, gains = read_log(run.log(CHECK)), load_gains(run.file(GAINS))
+    flight, gains = run.experiment(CHECK), load_gains(run.file(GAINS))
     _check_flown(run, flight)
-    result = check_flight(flight, read_log(run.log(FLIGHT)), gains)
+    result = check_flight(flight, run.experiment(FLIGHT), gains)
     run.dialogue.show_check(result)
     write_autotune_report(run, gains, result)
     if result.worse:

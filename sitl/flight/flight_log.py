@@ -18,7 +18,8 @@ from mimopilot.sitl.physics.state_estimate import quaternion_of
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import IDENTITY, PARAMETERS
 
-EXCITATION_NAME = b"MIMO_EXC"  # of the debug_vect topic that carries the excitation, as in the firmware
+#: Names of the debug_vect messages with the injected torque, as in the firmware: x, y on roll and pitch; x on yaw.
+EXCITATION_NAME, YAW_EXCITATION_NAME = b"MIMO_EXC", b"MIMO_EXY"
 
 
 def quaternions(angles: NDArray[Any]) -> NDArray[np.float32]:
@@ -99,8 +100,9 @@ def _ulog_file(
 def _autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, NDArray[Any]]]:
     """Topics of the inputs and outputs of the autopilot."""
     excitation = record["excitation"]
-    # z is the excited axis: 0 roll, 1 pitch, -1 none.
-    active = np.where(excitation[:, 0] != 0, 0, np.where(excitation[:, 1] != 0, 1, -1)).astype(np.float32)
+    # One message a period, as in the firmware; z is the excited axis, numbered as `ExcitationPhase`.
+    on_yaw = excitation[:, 2] != 0
+    active = np.select([excitation[:, 0] != 0, excitation[:, 1] != 0, on_yaw], [0, 1, 3], -1).astype(np.float32)
     thrust = np.zeros_like(excitation)
     thrust[:, 2] = -record["collective"]
     return {
@@ -120,12 +122,19 @@ def _autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, 
         "actuator_motors": {"control": record["commands"][:, :rotors]},
         "control_allocator_status": {"unallocated_torque": record["unallocated"]},
         "debug_vect": {
-            "x": excitation[:, 0],
-            "y": excitation[:, 1],
+            "x": np.where(on_yaw, excitation[:, 2], excitation[:, 0]),
+            "y": np.where(on_yaw, _turned(record["attitude"][:, 2], on_yaw), excitation[:, 1]),
             "z": active,
-            "name": np.full(len(record), EXCITATION_NAME, "S10"),
+            "name": np.where(on_yaw, np.array(YAW_EXCITATION_NAME, "S10"), np.array(EXCITATION_NAME, "S10")),
         },
     }
+
+
+def _turned(heading: NDArray[np.float32], on_yaw: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """How far the vehicle has turned since yaw's excitation began, rad, as y of MIMO_EXY says; 0 without one."""
+    if not on_yaw.any():
+        return np.zeros_like(heading)
+    return np.remainder(heading - heading[np.argmax(on_yaw)] + np.pi, 2 * np.pi).astype(np.float32) - np.float32(np.pi)
 
 
 def save_flight(path: Path, flight: Flight, airframe: Airframe, gains: Gains) -> None:

@@ -86,18 +86,18 @@ def measure_kinematics(experiment: Experiment) -> Kinematics:
 
 
 def injected_in(total: Signal, injected: Signal, segments: tuple[tuple[int, int], ...]) -> Matrix:
-    """Gain from steps of what is injected to steps of the whole, (2, 2): the identity in a correct log.
+    """Gain from steps of what is injected to steps of the whole, (n, n): the identity in a correct log.
 
     Parameters
     ----------
-    total, injected : (N, 2) arrays
+    total, injected : (N, n) arrays
         Torque and the injected torque, or the same of the rate setpoint.
     segments : tuple of (start, stop)
         Stretches without a gap.
     """
     found = []
     for lag in range(-MAX_LAG, MAX_LAG + 1):
-        outer, inner = np.zeros((2, 2)), np.zeros((2, 2))
+        outer, inner = np.zeros((2, total.shape[1], total.shape[1]))
         for start, stop in segments:
             u, w = np.diff(total[start:stop], axis=0), np.diff(injected[start:stop], axis=0)
             u, w = (u[lag:], w[: len(w) - lag]) if lag >= 0 else (u[:lag], w[-lag:])

@@ -1,15 +1,20 @@
 """An autotune in simulated time: link, vehicle and answers are scripted."""
 
+import functools
+import hashlib
 from dataclasses import dataclass, field
 
 import pytest
 
+import mimopilot.sitl.field.autotune_run as autotune_run
 import mimopilot.sitl.field.ground_steps as ground_steps
 import mimopilot.sitl.mavlink.ground_station.session as session
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import AutotuneOptions
 from mimopilot.sitl.field.workflow import autotune
 from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.logs.inspection import inspect_log
+from mimopilot.tuning.logs.reader import read_log
 from tests.sitl.field.field_vehicle import SECONDS, FieldLink, FieldVehicle
 
 #: SHA-256 of a log -> its gains: the same few logs are flown in many tests.
@@ -21,6 +26,16 @@ def tune_once(experiments):
     if one.sha256 not in TUNED:
         TUNED[one.sha256] = tune(experiments)
     return TUNED[one.sha256]
+
+
+@functools.cache
+def read_once(sha256, read, path):
+    return read(path)
+
+
+def once(read):
+    """Read a log of some content once, whatever its name."""
+    return lambda path: read_once(hashlib.sha256(path.read_bytes()).hexdigest(), read, path)
 
 
 @dataclass
@@ -69,9 +84,11 @@ class Field:
 def scripted(tmp_path, monkeypatch):
     """Make a `Field`; keywords are those of the link, `then` and others those of the vehicle or the options."""
     monkeypatch.setattr(ground_steps, "tune", tune_once)
+    monkeypatch.setattr(ground_steps, "inspect_log", once(inspect_log))
+    monkeypatch.setattr(autotune_run, "read_log", once(read_log))
 
     def make(at=None, answers=None, loss=0.0, seed=0, pilot=False, **changes):
-        vehicle = FieldVehicle(tmp_path)
+        vehicle = FieldVehicle()
         for name, value in changes.items():
             assert hasattr(vehicle, name)
             setattr(vehicle, name, value)
@@ -87,4 +104,3 @@ def scripted(tmp_path, monkeypatch):
         return Field(vehicle, link, Answers(answers or {}), options)
 
     return make
-

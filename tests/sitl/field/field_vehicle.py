@@ -7,14 +7,14 @@ import functools
 
 import numpy as np
 
+from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.autopilot.autopilot import Autopilot
-from mimopilot.sitl.field.doublet_flight import DOUBLET_S, DOUBLETS, LEVEL_S, DoubletPlan
+from mimopilot.sitl.field.doublet_flight import DoubletPlan
 from mimopilot.sitl.flight.excitation_flight import ExperimentPlan
-from mimopilot.sitl.flight.flight_log import flight_log_bytes
+from mimopilot.sitl.flight.flight_log import vehicle_log
 from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.mavlink.ground_station.events import (
-    SOLE_PEER,
     AltitudeReport,
     AttitudeReport,
     AttitudeTarget,
@@ -30,13 +30,11 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     ThrustReport,
 )
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
-from mimopilot.sitl.mavlink.vehicle.flight_recorder import StoredLog
-from mimopilot.sitl.mavlink.wire.ftp import crc32
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.parameters import PARAMETERS
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
-from tests.sitl.mavlink.log_transfer.logging_vehicle import OwnVehicle
-from tests.sitl.mavlink.scripted_vehicle import STREAM_S, SYSTEM, SimulatedLink
+from tests.sitl.mavlink.log_transfer.logging_vehicle import ScriptedLogs
+from tests.sitl.mavlink.scripted_vehicle import SYSTEM, SimulatedLink
 
 SECONDS = 6.0  # of the excitation of an axis
 HOLD, LANDING, TAKEOFF, OFFBOARD = 4 << 16 | 3 << 24, 4 << 16 | 6 << 24, 4 << 16 | 2 << 24, 6 << 16
@@ -64,7 +62,8 @@ def flight_bytes(kind, values, detuned):
         flown = gains.with_elements({"RD_RR": detuned, "RD_PP": detuned}) if detuned else gains
         scenario = Scenario("doublet", Ts, setpoint, level, 0, (0, len(times)))
         flight = fly(body, Autopilot(body, flown), scenario, 2)
-    return flight_log_bytes(flight, body, gains)
+    landed = np.zeros(len(flight.record), bool)
+    return vehicle_log(flight.record, landed, gains.Ts, body, to_array(gains))
 
 
 class FieldVehicle(FlyingVehicle):
@@ -80,13 +79,14 @@ class FieldVehicle(FlyingVehicle):
         Amplitude of its wobble in hover.
     """
 
-    def __init__(self, folder, **keywords):
+    def __init__(self, **keywords):
         gains = first_gains()
         fixed = {p.name: gains.elements()[p.code] for p in PARAMETERS if not p.writable}
         scale = gains.identity()
         super().__init__(**{**make_plan(gains).values, **fixed, **scale}, **keywords)
         self.stored_values = dict(self.values)
-        self.folder, self.own = folder, OwnVehicle(folder)
+        self.logs = ScriptedLogs({})
+        self.logs.now = lambda: self.clock
         self.armed, self.landed, self.height = False, 1, 0.0
         self.charge, self.logging, self.detuned, self.gust, self.simulated = 80, True, 0.0, 0.0, True
         self.target = 0.0
@@ -94,6 +94,7 @@ class FieldVehicle(FlyingVehicle):
         self.excited = self.content = ""
         self.rotation = 0.0
         self.stuck = None
+        self.cut = None
         self.mute_until = 0.0
         self.clock = 0.0
         self.text = []
@@ -112,7 +113,7 @@ class FieldVehicle(FlyingVehicle):
         if self.clock < self.mute_until:
             return []
         if isinstance(order, FileRequest | RequestLogs | RequestLogData | EndLogs):
-            return self.own.answer(order)
+            return self.logs.answer(order)
         if isinstance(order, SendCommand):
             return self.execute(order.command, order.params)
         if isinstance(order, AttitudeTarget):
@@ -147,9 +148,8 @@ class FieldVehicle(FlyingVehicle):
             return
         values = tuple((p.code, self.values[p.name]) for p in PARAMETERS if p.writable)
         content = flight_bytes(self.content, values, self.detuned if self.content == "check" else 0.0)
-        path = self.folder / f"flight-{len(self.own.logs) + 1}.ulg"
-        path.write_bytes(content)
-        self.own.logs.append(StoredLog(path, len(content), crc32(content), 1_700_000_000 + len(self.own.logs)))
+        number = len(self.logs.files) + 1
+        self.logs.files[f"{self.logs.folder}/2026-11-29/{number:02d}.ulg"] = content[: self.cut]
 
     def reboot(self):
         """It falls silent, loses what it has not stored, and stands on the ground."""
@@ -228,7 +228,3 @@ class FieldLink(SimulatedLink):
             self.queue.sort()
             entry[3](self)
         return super().receive(until)
-
-
-__all__ = ["SOLE_PEER", "STREAM_S", "FieldLink", "FieldVehicle"]
-DURATION = DOUBLETS * (DOUBLET_S + LEVEL_S)
