@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.autopilot.autopilot import RECORD
 from mimopilot.sitl.autopilot.flight_modes import Commander
@@ -38,6 +39,8 @@ class VehicleState:
         Share of the last second in which the control loop did not sleep.
     excitation_phase : int
         0 roll, 1 pitch, 2 between them, -1 off.
+    autopilot : int
+        MAV_AUTOPILOT that the vehicle reports.
     """
 
     vehicle: Commander
@@ -49,6 +52,7 @@ class VehicleState:
     home: tuple[int, ...] = ()
     load: float = 0.0
     excitation_phase: int = -1
+    autopilot: int = mavlink.MAV_AUTOPILOT_GENERIC
 
     @property
     def milliseconds(self) -> int:

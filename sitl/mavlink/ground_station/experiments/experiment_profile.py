@@ -50,6 +50,8 @@ class ExcitationOptions:
         Roll or pitch beyond which the experiment is stopped.
     runs : int or None
         How often PX4's autotune is run.
+    yaw_amplitude : float or None
+        Of the torque on yaw (normalised); our injector's.
     """
 
     axis: str | None
@@ -60,6 +62,7 @@ class ExcitationOptions:
     mode: str
     tilt_deg: float
     runs: int | None = None
+    yaw_amplitude: float | None = None
 
 
 @dataclass(frozen=True)

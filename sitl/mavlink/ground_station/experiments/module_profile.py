@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.flight.excitation_flight import AMPLITUDE
+from mimopilot.sitl.flight.excitation_flight import AMPLITUDE, VEHICLE_YAW_AMPLITUDE
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import (
     ExcitationOptions,
     ExperimentProfile,
@@ -43,7 +43,7 @@ PX4 = 12  # MAV_AUTOPILOT_PX4
 #: Bits of SDLOG_PROFILE that tuning from a log needs: default, high rate, debug topics.
 LOG_PROFILE, NEEDED = "SDLOG_PROFILE", 1 | 16 | 32
 #: --axis -> value of `AXIS`.
-AXES = {"roll": 1, "pitch": 2, "both": 3}
+AXES = {"roll": 1, "pitch": 2, "both": 3, "yaw": 4, "all": 5}
 
 
 def injector_settings(excitation: ExcitationOptions, Ts: float) -> dict[str, float]:
@@ -64,6 +64,7 @@ def injector_settings(excitation: ExcitationOptions, Ts: float) -> dict[str, flo
     values = {
         AXIS: AXES[axis],
         "MIMO_EX_AMP": AMPLITUDE if excitation.amplitude is None else excitation.amplitude,
+        "MIMO_EX_AMPY": VEHICLE_YAW_AMPLITUDE if excitation.yaw_amplitude is None else excitation.yaw_amplitude,
         "MIMO_EX_HMIN": hold_min,
         "MIMO_EX_HMAX": hold_max,
         "MIMO_EX_DUR": excitation.seconds_per_axis,
@@ -74,6 +75,27 @@ def injector_settings(excitation: ExcitationOptions, Ts: float) -> dict[str, flo
     wanted = {name: single(values[name]) for name in NAMES}
     check_settings(wanted)
     return wanted
+
+
+def check_log(session: VehicleSession) -> None:
+    """Refuse a PX4 whose log would be too slow for tuning.
+
+    Raises
+    ------
+    SitlError
+        With the parameter and its value.
+    """
+    client = session.client
+    assert client.vehicle is not None
+    if client.vehicle.autopilot != PX4:
+        return
+    profile = round(session.run(read_values(client, [LOG_PROFILE]))[LOG_PROFILE])
+    if profile & NEEDED != NEEDED:
+        raise SitlError(
+            f"{LOG_PROFILE} is {profile}: the log rate would be too low for tuning; land, set it to {NEEDED}, and "
+            "take off again",
+            exit_code=1,
+        )
 
 
 class ModuleInjection(ExperimentProfile):
@@ -106,14 +128,7 @@ class ModuleInjection(ExperimentProfile):
         Ts = session.run(read_values(session.client, ["MIMO_TS"]))["MIMO_TS"]
         self.wanted = injector_settings(self.options, Ts)
         monitor = session.run(start_monitor(session.client, round(self.wanted["MIMO_EX_MODE"])))
-        if self._on_px4(session):
-            profile = round(session.run(read_values(session.client, [LOG_PROFILE]))[LOG_PROFILE])
-            if profile & NEEDED != NEEDED:
-                raise SitlError(
-                    f"{LOG_PROFILE} is {profile}: the log rate would be too low for tuning; land, set it to {NEEDED}, "
-                    "and take off again",
-                    exit_code=1,
-                )
+        check_log(session)
         return monitor
 
     @property

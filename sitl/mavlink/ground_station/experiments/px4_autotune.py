@@ -83,7 +83,7 @@ SETTLE_S = 3.0  # between two runs
 
 @dataclass
 class _Run:
-    """What is known of one run of the autotune; times by our clock, s.
+    """What is known of one run of the autotune; times by the vehicle's clock, s.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ class _Run:
         return self.axis == "end" or self.result is not None
 
     def note(self, ack: CommandAck, now: float) -> None:
-        """Record an acknowledgement."""
+        """Record an acknowledgement that came at a time."""
         if ack.result == mavlink.MAV_RESULT_IN_PROGRESS:
             self.requested = True
             axis = AXES.get(ack.progress, "end" if ack.progress >= AFTER_AXES else "")
@@ -157,7 +157,7 @@ class Px4Autotune(ExperimentProfile):
             )
         if options.mode not in EXCITED_MODES:
             raise SitlError(f"--mode: got {options.mode!r}, expected one of {', '.join(EXCITED_MODES)}")
-        if options.axis is not None:
+        if options.axis not in (None, "all"):
             raise SitlError("--axis: PX4's autotune excites roll, pitch and yaw, one after the other; leave it out")
         self.runs = DEFAULT_RUNS if options.runs is None else options.runs
         self.amplitude = single(amplitude)
@@ -263,7 +263,7 @@ class Px4Autotune(ExperimentProfile):
             if reason:
                 reason = f"run {number + 1}: {reason}"
                 break
-        stopped = not reason or (yield from self._stop(client))
+        stopped = not reason or (yield from self._stop(client, monitor))
         return ExperimentResult(not reason, reason, seconds, stopped, True)
 
     def _run(self, client: ParameterClient, monitor: FlightMonitor, mode: int, run: _Run, phase: str) -> Exchange[str]:
@@ -274,7 +274,7 @@ class Px4Autotune(ExperimentProfile):
             if client.now >= due and not run.ended:
                 due = client.now + POLL_RUN_S
                 send = [self._request(client, run)]
-            yield from self._exchange(client, run, send)
+            yield from self._exchange(client, monitor, run, send)
             client.progress(phase, round(client.now - begin), round(RUN_TIMEOUT_S))
             reason = stop_reason(client, monitor, mode, self.tilt) or self._run_problem(client, monitor, run, begin)
             if reason:
@@ -302,7 +302,9 @@ class Px4Autotune(ExperimentProfile):
             return ReadParameter(*target, START)
         return SendCommand(*target, COMMAND, (0.0 if run.requested else 1.0,))
 
-    def _exchange(self, client: ParameterClient, run: _Run, send: list[Outgoing]) -> Exchange[None]:
+    def _exchange(
+        self, client: ParameterClient, monitor: FlightMonitor, run: _Run, send: list[Outgoing]
+    ) -> Exchange[None]:
         """Send, wait for `POLL_S`, and record what is heard of the run."""
         assert client.vehicle is not None
         end = client.now + POLL_S
@@ -311,7 +313,7 @@ class Px4Autotune(ExperimentProfile):
             send = []
             for answer in answers:
                 if isinstance(answer, CommandAck) and answer.command == COMMAND:
-                    run.note(answer, client.now)
+                    run.note(answer, monitor.clock)
                     # Without MC_AT_START the end is the first idle state after the axes.
                     idle = answer.result == mavlink.MAV_RESULT_IN_PROGRESS and answer.progress == 0
                     run.ended |= not self.has_start and idle and run.over
@@ -320,7 +322,7 @@ class Px4Autotune(ExperimentProfile):
                     if answer.value and not run.over:  # while it runs, the command tells the axis and starts nothing
                         send.append(SendCommand(client.vehicle.system, client.vehicle.component, COMMAND, (1.0,)))
 
-    def _stop(self, client: ParameterClient) -> Exchange[bool]:
+    def _stop(self, client: ParameterClient, monitor: FlightMonitor) -> Exchange[bool]:
         """Take the amplitude away and wait until the run has ended; returns whether nothing is injected any more."""
         yield from client.write({AMPLITUDE: 0.0}, "stopping", keep_going=True)
         yield from client.wait_until_quiet()
@@ -334,7 +336,7 @@ class Px4Autotune(ExperimentProfile):
             if client.now >= due:
                 due = client.now + POLL_RUN_S
                 send = [self._request(client, run)]
-            yield from self._exchange(client, run, send)
+            yield from self._exchange(client, monitor, run, send)
             if client.lost:
                 return False
         return True

@@ -150,7 +150,7 @@ def test_the_injection_is_not_started_if_a_setting_is_refused():
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        ({"axis": "yaw"}, "--axis: got 'yaw'"),
+        ({"axis": "thrust"}, "--axis: got 'thrust'"),
         ({"mode": "acro"}, "--mode: got 'acro'"),
         ({"amplitude": 0.6}, "MIMO_EX_AMP: got 0.6"),
         ({"amplitude": float("nan")}, "finite"),
