@@ -106,9 +106,10 @@ def fly_check(run: AutotuneRun) -> Found:
             run.dialogue.tell(f"{reason}: landing")
             reason = f"the check flight was ended: {reason}"
             run.decisions.note(reason)
-            session.run(_hand_over(session))
+            ours = session.run(_hand_over(session))
             session.run(land(watch))
             run.took_off = False
+            session.run(session.client.write(ours, "restoring", keep_going=True))
             raise Decided(reason)
         if reason and session.vehicle.mode == custom_mode(Mode.OFFBOARD) and not run.took_off:
             session.run(_enter_mode(session, mode))
@@ -196,13 +197,23 @@ def _check_wind(watch: FlightWatch) -> Exchange[None]:
         )
 
 
-def _hand_over(session: Session) -> Exchange[None]:
-    """Hand over to PX4's own controllers by the one parameter of our module; other vehicles have no such switch."""
+def _hand_over(session: Session) -> Exchange[dict[str, float]]:
+    """Hand over to PX4's own controllers by the one parameter of our module; other vehicles have no such switch.
+
+    Returns
+    -------
+    dict
+        The parameter and its value before; empty: nothing was switched.
+    """
     client = session.client
     assert client.vehicle is not None
     if client.vehicle.autopilot != PX4:
-        return
+        return {}
+    answer = (yield from client.read([ENABLE.name], "reading", keep_going=True))[ENABLE.name]
+    if not answer.value:
+        return {}
     yield from client.write({ENABLE.name: 0.0}, "handing over", keep_going=True)
+    return {ENABLE.name: answer.value}
 
 
 def _enter_mode(session: Session, mode: int) -> Any:

@@ -90,19 +90,22 @@ def list_logs(run: AutotuneRun) -> list[list[Any]]:
 
 def fetch_flight(run: AutotuneRun) -> Found:
     """Fetch the log of the experiment."""
-    return _fetch(run, FLIGHT, run.decisions.steps["experiment"]["logs_before"])
+    return _fetch(run, FLIGHT, "experiment")
 
 
 def fetch_check(run: AutotuneRun) -> Found:
     """Fetch the log of the check flight."""
-    return _fetch(run, CHECK, run.decisions.steps["check flight"]["logs_before"])
+    return _fetch(run, CHECK, "check flight")
 
 
-def _fetch(run: AutotuneRun, name: str, before: list[list[Any]]) -> Found:
-    """Fetch the one log that is new, and give it its name."""
+def _fetch(run: AutotuneRun, name: str, flight: str) -> Found:
+    """Fetch the one log that is new since a flight began, and give it its name; without one, fly again next time."""
     folder = run.file(DOWNLOADS)
     with run.vehicle_logs() as session:
-        log = _new_log(session, before)
+        log, problem = _new_log(session, run.decisions.steps[flight]["logs_before"])
+        if log is None:
+            run.decisions.forget_from(flight)
+            raise SitlError(problem, exit_code=1)
         done = session.run(session.logs.download(log, folder))
     target = run.file(name + done.path.suffix)
     done.path.replace(target)
@@ -111,8 +114,8 @@ def _fetch(run: AutotuneRun, name: str, before: list[list[Any]]) -> Found:
     return {"file": target.name, "bytes": done.log.size, "verified": done.verified, "log": done.log.name}
 
 
-def _new_log(session: LogSession, before: list[list[Any]]) -> VehicleLog:
-    """The last log of the vehicle, which must be new; waits until it is there and no longer grows."""
+def _new_log(session: LogSession, before: list[list[Any]]) -> tuple[VehicleLog | None, str]:
+    """The new log of the vehicle, once it no longer grows, or why there is none."""
     begin, size = session.link.now(), -1
     while True:
         found = session.run(session.logs.find())
@@ -120,14 +123,12 @@ def _new_log(session: LogSession, before: list[list[Any]]) -> VehicleLog:
         last = session.run(session.logs.choose(None)) if len(new) > 1 else None
         log = last if last in new else new[0] if len(new) == 1 else None
         if log is not None and log.size == size > 0:
-            return log
+            return log, ""
         size = -1 if log is None else log.size
         if session.link.now() > begin + LOG_TIMEOUT_S:
             if log is None:
-                reason = "the vehicle has no log of this flight: is logging on, is its card full?"
-            else:
-                reason = f"{log.name}: the log of this flight has {log.size} bytes and is not closed: card full?"
-            raise SitlError(reason, exit_code=1)
+                return None, "the vehicle has no log of this flight: is logging on, is its card full?"
+            return None, f"{log.name}: the log of this flight has {log.size} bytes and is not closed: card full?"
         session.run(_pause(session))
 
 

@@ -46,9 +46,13 @@ class Answers:
     interactive: bool = True
     told: list = field(default_factory=list)
     asked: list = field(default_factory=list)
+    obeys: dict = field(default_factory=dict)
 
     def tell(self, text):
         self.told.append(text)
+        for part, action in self.obeys.items():
+            if part in text:
+                action()
 
     def ask(self, question, seconds=None):
         self.asked.append(question)
@@ -69,6 +73,7 @@ class Field:
     link: FieldLink
     user: Answers
     options: AutotuneOptions
+    patch: pytest.MonkeyPatch
 
     def run(self):
         """Run the autotune; returns why it failed, empty: the gains were kept."""
@@ -87,7 +92,9 @@ def scripted(tmp_path, monkeypatch):
     monkeypatch.setattr(ground_steps, "inspect_log", once(inspect_log))
     monkeypatch.setattr(autotune_run, "read_log", once(read_log))
 
-    def make(at=None, answers=None, loss=0.0, seed=0, pilot=False, **changes):
+    patch = pytest.MonkeyPatch()
+
+    def make(at=None, answers=None, loss=0.0, seed=0, pilot=False, yes=False, arm=False, **changes):
         vehicle = FieldVehicle()
         for name, value in changes.items():
             assert hasattr(vehicle, name)
@@ -100,7 +107,10 @@ def scripted(tmp_path, monkeypatch):
             take_off=None if pilot else 4.0,
             seconds_per_axis=SECONDS,
             amplitude=0.1,
+            yes=yes,
+            arm=arm,
         )
-        return Field(vehicle, link, Answers(answers or {}), options)
+        return Field(vehicle, link, Answers(answers or {}), options, patch)
 
-    return make
+    yield make
+    patch.undo()

@@ -25,8 +25,10 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     PowerReport,
     RequestLogData,
     RequestLogs,
+    RequestMessage,
     SendCommand,
     StatusText,
+    StorageReport,
     ThrustReport,
 )
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
@@ -63,7 +65,8 @@ def flight_bytes(kind, values, detuned):
         scenario = Scenario("doublet", Ts, setpoint, level, 0, (0, len(times)))
         flight = fly(body, Autopilot(body, flown), scenario, 2)
     landed = np.zeros(len(flight.record), bool)
-    return vehicle_log(flight.record, landed, gains.Ts, body, to_array(gains))
+    parameters = {p.name: value for p, value in zip(PARAMETERS, to_array(gains), strict=True)}
+    return vehicle_log(flight.record, landed, gains.Ts, body, parameters)
 
 
 class FieldVehicle(FlyingVehicle):
@@ -84,6 +87,7 @@ class FieldVehicle(FlyingVehicle):
         fixed = {p.name: gains.elements()[p.code] for p in PARAMETERS if not p.writable}
         scale = gains.identity()
         super().__init__(**{**make_plan(gains).values, **fixed, **scale}, **keywords)
+        self.autopilot, self.free = 0, None
         self.stored_values = dict(self.values)
         self.logs = ScriptedLogs({})
         self.logs.now = lambda: self.clock
@@ -95,6 +99,8 @@ class FieldVehicle(FlyingVehicle):
         self.rotation = 0.0
         self.stuck = None
         self.cut = None
+        self.lost_excitation = False
+        self.handed_over = []
         self.mute_until = 0.0
         self.clock = 0.0
         self.text = []
@@ -107,13 +113,15 @@ class FieldVehicle(FlyingVehicle):
     def heartbeat(self):
         if self.clock < self.mute_until or "HEARTBEAT" in self.silent:
             return []
-        return [Heartbeat(SYSTEM, 1, 0, self.armed, self.mode, 2, self.simulated)]
+        return [Heartbeat(SYSTEM, 1, self.autopilot, self.armed, self.mode, self.type, self.simulated)]
 
     def answer(self, order):
         if self.clock < self.mute_until:
             return []
         if isinstance(order, FileRequest | RequestLogs | RequestLogData | EndLogs):
             return self.logs.answer(order)
+        if order == RequestMessage(SYSTEM, 1, 261) and self.free is not None:
+            return [StorageReport(SYSTEM, 1, self.free)]
         if isinstance(order, SendCommand):
             return self.execute(order.command, order.params)
         if isinstance(order, AttitudeTarget):
@@ -146,6 +154,8 @@ class FieldVehicle(FlyingVehicle):
         self.injector.configure({n: v for n, v in self.values.items() if n.startswith("MIMO_EX")} | {"MIMO_EX_AX": 0.0})
         if not (self.logging and self.content):
             return
+        if self.lost_excitation and self.content == "experiment":
+            self.content = "check"
         values = tuple((p.code, self.values[p.name]) for p in PARAMETERS if p.writable)
         content = flight_bytes(self.content, values, self.detuned if self.content == "check" else 0.0)
         number = len(self.logs.files) + 1
@@ -182,6 +192,8 @@ class FieldVehicle(FlyingVehicle):
     def fly(self, dt):
         """Move for a period; returns the climb, m/s."""
         climb = 0.0
+        if self.values.get("MIMO_EN") == 0.0:
+            self.handed_over.append(self.armed)
         if self.armed and self.mode == TAKEOFF:
             climb = min(1.0, (self.target - self.height) / max(dt, 1e-3))
             if self.target - self.height < 0.05:
@@ -191,6 +203,7 @@ class FieldVehicle(FlyingVehicle):
             self.landed = 4
         self.height += climb * dt
         if self.armed and self.mode == LANDING and self.height <= 0.0:
+            self.height = 0.0
             self.disarm()
         stale = self.setpoint is None or self.clock - self.setpoint[2] > 0.5
         if self.mode == OFFBOARD and stale and self.setpoint is not None and self.clock - self.setpoint[2] > 2.5:
@@ -208,7 +221,11 @@ class FieldLink(SimulatedLink):
     def __init__(self, vehicle, at=None, **keywords):
         super().__init__(vehicle, **keywords)
         for moment, event in (at or {}).items():
-            self.schedule(moment, "event", event)
+            self.plan(moment, event)
+
+    def plan(self, moment, event):
+        """Call a function of the link at a moment, s."""
+        self.schedule(moment, "event", event)
 
     def open(self, *_):
         self.closed = False
