@@ -16,9 +16,10 @@ from mimopilot.sitl.field.flight_watch import POLL_S, FlightWatch, start_watch
 from mimopilot.sitl.field.ground_steps import Found, list_logs
 from mimopilot.sitl.field.vehicle_set import NEW, compare_set
 from mimopilot.sitl.mavlink.ground_station.events import Exchange
-from mimopilot.sitl.mavlink.ground_station.experiment_console import PX4, ExcitationOptions, check_log, settings
+from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
+from mimopilot.sitl.mavlink.ground_station.experiments.module_injector import INTEGERS, excite, start_monitor
+from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4, check_log, injector_settings
 from mimopilot.sitl.mavlink.ground_station.session import Session
-from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import INTEGERS, excite, start_monitor
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import ENABLE
@@ -46,7 +47,7 @@ def fly_experiment(run: AutotuneRun) -> Found:
         excitation = ExcitationOptions(
             "both", options.seconds_per_axis, options.amplitude, BANDWIDTH, SEED, "hold", TILT_DEG
         )
-        wanted = settings(excitation, Ts)
+        wanted = injector_settings(excitation, Ts)
         check_log(session)
         watch = _hover(run, session, "experiment")
         session.run(_check_wind(watch))

@@ -10,9 +10,10 @@ import pytest
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SetParameter, run_exchange
-from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions, settings
+from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
+from mimopilot.sitl.mavlink.ground_station.experiments.module_injector import INTEGERS, excite, start_monitor
+from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import injector_settings
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
-from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import INTEGERS, excite, start_monitor
 from mimopilot.tuning.logs.reader import read_log
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
@@ -20,7 +21,7 @@ from tests.sitl.mavlink.running import PATIENCE_S, Pilot, running_sitl, start
 from tests.sitl.mavlink.scripted_vehicle import SimulatedLink
 
 CHOICE = ExcitationOptions("both", 8.0, 0.2, 50.0, 3, "hold", 25.0)
-WANTED = settings(CHOICE, 0.004)
+WANTED = injector_settings(CHOICE, 0.004)
 PLANNED = 2 * 8.0 + 1.0
 
 
@@ -57,7 +58,7 @@ def test_a_complete_experiment_restores_all_settings(integers, loss):
 
 def test_all_three_axes_are_excited_one_after_the_other():
     vehicle = FlyingVehicle()
-    wanted = settings(replace(CHOICE, axis="all", yaw_amplitude=0.3), 0.004)
+    wanted = injector_settings(replace(CHOICE, axis="all", yaw_amplitude=0.3), 0.004)
     result, _ = experiment(vehicle, wanted=wanted)
     assert (result.complete, result.restored) == (True, True)
     assert result.seconds == pytest.approx(3 * 8.0 + 2 * 1.0, abs=0.3)  # messages at 10 Hz
@@ -173,7 +174,7 @@ def test_the_injection_is_not_started_if_a_setting_is_refused():
 )
 def test_settings_out_of_range_are_refused_before_sending(change, parts):
     with pytest.raises(SitlError, match=parts):
-        settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
+        injector_settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
 
 
 # The commands, against `mimopilot sitl`.
