@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -51,9 +49,3 @@ KeyOption = Annotated[Path | None, typer.Option(help="Sign with this key: 32 byt
 SystemOption = Annotated[
     int, typer.Option(min=0, max=255, help="The vehicle's system number; 0: the only one there is.")
 ]
-
-
-def warn(where: Path | str, warnings: Iterable[str]) -> None:
-    """Warnings about a file, a line each, on standard error."""
-    for warning in warnings:
-        print(f"mimopilot: warning: {where}: {warning}", file=sys.stderr)

@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ReportOption, warn
+from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ReportOption
 from mimopilot.cli.report import check_count, name_of, write_report_of
 from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
 from mimopilot.common.console import print_json, print_table, progress_console
 from mimopilot.common.errors import check_not_given
+from mimopilot.common.progress import step
+from mimopilot.common.text_table import with_deviation
+from mimopilot.common.verbosity import warn
 
 if TYPE_CHECKING:
     from mimopilot.tuning.experiment import Experiment
@@ -120,7 +123,8 @@ def tune(
         check_count(logs)
     experiments = [read_warned(log, columns) for log in logs]
     second = read_warned(repeat, columns) if repeat else None
-    gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
+    with step("designing the gains"):
+        gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
     gains.save(out)
     if report is not None:
         write_report_of(logs, [(name_of(out), gains)], report, columns, task)
@@ -230,7 +234,9 @@ def certify(
     from mimopilot.tuning.certificate import ACCEPTED
     from mimopilot.tuning.spec import load_spec
 
-    examined = mp.certify(read_warned(log, columns), gains, rate=rate, spec=spec)
+    experiment = read_warned(log, columns)
+    with step("examining the loop"):
+        examined = mp.certify(experiment, gains, rate=rate, spec=spec)
     if report is not None:
         write_report_of([log], [(name_of(gains), examined)], report, columns, load_spec(spec))
     if out is not None:
@@ -355,7 +361,8 @@ def inspect(
     import mimopilot as mp
     from mimopilot.tuning.logs.inspection_report import as_mapping, print_inspection
 
-    found = mp.inspect(log, columns)
+    with step(f"reading {log.name}"):
+        found = mp.inspect(log, columns)
     warn(log, found.warnings)
     if as_json:
         print_json(as_mapping(found))
@@ -378,7 +385,8 @@ def identify(
     from mimopilot.tuning.plant.rates_model import identify_rates, model_toml
 
     experiment = read_warned(log, columns)
-    found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)
+    with step("identifying the plant"):
+        found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)
     model, fits = found.model, found.one_step_percent
     if out is not None:
         write_atomically(out, model_toml(model, experiment.sha256))
@@ -421,7 +429,8 @@ def read_warned(log: Path, columns: Path | None) -> Experiment:
     """The experiment in a log; warnings about it go to standard error."""
     import mimopilot as mp
 
-    experiment = mp.read_log(log, columns)
+    with step(f"reading {log.name}"):
+        experiment = mp.read_log(log, columns)
     warn(log, experiment.warnings)
     return experiment
 
@@ -430,10 +439,7 @@ def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None
     """The matrices and the yaw gains of a set as a table, with standard deviations where they are known."""
     rows = []
     for name, matrix in gains.matrices.items():
-        row = [name]
-        for i in range(2):
-            for j in range(2):
-                text = f"{matrix[i][j]:.4f}"
-                row.append(f"{text} ({deviations[name][i][j]:.4f})" if name in deviations else text)
-        rows.append([*row, yaw_cell(gains, name, deviations)])
+        known = deviations.get(name, [[None, None], [None, None]])
+        cells = [with_deviation(matrix[i][j], known[i][j]) for i in range(2) for j in range(2)]
+        rows.append([name, *cells, yaw_cell(gains, name, deviations)])
     print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch", "yaw"], rows)
