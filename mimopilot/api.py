@@ -121,7 +121,8 @@ def tune(
     -------
     Gains
         With their certificate, standard deviations and warnings. `provenance.details` holds the predicted figures of
-        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``.
+        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``; and those of yaw in ``yaw``, or
+        why its gains are kept: ``kept``.
 
     Raises
     ------
