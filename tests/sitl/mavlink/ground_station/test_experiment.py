@@ -61,7 +61,7 @@ def test_all_three_axes_are_excited_one_after_the_other():
     wanted = injector_settings(replace(CHOICE, axis="all", yaw_amplitude=0.3), 0.004)
     result, _ = experiment(vehicle, wanted=wanted)
     assert (result.complete, result.restored) == (True, True)
-    assert result.seconds == pytest.approx(3 * 8.0 + 2 * 1.0, abs=0.2)
+    assert result.seconds == pytest.approx(3 * 8.0 + 2 * 1.0, abs=0.3)  # messages at 10 Hz
     moments = np.array(vehicle.moments)
     assert np.abs(moments).max(axis=0) == pytest.approx([0.2, 0.2, 0.3])
     assert np.count_nonzero(moments, axis=0).tolist() == [400, 400, 400]
@@ -194,7 +194,7 @@ def test_an_experiment_over_mavlink_produces_a_log_for_tuning(tmp_path, mimopilo
     with running_sitl("--speed", "4", "--log", log) as sitl:
         pilot = hovering_pilot(sitl)
         link = ("--connect", f"tcp:127.0.0.1:{sitl.tcp}", "--yes")
-        done = mimopilot("experiment", *link, "--seconds-per-axis", 12)
+        done = mimopilot("experiment", *link, "--seconds-per-axis", 9)
         assert done.returncode == 0, done.stderr
         assert "mimopilot tune LOG" in done.stdout
         wrong = mimopilot("experiment", *link, "--mode", "position")
@@ -207,7 +207,7 @@ def test_an_experiment_over_mavlink_produces_a_log_for_tuning(tmp_path, mimopilo
         pilot.close()
     flown = read_log(log)
     excited = [np.flatnonzero(signal) for signal in (*flown.u_bar.T, flown.yaw.u_bar)]
-    assert [len(samples) * flown.Ts for samples in excited] == pytest.approx([12.0, 12.0, 12.0])
+    assert [len(samples) * flown.Ts for samples in excited] == pytest.approx([9.0, 9.0, 9.0])
     assert excited[2][0] - excited[1][-1] == 251  # 1 s pause
     assert flown.yaw.segments == ((excited[2][0], len(flown.u)),)
     assert flown.Ts == 0.004
@@ -228,7 +228,7 @@ def test_ctrl_c_in_the_client_restores_the_settings_and_the_vehicle_hovers_on():
         client.end()
         pilot.link.mav.param_request_list_send(1, 1)
         values = {}
-        while len(values) < 47:
+        while len(values) < 48:
             message = pilot.asks("PARAM_VALUE")
             values[message.param_id] = message.param_value
         assert values["MIMO_EX_AMP"] == pytest.approx(0.1)
