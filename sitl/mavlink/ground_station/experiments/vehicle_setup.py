@@ -11,7 +11,6 @@ from mimopilot.sitl.mavlink.ground_station.events import CommandAck, Exchange, H
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import VehicleSession
 from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
     FLIGHT_STREAMS,
-    POLL_S,
     STREAM_TIMEOUT_S,
     FlightMonitor,
     request_status,
@@ -25,8 +24,8 @@ from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
 
 #: From the command to reboot until the vehicle must be back, s; chosen: a Pixhawk with many sensors takes 20.
 BOOT_S = 60.0
-#: The same where the user has to reboot it, s; chosen.
-HAND_S = 180.0
+#: The same where the user has to reboot it, and between two looks whether it is back, s; chosen.
+HAND_S, LOOK_S = 180.0, 1.0
 #: Tries for a parameter that a vehicle may lack: at 30 % loss each way one answer in 3000 is missed.
 PROBE_TRIES = 12
 
@@ -175,7 +174,7 @@ def reboot(session: VehicleSession, monitor: FlightMonitor) -> FlightMonitor:
         monitor = session.run(request_streams(session.client, FLIGHT_STREAMS))
         if not monitor.overdue(STREAM_TIMEOUT_S) and monitor.clock < before:
             return monitor
-        session.run(wait(session.client, POLL_S))
+        session.run(wait(session.client, LOOK_S))
     if session.client.interrupted:
         raise SitlError("interrupted while the vehicle rebooted", exit_code=1)
     how = "it refuses the command: switch it off and on" if by_hand else "reboot it by hand"
