@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mimopilot.cli.options import (
-    ColumnsOption,
-    JsonOption,
-    LogArgument,
-    warn,
-)
+from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ReportOption
+from mimopilot.cli.report import check_count, name_of, write_report_of
 from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
 from mimopilot.common.console import print_json, print_table, progress_console
 from mimopilot.common.errors import check_not_given
+from mimopilot.common.progress import step
+from mimopilot.common.text_table import with_deviation
+from mimopilot.common.verbosity import warn
 
 if TYPE_CHECKING:
     from mimopilot.tuning.experiment import Experiment
@@ -93,6 +92,7 @@ def tune(
     require_better: Annotated[
         bool, typer.Option("--require-better", help="Exit code 1 if the flown gains are better.")
     ] = False,
+    report: ReportOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the best gains of the attitude cascade from one flight, and compare them with those that flew."""
@@ -111,7 +111,7 @@ def tune(
         window=window,
     )
     if campaign:
-        check_not_given("belongs to one log, --campaign tunes many; leave it out", repeat=repeat)
+        check_not_given("belongs to one log, --campaign tunes many; leave it out", repeat=repeat, report=report)
         tune_campaign(logs, task, out, load_columns(columns) if columns else None, as_json)
         return
     if not task.for_models:
@@ -119,10 +119,15 @@ def tune(
         check_not_given(text, instrument=instrument, repeat=repeat, window=window)
     else:
         check_not_given("belongs to the design; leave out --inner and --outer", follow_model=follow_model or None)
+    if report is not None:
+        check_count(logs)
     experiments = [read_warned(log, columns) for log in logs]
     second = read_warned(repeat, columns) if repeat else None
-    gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
+    with step("designing the gains"):
+        gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
     gains.save(out)
+    if report is not None:
+        write_report_of(logs, [(name_of(out), gains)], report, columns, task)
     known = {warning for experiment in experiments for warning in experiment.warnings}
     warn(logs[0], (warning for warning in gains.provenance.warnings if warning not in known))
     details, deviations = gains.provenance.details, gains.provenance.standard_deviation
@@ -221,13 +226,19 @@ def certify(
         Path | None, typer.Option(help="Specification (TOML) whose [certificate] says what margins are needed.")
     ] = None,
     columns: ColumnsOption = None,
+    report: ReportOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check the stability of the closed loop, from a flight with any gains. Exit code 1: not certified."""
     import mimopilot as mp
     from mimopilot.tuning.certificate import ACCEPTED
+    from mimopilot.tuning.spec import load_spec
 
-    examined = mp.certify(read_warned(log, columns), gains, rate=rate, spec=spec)
+    experiment = read_warned(log, columns)
+    with step("examining the loop"):
+        examined = mp.certify(experiment, gains, rate=rate, spec=spec)
+    if report is not None:
+        write_report_of([log], [(name_of(gains), examined)], report, columns, load_spec(spec))
     if out is not None:
         examined.save(out)
     if as_json:
@@ -243,6 +254,7 @@ def advise(
     spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
     columns: ColumnsOption = None,
+    report: ReportOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show the gains that tune finds beside alternatives: slower, faster, quieter, SISO, other derivative filters."""
@@ -261,6 +273,8 @@ def advise(
     best = found.recommended
     if out is not None:
         best.gains.save(out)
+    if report is not None:
+        write_report_of([log], [("recommended", best.gains)], report, columns, load_spec(spec))
     if as_json:
         candidates = [
             {
@@ -347,7 +361,8 @@ def inspect(
     import mimopilot as mp
     from mimopilot.tuning.logs.inspection_report import as_mapping, print_inspection
 
-    found = mp.inspect(log, columns)
+    with step(f"reading {log.name}"):
+        found = mp.inspect(log, columns)
     warn(log, found.warnings)
     if as_json:
         print_json(as_mapping(found))
@@ -370,7 +385,8 @@ def identify(
     from mimopilot.tuning.plant.rates_model import identify_rates, model_toml
 
     experiment = read_warned(log, columns)
-    found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)
+    with step("identifying the plant"):
+        found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)
     model, fits = found.model, found.one_step_percent
     if out is not None:
         write_atomically(out, model_toml(model, experiment.sha256))
@@ -413,7 +429,8 @@ def read_warned(log: Path, columns: Path | None) -> Experiment:
     """The experiment in a log; warnings about it go to standard error."""
     import mimopilot as mp
 
-    experiment = mp.read_log(log, columns)
+    with step(f"reading {log.name}"):
+        experiment = mp.read_log(log, columns)
     warn(log, experiment.warnings)
     return experiment
 
@@ -422,10 +439,7 @@ def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None
     """The matrices and the yaw gains of a set as a table, with standard deviations where they are known."""
     rows = []
     for name, matrix in gains.matrices.items():
-        row = [name]
-        for i in range(2):
-            for j in range(2):
-                text = f"{matrix[i][j]:.4f}"
-                row.append(f"{text} ({deviations[name][i][j]:.4f})" if name in deviations else text)
-        rows.append([*row, yaw_cell(gains, name, deviations)])
+        known = deviations.get(name, [[None, None], [None, None]])
+        cells = [with_deviation(matrix[i][j], known[i][j]) for i in range(2) for j in range(2)]
+        rows.append([name, *cells, yaw_cell(gains, name, deviations)])
     print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch", "yaw"], rows)

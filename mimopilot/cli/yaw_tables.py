@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from mimopilot.common.console import print_table
+from mimopilot.common.text_table import with_deviation
 
 if TYPE_CHECKING:
     from mimopilot.tuning.gains import Gains
@@ -31,7 +32,7 @@ def yaw_cell(gains: Gains, name: str, deviations: Mapping[str, Any]) -> str:
     value, deviation = getattr(gains.yaw, name, None), deviations.get("yaw", {}).get(name)
     if value is None:
         return ""
-    return f"{value:.4f}" if deviation is None else f"{value:.4f} ({deviation:.4f})"
+    return with_deviation(value, deviation)
 
 
 def print_yaw(gains: Gains) -> None:
