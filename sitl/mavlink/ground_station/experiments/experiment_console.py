@@ -78,6 +78,8 @@ def experiment(options: LinkOptions, name: str, excitation: ExcitationOptions) -
         snapshot.session = session
         ours = isinstance(profile, ModuleInjection)
         vehicle = identify(session, "" if ours else profile.name)
+        if ours:
+            session.read(["MIMO_TS"])  # says what is wrong with a vehicle that lacks our module
         try:
             monitor = profile.check(session) if ours or vehicle.armed else _prepare(session, profile, options)
             if not options.as_json:
