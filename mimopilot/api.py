@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from mimopilot.common.blas import reproducible
 
 if TYPE_CHECKING:
+    from mimopilot.sitl.field.report.flight_report import FlightReport
     from mimopilot.sitl.flight.metrics import Performance
     from mimopilot.sitl.flight.scenario import Scenario
     from mimopilot.sitl.flight.simulator import Flight
@@ -205,6 +206,60 @@ def advise(
     from mimopilot.tuning.design.advise import advise as scan
 
     return scan(_experiment(log, columns), _spec(spec, {}), watch=watch)
+
+
+@reproducible
+def report(
+    logs: PathLike | Sequence[PathLike],
+    out: PathLike,
+    *,
+    gains: GainSet | Sequence[GainSet] = (),
+    figures: PathLike | None = None,
+    spec: PathLike | TuningSpec | None = None,
+    columns: PathLike | None = None,
+) -> FlightReport:
+    """Write the report of a flight: one page with interactive figures, which needs no network.
+
+    Parameters
+    ----------
+    logs : str or Path, or a list of them
+        Any flight logs, also such that gains cannot be tuned from; the first is the one before.
+    out : str or Path
+        The page (HTML).
+    gains : str, Path or Gains, or a list of them
+        Shown beside the flown gains.
+    figures : str or Path, optional
+        Folder for the same figures as PNG and SVG.
+    spec : str, Path or TuningSpec, optional
+        Whose ``certificate`` says which margins are needed.
+    columns : str or Path, optional
+        As in `read_log`.
+
+    Returns
+    -------
+    FlightReport
+        What was written: headline, sections with their tables and figures, gain sets with their certificates.
+
+    Raises
+    ------
+    Error
+        When a file is no flight log or damaged, or the gains cannot be read.
+    """
+    from mimopilot.sitl.field.report.flight_report import make_report
+
+    paths = [Path(one) for one in ([logs] if isinstance(logs, str | Path) else logs)]
+    given: Sequence[GainSet] = [gains] if isinstance(gains, str | Path) or not isinstance(gains, Sequence) else gains
+    named = [(_gains_name(one, place, len(given)), _gains(one)) for place, one in enumerate(given)]
+    found = make_report(paths, named, _spec(spec, {}), _columns(columns))
+    found.write(Path(out), None if figures is None else Path(figures))
+    return found
+
+
+def _gains_name(gains: GainSet, place: int, count: int) -> str:
+    """Name of a gain set in a report: that of its file, else new."""
+    if isinstance(gains, str | Path):
+        return Path(gains).name.removesuffix(".toml").removesuffix(".gains")
+    return "new" if count == 1 else f"new {place + 1}"
 
 
 def load_gains(path: PathLike) -> Gains:
@@ -476,8 +531,10 @@ def experiment(
     seed: int = 0,
     excitation_seed: int | None = None,
     both_axes: bool = False,
+    axis: str = "all",
+    yaw_amplitude: float | None = None,
 ) -> Experiment:
-    """Fly a simulated experiment with a PRBS added to the torque on roll, then on pitch.
+    """Fly a simulated experiment with a PRBS added to the torque on roll, then on pitch, then on yaw.
 
     Parameters
     ----------
@@ -495,7 +552,11 @@ def experiment(
     excitation_seed : int, optional
         Of the excitation.
     both_axes : bool
-        Excite roll and pitch at once, for `seconds_per_axis` in all.
+        Excite roll and pitch at once, for `seconds_per_axis`.
+    axis : str
+        ``all``, ``both`` (roll, then pitch), ``roll``, ``pitch`` or ``yaw``.
+    yaw_amplitude : float, optional
+        On yaw; by default 0.3, or less if the motors would saturate.
 
     Returns
     -------
@@ -512,7 +573,9 @@ def experiment(
 
     body, controller = vehicle(airframe, gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
-    plan = ExperimentPlan(body, controller, seconds_per_axis, strength, bandwidth, excitation_seed, both_axes)
+    plan = ExperimentPlan(
+        body, controller, seconds_per_axis, strength, bandwidth, excitation_seed, both_axes, axis, yaw_amplitude
+    )
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "flight.ulg" if out is None else Path(out)
         check_survived(plan.record(path, seed))

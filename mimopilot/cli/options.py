@@ -37,6 +37,9 @@ WorkersOption = Annotated[int | None, typer.Option(min=1, max=1024, help="Proces
 SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast as possible.")]
 LogOutOption = Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")]
 UncertifiedOption = Annotated[bool, typer.Option("--uncertified", help="Accept gains whose stability is in doubt.")]
+ReportOption = Annotated[
+    Path | None, typer.Option(help="Also write a page with figures of the log and of these gains (HTML).")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 TimeoutOption = Annotated[

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ERROR, RATE, SETPOINT, rate_matrices, state_space
 from mimopilot.tuning.reference_model import ReferenceModel
+from mimopilot.tuning.small_matrices import singular_values
 from mimopilot.tuning.statespace import Response, StateSpace
-from mimopilot.tuning.two_by_two import singular_values
 
 #: Poles slower than this are dominant, rad/s: three times the usual attitude model. Faster ones are those of rotors,
 #: filters and delays, which damp out within a fraction of a manoeuvre.

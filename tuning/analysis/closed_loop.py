@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning import law
-from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.axes import Law
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.statespace import StateSpace
 
@@ -22,7 +22,7 @@ Signal = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class CascadeLoop:
-    """Frequency responses of a gain set around a plant, (K, 2, 2) each.
+    """Frequency responses of a gain set around a plant, (K, n, n) each.
 
     Attributes
     ----------
@@ -38,33 +38,34 @@ class CascadeLoop:
     U_o: Complex
 
 
-def whole_loop(gains: Gains, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
-    """L_i and L_u as in `CascadeLoop`, and the setpoint's path C_ref, (K, 2, 2) each."""
+def whole_loop(gains: Law, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
+    """L_i and L_u as in `CascadeLoop`, and the setpoint's path C_ref, (K, n, n) each."""
     C_ref, C_o, C_y = law.cascade_response(gains, plant.omega)
     L_i = C_y @ plant.G_i
     return L_i, L_i + C_o @ plant.G_o, C_ref
 
 
-def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
+def cascade_loop(gains: Law, plant: PlantResponse) -> CascadeLoop:
     """Open and closed loop of a gain set around a measured plant."""
     L_i, L_u, forward = whole_loop(gains, plant)
-    U_o: Complex = np.linalg.solve(np.eye(2) + L_u, forward).astype(np.complex128)
+    U_o: Complex = np.linalg.solve(np.eye(plant.axes) + L_u, forward).astype(np.complex128)
     return CascadeLoop(L_i, L_u, plant.G_o @ U_o, U_o)
 
 
-def closed_loop_poles(gains: Gains, plant: StateSpace) -> Complex:
+def closed_loop_poles(gains: Law, plant: StateSpace) -> Complex:
     """Poles of the closed loop around a plant, without limits: those of the rate loop alone, then of the whole cascade.
 
     Parameters
     ----------
-    gains : Gains
+    gains : Law
     plant : StateSpace
         From torque to body rates; the angles are their integrals.
     """
     flown = law.state_space(law.rate_matrices(gains), gains.filters)
     n, m = len(plant.A), len(flown.A)
-    start = np.eye(n + m + 4)
-    state, memory, rate, angle = np.split(start, [n, n + m, n + m + 2])
+    axes = len(plant.C)
+    start = np.eye(n + m + 2 * axes)
+    state, memory, rate, angle = np.split(start, [n, n + m, n + m + axes])
     now = plant.C @ state
     angle = angle + gains.Ts / 2 * (now + rate)
     poles = []
@@ -75,7 +76,7 @@ def closed_loop_poles(gains: Gains, plant: StateSpace) -> Complex:
         step = np.vstack([plant.A @ state + plant.B @ torque, ahead, now, angle])
         kept = np.ones(len(step), bool)
         if not setpoint.any():  # the rate loop alone: the angle is not fed back
-            kept[-2:] = False
+            kept[-axes:] = False
         # A filter whose output is not used, such as an integral with zero gain, is not part of the loop.
         kept[n : n + m] = np.any(flown.C, axis=0)
         poles.append(np.linalg.eigvals(step[np.ix_(kept, kept)]))
@@ -83,17 +84,17 @@ def closed_loop_poles(gains: Gains, plant: StateSpace) -> Complex:
     return found
 
 
-def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
+def model_spectral_radius(gains: Law, plant: StateSpace) -> float:
     """Spectral radius of the closed loop around an identified plant; see `closed_loop_poles`."""
     return float(np.abs(closed_loop_poles(gains, plant)).max())
 
 
-def slow_growth(gains: Gains, plant: StateSpace, below: float) -> float | None:
+def slow_growth(gains: Law, plant: StateSpace, below: float) -> float | None:
     """Frequency (rad/s) of an unstable mode of the loop around a model, slower than `below`; None: there is none.
 
     Parameters
     ----------
-    gains : Gains
+    gains : Law
     plant : StateSpace
         From torque to body rates.
     below : float, rad/s

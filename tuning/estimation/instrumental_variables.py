@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.experiment import SIGNALS, Experiment, YawSignals, excited_segments, external_signal
 from mimopilot.tuning.parameter_row import ROLL_PITCH
 from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
 from mimopilot.tuning.plant.local_polynomial import local_response
@@ -22,6 +21,7 @@ SAME_EXCITATION = 0.99
 SAME_PERIOD = 1e-6
 
 Signal = NDArray[np.float64]
+Segments = tuple[tuple[int, int], ...]
 Stretches = list[tuple[slice, list[tuple[int, int]]]]
 
 
@@ -115,12 +115,7 @@ def excited_stretches(experiment: Experiment, external: Signal, method: str) -> 
     """
     stretches: Stretches = []
     for axis in range(2):
-        active: list[tuple[int, int]] = []
-        for start, stop in experiment.segments:
-            signal = external[start:stop, axis]
-            moving = start + np.flatnonzero(signal if np.ptp(signal) > 0 else 0 * signal)
-            if len(moving):
-                active.append((int(moving[0]), int(moving[-1]) + 1))
+        active = excited_segments(experiment.segments, external[:, axis])
         if not active:
             name = ROLL_PITCH[axis]
             raise TuningError(f"{experiment.source}: not excited on {name}; inject a torque on that axis too")
@@ -153,17 +148,26 @@ def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment
             f"{np.max(likeness) / size:.2f}); give a second flight with the same amplitude, hold times and seed"
         )
     start, stop = max(shift, 0), min(len(one), len(other) + shift)
-    shared = [
-        (max(a, c + shift) - start, min(b, d + shift) - start)
-        for a, b in first.segments
-        for c, d in second.segments
-        if max(a, c + shift) < min(b, d + shift)
-    ]
-    return _cut(first, start, stop, shared), _cut(second, start - shift, stop - shift, shared)
+
+    def shared(segments: Segments, others: Segments) -> Segments:
+        return tuple(
+            (max(a, c + shift) - start, min(b, d + shift) - start)
+            for a, b in segments
+            for c, d in others
+            if max(a, c + shift) < min(b, d + shift)
+        )
+
+    kept = shared(first.segments, second.segments)
+    of_yaw = shared(first.yaw.segments, second.yaw.segments) if first.yaw and second.yaw else ()
+    return _cut(first, start, stop, kept, of_yaw), _cut(second, start - shift, stop - shift, kept, of_yaw)
 
 
-def _cut(experiment: Experiment, start: int, stop: int, segments: Sequence[tuple[int, int]]) -> Experiment:
-    """Rows start..stop of all signals."""
-    values = {f.name: getattr(experiment, f.name) for f in fields(experiment)}
-    cut: dict[str, Any] = {name: value[start:stop] for name, value in values.items() if isinstance(value, np.ndarray)}
-    return replace(experiment, **cut, segments=tuple(segments))
+def _cut(experiment: Experiment, start: int, stop: int, segments: Segments, of_yaw: Segments) -> Experiment:
+    """Rows start..stop of all signals; without yaw where both flights have none of its segments."""
+
+    def cut(signals: Experiment | YawSignals) -> dict[str, Any]:
+        values = {name: getattr(signals, name) for name in SIGNALS}
+        return {name: None if value is None else value[start:stop] for name, value in values.items()}
+
+    yaw = YawSignals(**cut(experiment.yaw), segments=of_yaw) if experiment.yaw and of_yaw else None
+    return replace(experiment, **cut(experiment), yaw=yaw, segments=segments)

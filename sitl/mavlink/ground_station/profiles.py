@@ -54,6 +54,8 @@ class UploadPlan:
         Other differences of the vehicle's controller.
     profile : str
         Key of `PROFILES` that the vehicle must fit; empty: any vehicle.
+    integers : frozenset of str
+        Parameters that may be whole numbers on the vehicle.
     """
 
     settings: tuple[ParameterWrite, ...]
@@ -62,6 +64,7 @@ class UploadPlan:
     dropped: dict[str, float]
     notes: tuple[str, ...] = ()
     profile: str = ""
+    integers: frozenset[str] = frozenset()
 
     @property
     def values(self) -> dict[str, float]:
@@ -203,7 +206,7 @@ def _lost_features(gains: Gains) -> tuple[str, ...]:
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.
 _OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
 TABLE = {p.name: p for p in _OURS}
-PREFIXES = {"mimo": PREFIX, "px4-stock": "MC_", "ardupilot-stock": "ATC_"}
+PREFIXES = {"mimo": (PREFIX,), "px4-stock": ("MC_",), "ardupilot-stock": ("ATC_", "SID_")}
 
 
 def violated_range(name: str, value: float) -> str:
@@ -250,4 +253,5 @@ def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
         if name not in fixed
     )
     profile = next((p for p, prefix in PREFIXES.items() if any(name.startswith(prefix) for name in values)), "")
-    return UploadPlan(settings, {name: values[name] for name in values if name in fixed}, (), {}, profile=profile)
+    held = {name: values[name] for name in values if name in fixed}
+    return UploadPlan(settings, held, (), {}, profile=profile, integers=frozenset(values))

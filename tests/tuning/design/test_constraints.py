@@ -22,7 +22,7 @@ from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import wide_response
-from mimopilot.tuning.two_by_two import singular_values
+from mimopilot.tuning.small_matrices import singular_values
 from tests.tuning.analysis.test_certify import experiment
 
 
