@@ -87,24 +87,24 @@ class Field:
 
 @pytest.fixture
 def scripted(tmp_path, monkeypatch):
-    """Make a `Field`; keywords are those of the link, `then` and others those of the vehicle or the options."""
+    """Make a `Field`; other keywords are attributes of the vehicle."""
     monkeypatch.setattr(ground_steps, "tune", tune_once)
     monkeypatch.setattr(ground_steps, "inspect_log", once(inspect_log))
     monkeypatch.setattr(autotune_run, "read_log", once(read_log))
 
     patch = pytest.MonkeyPatch()
 
-    def make(at=None, answers=None, loss=0.0, seed=0, pilot=False, yes=False, arm=False, **changes):
+    def make(answers=None, loss=0.0, seed=0, pilot=False, yes=False, arm=False, **changes):
         vehicle = FieldVehicle()
         for name, value in changes.items():
             assert hasattr(vehicle, name)
             setattr(vehicle, name, value)
-        link = FieldLink(vehicle, at, loss=loss, seed=seed, latency=0.01)
+        link = FieldLink(vehicle, loss=loss, seed=seed, latency=0.01)
         monkeypatch.setattr(session, "Connection", link.open)
         options = AutotuneOptions(
             "udpin:127.0.0.1:14550",
             tmp_path / "out",
-            take_off=None if pilot else 4.0,
+            take_off=None if pilot else 2.0,
             seconds_per_axis=SECONDS,
             amplitude=0.1,
             yes=yes,
