@@ -10,13 +10,14 @@ demo: $(VENV)/.installed
 test: $(VENV)/.installed-test cross
 	$(BIN)/pytest -n $(JOBS) --dist loadfile
 
-# What emulates and builds for the vehicle's processor; installed when missing.
-CROSS = gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm
+# What emulates and builds for the vehicle's processor, and the browser that opens reports; installed when missing.
+CROSS = gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm chromium
 cross:
 	@test -f "$$(arm-none-eabi-g++ -print-file-name=librdimon.a 2>&1)" && command -v qemu-system-arm >/dev/null \
+	&& command -v chromium >/dev/null \
 	|| { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && export DEBIAN_FRONTEND=noninteractive \
 	&& apt-get update -qq && apt-get install -qq -y --no-install-recommends $(CROSS); } \
-	|| { echo "the tests need a cross compiler and QEMU; on Debian, as root: apt-get install $(CROSS)"; exit 1; }
+	|| { echo "the tests need a cross compiler, QEMU and Chromium; on Debian, as root: apt-get install $(CROSS)"; exit 1; }
 
 # The packages under the names that they import by, for the type checker.
 AS_IMPORTED := build/as-imported/mimopilot

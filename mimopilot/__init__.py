@@ -32,6 +32,7 @@ _PUBLIC = {
             "load_airframe",
             "fly",
             "performance",
+            "report",
             "experiment",
             "upload",
             "list_logs",
@@ -64,6 +65,7 @@ if TYPE_CHECKING:
     from mimopilot.api import load_gains as load_gains
     from mimopilot.api import performance as performance
     from mimopilot.api import read_log as read_log
+    from mimopilot.api import report as report
     from mimopilot.api import tune as tune
     from mimopilot.api import upload as upload
     from mimopilot.common.errors import Error as Error

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from mimopilot.common.blas import reproducible
 
 if TYPE_CHECKING:
+    from mimopilot.sitl.field.report.flight_report import FlightReport
     from mimopilot.sitl.flight.metrics import Performance
     from mimopilot.sitl.flight.scenario import Scenario
     from mimopilot.sitl.flight.simulator import Flight
@@ -205,6 +206,60 @@ def advise(
     from mimopilot.tuning.design.advise import advise as scan
 
     return scan(_experiment(log, columns), _spec(spec, {}), watch=watch)
+
+
+@reproducible
+def report(
+    logs: PathLike | Sequence[PathLike],
+    out: PathLike,
+    *,
+    gains: GainSet | Sequence[GainSet] = (),
+    figures: PathLike | None = None,
+    spec: PathLike | TuningSpec | None = None,
+    columns: PathLike | None = None,
+) -> FlightReport:
+    """Write the report of a flight: one page with interactive figures, which needs no network.
+
+    Parameters
+    ----------
+    logs : str or Path, or a list of them
+        Any flight logs, also such that gains cannot be tuned from; the first is the one before.
+    out : str or Path
+        The page (HTML).
+    gains : str, Path or Gains, or a list of them
+        Shown beside the flown gains.
+    figures : str or Path, optional
+        Folder for the same figures as PNG and SVG.
+    spec : str, Path or TuningSpec, optional
+        Whose ``certificate`` says which margins are needed.
+    columns : str or Path, optional
+        As in `read_log`.
+
+    Returns
+    -------
+    FlightReport
+        What was written: headline, sections with their tables and figures, gain sets with their certificates.
+
+    Raises
+    ------
+    Error
+        When a file is no flight log or damaged, or the gains cannot be read.
+    """
+    from mimopilot.sitl.field.report.flight_report import make_report
+
+    paths = [Path(one) for one in ([logs] if isinstance(logs, str | Path) else logs)]
+    given: Sequence[GainSet] = [gains] if isinstance(gains, str | Path) or not isinstance(gains, Sequence) else gains
+    named = [(_gains_name(one, place, len(given)), _gains(one)) for place, one in enumerate(given)]
+    found = make_report(paths, named, _spec(spec, {}), _columns(columns))
+    found.write(Path(out), None if figures is None else Path(figures))
+    return found
+
+
+def _gains_name(gains: GainSet, place: int, count: int) -> str:
+    """Name of a gain set in a report: that of its file, else new."""
+    if isinstance(gains, str | Path):
+        return Path(gains).name.removesuffix(".toml").removesuffix(".gains")
+    return "new" if count == 1 else f"new {place + 1}"
 
 
 def load_gains(path: PathLike) -> Gains:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 # As the command line does, before numpy is loaded: results are compared with printed ones.
@@ -16,6 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+import mimopilot.cli.main as front_door
 from mimopilot.tuning.gains import Gains, Limits, YawGains
 from mimopilot.tuning.law import Filters
 
@@ -63,9 +67,29 @@ def gains() -> Gains:
     return coupled_gains()
 
 
+def run_here(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command line from a folder in this process, which saves a start; returns what a process would."""
+    output, errors, code = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), redirect_stderr(errors):
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["mimopilot", *map(str, arguments)])
+        patch.setattr(sys, "stdin", io.StringIO())
+        try:
+            front_door.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return subprocess.CompletedProcess(arguments, code, output.getvalue(), errors.getvalue())
+
+
 @pytest.fixture
 def mimopilot(tmp_path: Path) -> Run:
-    """Run the command line as a user would; returns the finished process."""
+    """`run_here` from the test's folder."""
+    return partial(run_here, tmp_path)
+
+
+@pytest.fixture
+def mimopilot_process(tmp_path: Path) -> Run:
+    """Run the command line as a user would, in a process of its own; returns the finished process."""
 
     def run(*arguments: object, **keywords: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "mimopilot", *map(str, arguments)]

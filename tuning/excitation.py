@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
 
-#: How many times longer yaw's pulses are than those of roll and pitch, as in the firmware (`kYawHold`). Chosen: a unit of
-#: torque accelerates yaw 10 to 20 times less, so its loop is slower; twice as long still excites it up to 8 Hz.
+#: How many times longer yaw's pulses are than those of roll and pitch, as in the firmware (`kYawHold`). Chosen: torque
+#: accelerates yaw 10 to 20 times less, so its loop is slower; pulses twice as long still excite it up to 8 Hz.
 YAW_HOLD = 2
 
 

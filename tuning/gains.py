@@ -324,6 +324,9 @@ class Gains:
         deviations = dict(self.provenance.standard_deviation)
         for name in deviations.keys() & matrices.keys():
             deviations[name] = (np.array(deviations[name]) * ratio[:2, None]).tolist()
+        of_yaw = deviations.get("yaw", {})
+        if of_yaw:
+            deviations["yaw"] = {n: v * float(ratio[2]) if n.endswith("_i") else v for n, v in of_yaw.items()}
         changed = replace(
             self,
             moment_scale=scale,

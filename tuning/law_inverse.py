@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import block_diag, schur
-from scipy.signal import lfilter
 
 from mimopilot.tuning.errors import NotMinimumPhaseError
 from mimopilot.tuning.law import (
@@ -109,6 +108,8 @@ def rebuild_rate_setpoint(gains: Matrices, u: Signal, rates: Signal) -> tuple[Si
     NotMinimumPhaseError
         When the inverse is unstable or does not exist.
     """
+    from scipy.signal import lfilter  # takes a second to import, which most commands do not need
+
     matrices, filters = rate_matrices(gains), gains.filters
     inverted = inverse_law(matrices, filters)
     A, B, inverse, eigenvalues = inverted.A, inverted.B, inverted.direct, inverted.eigenvalues

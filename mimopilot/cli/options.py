@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -39,6 +37,9 @@ WorkersOption = Annotated[int | None, typer.Option(min=1, max=1024, help="Proces
 SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast as possible.")]
 LogOutOption = Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")]
 UncertifiedOption = Annotated[bool, typer.Option("--uncertified", help="Accept gains whose stability is in doubt.")]
+ReportOption = Annotated[
+    Path | None, typer.Option(help="Also write a page with figures of the log and of these gains (HTML).")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 TimeoutOption = Annotated[
@@ -48,9 +49,3 @@ KeyOption = Annotated[Path | None, typer.Option(help="Sign with this key: 32 byt
 SystemOption = Annotated[
     int, typer.Option(min=0, max=255, help="The vehicle's system number; 0: the only one there is.")
 ]
-
-
-def warn(where: Path | str, warnings: Iterable[str]) -> None:
-    """Warnings about a file, a line each, on standard error."""
-    for warning in warnings:
-        print(f"mimopilot: warning: {where}: {warning}", file=sys.stderr)

@@ -17,6 +17,7 @@ from mimopilot.cli.options import (
     KeyOption,
     LogOutOption,
     PeriodOption,
+    ReportOption,
     ScenarioOption,
     SeedOption,
     SystemOption,
@@ -29,8 +30,11 @@ from mimopilot.common.errors import check_not_given
 
 if TYPE_CHECKING:
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan
+    from mimopilot.sitl.flight.simulator import Flight
     from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
+    from mimopilot.sitl.physics.airframe import Airframe
+    from mimopilot.tuning.gains import Gains
 
 #: Tilt beyond which the experiment on a vehicle stops, degrees: that of the injector's own parameter, MIMO_EX_TILT.
 TILT_DEG = 28.0
@@ -243,6 +247,7 @@ def fly(
     seed: SeedOption = 0,
     out: LogOutOption = None,
     on: Annotated[str, typer.Option(help="native, or cortex-m4: the emulated processor of the vehicle.")] = "native",
+    report: ReportOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Fly the generated C++ in process and print how well it followed; with faults also their effect."""
@@ -268,6 +273,8 @@ def fly(
         figures |= {"faults": list(map(str, task.faults)), **asdict(recovery(flight, healthy))}
     if out is not None:
         save_flight(out, flight, body, controller)
+    if report is not None:
+        report_flight(report, flight, body, controller)
     if as_json:
         print_json({"airframe": body.name, "scenario": task.name, "axis": AXES[task.axis], "seed": seed, **figures})
     else:
@@ -281,6 +288,20 @@ def fly(
         raise SitlError(f"the vehicle was lost at {flight.crashed_at:.2f} s", exit_code=1)
     if flight.record["fault"].any():
         raise SitlError("the controller's inputs were invalid for too long: it only damped the rates", exit_code=1)
+
+
+def report_flight(out: Path, flight: Flight, airframe: Airframe, gains: Gains) -> None:
+    """`fly --report`: the page about the log of a simulated flight."""
+    import tempfile
+
+    from mimopilot.cli.report import write_report_of
+    from mimopilot.sitl.flight.flight_log import save_flight
+    from mimopilot.tuning.spec import TuningSpec
+
+    with tempfile.TemporaryDirectory() as scratch:
+        log = Path(scratch) / f"{airframe.name}-{flight.scenario.name}.ulg"
+        save_flight(log, flight, airframe, gains)
+        write_report_of([log], (), out, None, TuningSpec())
 
 
 def _text(value: float | str | None) -> str:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mimopilot.cli.options import (
-    ColumnsOption,
-    JsonOption,
-    LogArgument,
-    warn,
-)
+from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ReportOption
+from mimopilot.cli.report import check_count, name_of, write_report_of
+from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
 from mimopilot.common.console import print_json, print_table, progress_console
 from mimopilot.common.errors import check_not_given
+from mimopilot.common.progress import step
+from mimopilot.common.text_table import with_deviation
+from mimopilot.common.verbosity import warn
 
 if TYPE_CHECKING:
     from mimopilot.tuning.experiment import Experiment
@@ -92,6 +92,7 @@ def tune(
     require_better: Annotated[
         bool, typer.Option("--require-better", help="Exit code 1 if the flown gains are better.")
     ] = False,
+    report: ReportOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Find the best gains of the attitude cascade from one flight, and compare them with those that flew."""
@@ -110,7 +111,7 @@ def tune(
         window=window,
     )
     if campaign:
-        check_not_given("belongs to one log, --campaign tunes many; leave it out", repeat=repeat)
+        check_not_given("belongs to one log, --campaign tunes many; leave it out", repeat=repeat, report=report)
         tune_campaign(logs, task, out, load_columns(columns) if columns else None, as_json)
         return
     if not task.for_models:
@@ -118,10 +119,15 @@ def tune(
         check_not_given(text, instrument=instrument, repeat=repeat, window=window)
     else:
         check_not_given("belongs to the design; leave out --inner and --outer", follow_model=follow_model or None)
+    if report is not None:
+        check_count(logs)
     experiments = [read_warned(log, columns) for log in logs]
     second = read_warned(repeat, columns) if repeat else None
-    gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
+    with step("designing the gains"):
+        gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
     gains.save(out)
+    if report is not None:
+        write_report_of(logs, [(name_of(out), gains)], report, columns, task)
     known = {warning for experiment in experiments for warning in experiment.warnings}
     warn(logs[0], (warning for warning in gains.provenance.warnings if warning not in known))
     details, deviations = gains.provenance.details, gains.provenance.standard_deviation
@@ -136,6 +142,7 @@ def tune(
                 **found,
                 "derivative_cutoff_hz": gains.derivative_cutoff_hz,
                 "attitude_model": models["outer_model"][0],
+                "yaw": yaw_mapping(gains),
                 **comparison,
                 "certificate": certificate,
             }
@@ -144,6 +151,7 @@ def tune(
         names = " and ".join(log.name for log in logs)
         print_gains(f"{task.method.upper()} gains from {names} (standard deviation)", gains, deviations)
         print_comparison(gains, [log.name for log in logs])
+        print_yaw(gains)
         print_certificate(gains)
         print(f"written to {out}")
     if require_better and not comparison.get("better_than_flown", False):
@@ -218,13 +226,19 @@ def certify(
         Path | None, typer.Option(help="Specification (TOML) whose [certificate] says what margins are needed.")
     ] = None,
     columns: ColumnsOption = None,
+    report: ReportOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check the stability of the closed loop, from a flight with any gains. Exit code 1: not certified."""
     import mimopilot as mp
     from mimopilot.tuning.certificate import ACCEPTED
+    from mimopilot.tuning.spec import load_spec
 
-    examined = mp.certify(read_warned(log, columns), gains, rate=rate, spec=spec)
+    experiment = read_warned(log, columns)
+    with step("examining the loop"):
+        examined = mp.certify(experiment, gains, rate=rate, spec=spec)
+    if report is not None:
+        write_report_of([log], [(name_of(gains), examined)], report, columns, load_spec(spec))
     if out is not None:
         examined.save(out)
     if as_json:
@@ -240,6 +254,7 @@ def advise(
     spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
     out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
     columns: ColumnsOption = None,
+    report: ReportOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show the gains that tune finds beside alternatives: slower, faster, quieter, SISO, other derivative filters."""
@@ -258,6 +273,8 @@ def advise(
     best = found.recommended
     if out is not None:
         best.gains.save(out)
+    if report is not None:
+        write_report_of([log], [("recommended", best.gains)], report, columns, load_spec(spec))
     if as_json:
         candidates = [
             {
@@ -273,6 +290,7 @@ def advise(
         print_json(
             {
                 "recommended": candidates[0],
+                "yaw": yaw_mapping(best.gains),
                 "nonminimum_phase_zero_rad_s": found.zero,
                 "candidates": candidates,
                 "refused": found.refused,
@@ -293,6 +311,7 @@ def advise(
     print_table(PREDICTED_TITLE.format(model="its own; flown: the recommended one's"), columns_shown, rows)
     for name, reason in found.refused.items():
         print(f"{name}: {reason}")
+    print_yaw(best.gains)
     print(
         "no non-minimum-phase zero from torque to rates"
         if found.zero is None
@@ -302,8 +321,6 @@ def advise(
 
 def print_certificate(gains: Gains) -> None:
     """Verdict, reason and margins of a certified set."""
-    from mimopilot.tuning.parameter_row import ROLL_PITCH
-
     certificate = gains.certificate
     assert certificate is not None
     figures = certificate.figures
@@ -318,7 +335,7 @@ def print_certificate(gains: Gains) -> None:
     if "predicted" not in gains.provenance.details:  # asked for a model of the rate loop
         delta = f"{figures['delta']:.2f} +- {figures['delta_error']:.2f}"
         rows.append(["small gain of the rate loop, delta", delta])
-    for axis in ROLL_PITCH:
+    for axis in figures["phase_margin_deg"]:
         kind = figures["gain_margin"][axis]
         gain = "gain not known" if kind == "not known" else f"{figures['gain_margin_db'][axis]:.1f} dB"
         phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
@@ -330,7 +347,9 @@ def print_certificate(gains: Gains) -> None:
             ]
         )
     low, high = certificate.band
+    rows += yaw_margins(figures)
     print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)
+    print_cross_terms(figures)
 
 
 def inspect(
@@ -342,7 +361,8 @@ def inspect(
     import mimopilot as mp
     from mimopilot.tuning.logs.inspection_report import as_mapping, print_inspection
 
-    found = mp.inspect(log, columns)
+    with step(f"reading {log.name}"):
+        found = mp.inspect(log, columns)
     warn(log, found.warnings)
     if as_json:
         print_json(as_mapping(found))
@@ -365,7 +385,8 @@ def identify(
     from mimopilot.tuning.plant.rates_model import identify_rates, model_toml
 
     experiment = read_warned(log, columns)
-    found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)
+    with step("identifying the plant"):
+        found = identify_rates(experiment, measured_plant(experiment), order=order, past=past, future=future)
     model, fits = found.model, found.one_step_percent
     if out is not None:
         write_atomically(out, model_toml(model, experiment.sha256))
@@ -408,19 +429,17 @@ def read_warned(log: Path, columns: Path | None) -> Experiment:
     """The experiment in a log; warnings about it go to standard error."""
     import mimopilot as mp
 
-    experiment = mp.read_log(log, columns)
+    with step(f"reading {log.name}"):
+        experiment = mp.read_log(log, columns)
     warn(log, experiment.warnings)
     return experiment
 
 
 def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None:
-    """The matrices of a set as a table, with standard deviations where they are known."""
+    """The matrices and the yaw gains of a set as a table, with standard deviations where they are known."""
     rows = []
     for name, matrix in gains.matrices.items():
-        row = [name]
-        for i in range(2):
-            for j in range(2):
-                text = f"{matrix[i][j]:.4f}"
-                row.append(f"{text} ({deviations[name][i][j]:.4f})" if name in deviations else text)
-        rows.append(row)
-    print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch"], rows)
+        known = deviations.get(name, [[None, None], [None, None]])
+        cells = [with_deviation(matrix[i][j], known[i][j]) for i in range(2) for j in range(2)]
+        rows.append([name, *cells, yaw_cell(gains, name, deviations)])
+    print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch", "yaw"], rows)

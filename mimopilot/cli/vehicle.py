@@ -16,8 +16,8 @@ from mimopilot.cli.options import (
     TimeoutOption,
     UncertifiedOption,
     YesOption,
-    warn,
 )
+from mimopilot.common.verbosity import warn
 
 if TYPE_CHECKING:
     from mimopilot.tuning.logs.imported_gains import ImportedGains

@@ -8,8 +8,13 @@ import matplotlib
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-#: Okabe-Ito colours (distinguishable with colour blindness); each has its own line style, for print.
-STYLES: tuple[tuple[str, str], ...] = (("#D55E00", ":"), ("#0072B2", "--"), ("#009E73", "-"), ("#CC79A7", "-."))
+#: One colour for one thing in every report, from Okabe and Ito's palette (distinguishable with colour blindness): the
+#: gains or the flight that were, the same design axis by axis, the new ones with full matrices, and one more set.
+FLOWN, SISO, NEW, FURTHER = "#D55E00", "#0072B2", "#009E73", "#CC79A7"
+#: Setpoints, reference models, limits and marks.
+SETPOINT_COLOUR, MODEL_COLOUR, LIMIT = "#1a1a1a", "#888888", "#B00020"
+#: The colours of gain sets in their order, each with its own line style, for print.
+STYLES: tuple[tuple[str, str], ...] = ((FLOWN, ":"), (SISO, "--"), (NEW, "-"), (FURTHER, "-."))
 #: Resolution of rasterised parts; chosen.
 PIXELS_PER_INCH = 160
 

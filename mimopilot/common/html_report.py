@@ -1,14 +1,19 @@
-"""Self-contained HTML reports: tables and inline SVG figures; no external resources, no date."""
+"""Self-contained HTML reports: tables, inline SVG and interactive figures; no external resources, no date."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import jinja2
 
+from mimopilot.common.figures import Chart
 from mimopilot.common.files import write_atomically
+
+#: Characters of a table's cell above which it is a sentence and folded.
+LONGEST_CELL = 40
 
 TEMPLATE = Path(__file__).with_name("html_report.html.jinja")
 
@@ -21,18 +26,41 @@ class ReportTable:
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
 
+    @property
+    def wordy(self) -> set[int]:
+        """Columns that hold sentences, which are folded and left-aligned."""
+        return {place for row in self.rows for place, cell in enumerate(row) if len(cell) > LONGEST_CELL}
+
 
 @dataclass(frozen=True)
 class Section:
-    """Heading, paragraph, tables, and figures as SVG text."""
+    """Heading, paragraph, points, interactive figures, tables, and figures as SVG text."""
 
     heading: str
     text: str = ""
     tables: Sequence[ReportTable] = ()
     figures: Sequence[str] = ()
+    charts: Sequence[Chart] = ()
+    points: Sequence[str] = ()
+
+    @property
+    def anchor(self) -> str:
+        """Identifier of the heading in the page."""
+        return re.sub(r"[^a-z0-9]+", "-", self.heading.lower()).strip("-")
 
 
-def write_report(path: Path, title: str, lead: str, sections: Sequence[Section]) -> None:
+@dataclass(frozen=True)
+class Headline:
+    """The conclusion at the top: a sentence, what to do next, and a colour: ``good``, ``doubt`` or ``bad``."""
+
+    sentence: str
+    steps: Sequence[str] = ()
+    tone: str = "doubt"
+
+
+def write_report(
+    path: Path, title: str, lead: str, sections: Sequence[Section], headline: Headline | None = None
+) -> None:
     """Render a report and write it atomically.
 
     Parameters
@@ -43,7 +71,15 @@ def write_report(path: Path, title: str, lead: str, sections: Sequence[Section])
         Heading and first paragraph.
     sections : sequence of Section
         In their order on the page.
+    headline : Headline, optional
+        Conclusion above the first paragraph.
     """
+    charts = [chart for section in sections for chart in section.charts]
+    drawing = {}
+    if charts:  # plotly.js has nearly 5 MB: a page without interactive figures does not carry it
+        from mimopilot.common.plotly_page import charts_json, panel_id, plotly_script
+
+        drawing = {"plotly": plotly_script(), "panels": charts_json(charts), "panel_id": panel_id}
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=True, trim_blocks=True)
     template = environment.from_string(TEMPLATE.read_text())
-    write_atomically(path, template.render(title=title, lead=lead, sections=sections))
+    write_atomically(path, template.render(title=title, lead=lead, sections=sections, headline=headline, **drawing))

@@ -4,7 +4,8 @@ Written from PX4's description of its controllers (docs.px4.io, Controller Diagr
 
 - attitude: the error quaternion is a tilt, then a turn about z, whose angle is scaled by MC_YAW_WEIGHT. The rate
   setpoint is P times twice its vector part, P of yaw divided by the weight, plus the yaw rate setpoint about earth's z
-  axis, limited; what the autotune adds comes after the limit.
+  axis, limited; what the autotune adds comes after the limit. It acts in the next period:
+  the rate controller runs first.
 - rate: K (P e + I integral of e - D derivative of the measured rate) + FF setpoint. The integral takes the error of
   before the step with the factor max(0, 1 - (e / 400 deg/s)^2), is clamped by the signs of the unallocated torque, held
   on the ground and zero while disarmed. First-order low-passes: IMU_DGYRO_CUTOFF on the derivative, MC_YAW_TQ_CUTOFF on
@@ -50,6 +51,7 @@ PX4_STATE = np.dtype(
         ("rates", "<f8", 3),
         ("derivative", "<f8", 3),
         ("yaw_torque", "<f8"),
+        ("rates_setpoint", "<f8", 3),
         ("started", "<i8"),
     ]
 )
@@ -82,6 +84,8 @@ def _step(state_pointer, input_pointer, output_pointer):  # type: ignore[no-unty
     """One control period, called as the generated controller's step is."""
     s, i, o = numba.carray(state_pointer, 1)[0], numba.carray(input_pointer, 1)[0], numba.carray(output_pointer, 1)[0]
     q = i.attitude
+    for axis in range(3):
+        o.rates_setpoint[axis] = s.rates_setpoint[axis] if i.rate_mode == 0 else i.rates_setpoint[axis]
     if i.rate_mode == 0:
         ex, ey, ez = _attitude_error_compiled(q, i.attitude_setpoint, s.yaw_weight)
         turn = 0.0 if np.isnan(i.yaw_rate_setpoint) else i.yaw_rate_setpoint
@@ -94,10 +98,7 @@ def _step(state_pointer, input_pointer, output_pointer):  # type: ignore[no-unty
         for axis in range(3):
             wanted = s.angle_p[axis] * error[axis] + down[axis] * turn
             wanted = min(max(wanted, -s.rate_max[axis]), s.rate_max[axis])
-            o.rates_setpoint[axis] = wanted + i.excitation[axis]
-    else:
-        for axis in range(3):
-            o.rates_setpoint[axis] = i.rates_setpoint[axis]
+            s.rates_setpoint[axis] = wanted + i.excitation[axis]
     for axis in range(3):
         rate, wanted = i.rates[axis], o.rates_setpoint[axis]
         slope = (rate - s.rates[axis]) / s.Ts if s.started else 0.0

@@ -47,7 +47,7 @@ def flight_log_bytes(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
         Gains in flight, logged as parameters of the vehicle.
     """
     truth = flight.truth
-    topics = autopilot_topics(flight.record, len(airframe.rotors)) | injection_topics(flight.record)
+    topics = autopilot_topics(flight.record, len(airframe.rotors)) | injection_topics(flight.record, flight.scenario.Ts)
     topics |= {
         "vehicle_attitude_groundtruth": {"q": quaternions(truth["attitude"])},
         "vehicle_angular_velocity_groundtruth": {"xyz": truth["rates"].astype(np.float32)},
@@ -79,7 +79,7 @@ def vehicle_log(
     parameters : mapping
         Name -> value of the parameters in flight.
     """
-    topics = autopilot_topics(record, len(airframe.rotors)) | injection_topics(record) | vehicle_topics(landed)
+    topics = autopilot_topics(record, len(airframe.rotors)) | injection_topics(record, Ts) | vehicle_topics(landed)
     return _ulog_file(Ts, topics, parameters, airframe)
 
 
@@ -130,7 +130,7 @@ def autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, N
     }
 
 
-def injection_topics(record: NDArray[Any]) -> dict[str, dict[str, NDArray[Any]]]:
+def injection_topics(record: NDArray[Any], Ts: float) -> dict[str, dict[str, NDArray[Any]]]:
     """Topic of the injected torque."""
     excitation = record["excitation"]
     # One message a period, as in the firmware; z is the excited axis, numbered as `ExcitationPhase`.
@@ -139,18 +139,17 @@ def injection_topics(record: NDArray[Any]) -> dict[str, dict[str, NDArray[Any]]]
     return {
         "debug_vect": {
             "x": np.where(on_yaw, excitation[:, 2], excitation[:, 0]),
-            "y": np.where(on_yaw, _turned(record["attitude"][:, 2], on_yaw), excitation[:, 1]),
+            "y": np.where(on_yaw, _turned(record["rates"][:, 2], on_yaw, Ts), excitation[:, 1]),
             "z": active,
             "name": np.where(on_yaw, np.array(YAW_EXCITATION_NAME, "S10"), np.array(EXCITATION_NAME, "S10")),
         },
     }
 
 
-def _turned(heading: NDArray[np.float32], on_yaw: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """How far the vehicle has turned since yaw's excitation began, rad, as y of MIMO_EXY says; 0 without one."""
-    if not on_yaw.any():
-        return np.zeros_like(heading)
-    return np.remainder(heading - heading[np.argmax(on_yaw)] + np.pi, 2 * np.pi).astype(np.float32) - np.float32(np.pi)
+def _turned(rate: NDArray[Any], on_yaw: NDArray[np.bool_], Ts: float) -> NDArray[np.float32]:
+    """How far the vehicle has turned since yaw's excitation began, rad, as y of MIMO_EXY says."""
+    turned = np.cumsum(np.where(on_yaw, rate, 0.0)) * Ts
+    return turned.astype(np.float32)
 
 
 def save_flight(path: Path, flight: Flight, airframe: Airframe, gains: Gains) -> None:

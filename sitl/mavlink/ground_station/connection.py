@@ -59,8 +59,8 @@ GROUND_SYSTEM, GROUND_COMPONENT = 255, mavlink.MAV_COMP_ID_MISSIONPLANNER
 BAUD = 57600
 #: Bit of SYS_STATUS for logging.
 LOGGING = mavlink.MAV_SYS_STATUS_LOGGING
-#: Name of the DEBUG_VECT in which the vehicle reports its injector's state.
-EXCITATION = "MIMO_EXC"
+#: Names of the DEBUG_VECT in which the vehicle reports its injector's state, and the phases as z.
+EXCITATION, PHASES = ("MIMO_EXC", "MIMO_EXY"), (-1, 0, 1, 2, 3)
 #: SET_ATTITUDE_TARGET.type_mask: ignore the body rates.
 RATES_IGNORED = 7
 FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
@@ -99,7 +99,7 @@ def from_mavlink(message: Any, cast: bool = False) -> Incoming | None:
         return LandedState(*sender, message.landed_state)
     if kind == "STORAGE_INFORMATION" and message.status == mavlink.STORAGE_STATUS_READY:
         return StorageReport(*sender, message.available_capacity)
-    if kind == "DEBUG_VECT" and message.name == EXCITATION and message.z in (-1, 0, 1, 2):
+    if kind == "DEBUG_VECT" and message.name in EXCITATION and message.z in PHASES:
         return InjectorState(*sender, int(message.z), message.time_usec)
     if kind == "VFR_HUD":
         return AltitudeReport(*sender, message.alt, message.climb)

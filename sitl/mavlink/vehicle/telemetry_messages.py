@@ -9,8 +9,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.sitl.autopilot.excitation_injector import ExcitationPhase
 from mimopilot.sitl.autopilot.flight_modes import Mode
-from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, setpoint_quaternions
+from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, YAW_EXCITATION_NAME, setpoint_quaternions
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
@@ -166,9 +167,12 @@ def _home_position(s: VehicleState) -> Any:
 
 
 def _excitation(s: VehicleState) -> Any:
-    """Injected torque, as the firmware's module publishes it."""
-    roll, pitch, _ = _floats(s.record["excitation"])
-    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, max(s.stamp, 0), roll, pitch, float(s.excitation_phase))
+    """Injected torque, as the firmware's module publishes it: of roll and pitch, or of yaw while that is excited."""
+    roll, pitch, yaw = _floats(s.record["excitation"])
+    phase, stamp = s.excitation_phase, max(s.stamp, 0)
+    if phase == ExcitationPhase.YAW.value:
+        return mavlink.MAVLink_debug_vect_message(YAW_EXCITATION_NAME, stamp, yaw, s.excitation_turn, float(phase))
+    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, stamp, roll, pitch, float(phase))
 
 
 def _autopilot_version(s: VehicleState) -> Any:

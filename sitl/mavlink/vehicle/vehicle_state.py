@@ -38,7 +38,9 @@ class VehicleState:
     load : float
         Share of the last second in which the control loop did not sleep.
     excitation_phase : int
-        0 roll, 1 pitch, 2 between them, -1 off.
+        0 roll, 1 pitch, 2 between two axes, 3 yaw, -1 off.
+    excitation_turn : float, rad
+        Since yaw's excitation began.
     autopilot : int
         MAV_AUTOPILOT that the vehicle reports.
     """
@@ -53,6 +55,7 @@ class VehicleState:
     load: float = 0.0
     excitation_phase: int = -1
     autopilot: int = mavlink.MAV_AUTOPILOT_GENERIC
+    excitation_turn: float = 0.0
 
     @property
     def milliseconds(self) -> int:

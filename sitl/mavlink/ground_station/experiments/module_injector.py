@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from mimopilot.sitl.autopilot.excitation_injector import AXIS, PAUSE_S
+from mimopilot.sitl.autopilot.excitation_injector import AXIS, PAUSE_S, PHASES
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Exchange
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExperimentResult
@@ -134,8 +134,8 @@ def _watch_flight(
 ) -> Exchange[tuple[str, float]]:
     """Wait for the end; returns why it failed (empty: it did not), and the duration of the injection (s)."""
     assert client.vehicle is not None
-    both = wanted[AXIS] == 3
-    planned = (2 * wanted["MIMO_EX_DUR"] + PAUSE_S) if both else wanted["MIMO_EX_DUR"]
+    axes = len(PHASES[round(wanted[AXIS])])
+    planned = axes * wanted["MIMO_EX_DUR"] + (axes - 1) * PAUSE_S
     mode, begin, seconds = client.vehicle.mode, client.now, 0.0
     first: int | None = None
     while True:

@@ -56,7 +56,7 @@ def injector_settings(excitation: ExcitationOptions, Ts: float) -> dict[str, flo
     TuningError
         If the bandwidth is wrong.
     """
-    axis = excitation.axis or "both"
+    axis = excitation.axis or "all"
     for option, value, known in (("--axis", axis, AXES), ("--mode", excitation.mode, EXCITED_MODES)):
         if value not in known:
             raise SitlError(f"{option}: got {value!r}, expected one of {', '.join(known)}")

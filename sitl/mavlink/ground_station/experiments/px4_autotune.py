@@ -74,8 +74,9 @@ DEFAULT_RUNS = 4  # one run is too short for a certificate; four gave one up to 
 AXES = {20: "roll", 40: "pitch", 60: "yaw"}
 AFTER_AXES = 80  # progress from here on: nothing is excited any more
 CONVERGED_S, GIVE_UP_S = 5.0, 19.0  # PX4: an axis takes 5 s or more; the module gives up after 20 s
+PAUSE_S = 2.0  # PX4: after each axis
 # Chosen:
-POLL_RUN_S = 0.5  # between two requests for the progress
+POLL_RUN_S = 0.25  # between two requests for the progress
 START_TIMEOUT_S = 15.0  # from the command to the first axis; PX4 measures 1000 samples of its rate first
 RUN_TIMEOUT_S = 90.0  # of a run: three axes of 20 s and their pauses
 SETTLE_S = 3.0  # between two runs
@@ -100,7 +101,7 @@ class _Run:
     since : float
         When that began.
     seconds : dict
-        Axis -> its duration so far.
+        Axis -> its duration so far, with the pause after it.
     """
 
     requested: bool = False
@@ -116,15 +117,24 @@ class _Run:
         """Whether nothing is excited any more."""
         return self.axis == "end" or self.result is not None
 
+    def pass_time(self, now: float) -> None:
+        """Count the time of the axis."""
+        if self.axis in AXES.values() and not self.over:
+            self.seconds[self.axis] = now - self.since
+
+    @property
+    def excited(self) -> float:
+        """Duration of the excitation of all axes, s, to the interval of the requests."""
+        return sum(max(0.0, seconds - PAUSE_S) for seconds in self.seconds.values())
+
     def note(self, ack: CommandAck, now: float) -> None:
         """Record an acknowledgement that came at a time."""
+        self.pass_time(now)
         if ack.result == mavlink.MAV_RESULT_IN_PROGRESS:
             self.requested = True
             axis = AXES.get(ack.progress, "end" if ack.progress >= AFTER_AXES else "")
             if axis != self.axis and axis:
                 self.axis, self.since, self.begun = axis, now, True
-            if axis in AXES.values():
-                self.seconds[axis] = now - self.since
         elif self.begun or ack.result not in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED):
             # A result before this run has begun is that of the run before.
             self.result = ack.result
@@ -259,7 +269,7 @@ class Px4Autotune(ExperimentProfile):
         for number in range(self.runs):
             run = _Run()
             reason = yield from self._run(client, monitor, mode, run, f"run {number + 1} of {self.runs}")
-            seconds += sum(run.seconds.values())
+            seconds += run.excited
             if reason:
                 reason = f"run {number + 1}: {reason}"
                 break
@@ -318,6 +328,7 @@ class Px4Autotune(ExperimentProfile):
                     idle = answer.result == mavlink.MAV_RESULT_IN_PROGRESS and answer.progress == 0
                     run.ended |= not self.has_start and idle and run.over
                 elif isinstance(answer, ParameterValue) and answer.name == START and run.requested:
+                    run.pass_time(monitor.clock)
                     run.ended |= answer.value == 0
                     if answer.value and not run.over:  # while it runs, the command tells the axis and starts nothing
                         send.append(SendCommand(client.vehicle.system, client.vehicle.component, COMMAND, (1.0,)))

@@ -159,7 +159,7 @@ def reboot(session: VehicleSession, monitor: FlightMonitor) -> FlightMonitor:
         If it refuses, or does not come back.
     """
     before, begin = monitor.clock, session.client.now
-    ack = session.run(send_command(session.client, mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1))
+    ack = session.run(_command_reboot(session.client, monitor))
     if ack is not None and ack.result != mavlink.MAV_RESULT_ACCEPTED:
         why = f": {monitor.text}" if monitor.text else ""
         raise SitlError(f"the vehicle refuses to reboot (MAV_RESULT {ack.result}){why}; reboot it by hand", exit_code=1)
@@ -177,6 +177,23 @@ def reboot(session: VehicleSession, monitor: FlightMonitor) -> FlightMonitor:
     raise SitlError(
         f"the vehicle was not seen to reboot within {BOOT_S:g} s; reboot it by hand and run this again", exit_code=1
     )
+
+
+def _command_reboot(client: ParameterClient, monitor: FlightMonitor) -> Exchange[CommandAck | None]:
+    """Command the reboot until it is acknowledged or the vehicle falls silent: not again once it is back."""
+    assert client.vehicle is not None
+    number: int = mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+    order, before = SendCommand(client.vehicle.system, client.vehicle.component, number, (1.0,)), monitor.clock
+    for _ in range(client.tries):
+        due, send = client.now + TRY_S, [order]
+        while client.now < due and not client.closed:
+            for answer in (yield from client.send_and_wait(send, due)):
+                if isinstance(answer, CommandAck) and answer.command == number:
+                    return answer
+            send = []
+        if client.closed or monitor.overdue(STREAM_TIMEOUT_S) or monitor.clock < before:
+            return None
+    return None
 
 
 def wait(client: ParameterClient, seconds: float) -> Exchange[None]:

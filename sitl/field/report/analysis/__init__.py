@@ -1,0 +1,1 @@
+"""What a report computes from a log: phases, spectra, step responses, predicted motion, filters."""

@@ -1,0 +1,291 @@
+"""A flight as the report needs it: what its log holds, its phases, its plant, and the gain sets around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mimopilot.common.charts import FLOWN, FURTHER, NEW, SISO
+from mimopilot.common.figures import MOST_SAMPLES
+from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals, further_signals
+from mimopilot.tuning.design.cascade import certify_from_log
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.logs.columns import Columns
+from mimopilot.tuning.logs.flight_phase import TUMBLE, bridged, intersection, intervals
+from mimopilot.tuning.logs.flown_gains import flown_gains
+from mimopilot.tuning.logs.inspection import Inspection, inspect_log
+from mimopilot.tuning.logs.recording import Recording
+from mimopilot.tuning.logs.resample import MAX_GAP, Interval, Series, sampling_period
+from mimopilot.tuning.motors import END
+from mimopilot.tuning.plant.frequency_response import PlantResponse
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
+from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
+from mimopilot.tuning.spec import TuningSpec
+
+#: Share of the largest torque from which on it is saturated.
+AT_LIMIT = 0.999
+#: Parameters of the control rate, Hz, and the period (s) if none is logged: that of this project's controllers.
+RATES, USUAL_PERIOD = ("SCHED_LOOP_RATE", "IMU_GYRO_RATEMAX"), 0.004
+#: Pauses in saturation or excitation that do not end a phase, s.
+BRIDGE = 0.5
+#: Colours and line styles of gain sets and flights in their order: what was, what is new, further ones.
+LOOKS = ((FLOWN, ":"), (NEW, "-"), (FURTHER, "-."), (SISO, "--"))
+
+#: Phase -> its colour, from top to bottom of the timeline.
+PHASES = {
+    "ground": "#999999",
+    "air": "#56B4E9",
+    "excitation": "#009E73",
+    "used": "#0072B2",
+    "saturated": "#E69F00",
+    "crash": "#B00020",
+    "gaps": "#1a1a1a",
+}
+
+Signal = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedFlight:
+    """One log of a report.
+
+    Attributes
+    ----------
+    label : str
+        Name of the log in legends.
+    found : Inspection
+    further : FurtherSignals
+    colour, dash : str
+        Of its curves.
+    samples : int
+        Most samples of a line over its time.
+    """
+
+    label: str
+    found: Inspection
+    further: FurtherSignals
+    colour: str
+    dash: str
+    samples: int = MOST_SAMPLES
+
+    @property
+    def recording(self) -> Recording:
+        """The log as read."""
+        return self.found.recording
+
+    @cached_property
+    def span(self) -> Interval:
+        """First and last time of the log's signals, s."""
+        series = [*self.recording.signals.values(), *(one for one in vars(self.further).values() if one is not None)]
+        first, last = self.recording.span or (0.0, 0.0)
+        begin = min((float(one.time[0]) for one in self.recording.signals.values()), default=first)
+        end = max((float(one.time[-1]) for one in self.recording.signals.values()), default=last)
+        if not self.recording.signals and series:
+            begin, end = min(float(one.time[0]) for one in series), max(float(one.time[-1]) for one in series)
+        return begin, end
+
+    def signal(self, name: str) -> Series | None:
+        """A signal with its time from the beginning of the log, s."""
+        found = self.recording.signals.get(name)
+        return None if found is None else self.since_begin(found)
+
+    def since_begin(self, series: Series) -> Series:
+        """A series with its time from the beginning of the log, s."""
+        return Series(series.time - self.span[0], series.values, series.topic)
+
+    @cached_property
+    def airborne(self) -> tuple[Interval, ...]:
+        """When it flew, s from the beginning: as logged, else the used parts, else the whole log."""
+        begin, end = self.span
+        whole = ((0.0, end - begin),)
+        if self.recording.airborne is not None:
+            return intersection(tuple((a - begin, b - begin) for a, b in self.recording.airborne), whole)
+        return self.found.parts or whole
+
+    @cached_property
+    def tumbles(self) -> tuple[Interval, ...]:
+        """When it was tilted beyond what a multirotor flies at, s from the beginning."""
+        angles = self.signal("y_o")
+        if angles is None:
+            return ()
+        tilt = np.arccos(np.clip(np.cos(angles.values[:, 0]) * np.cos(angles.values[:, 1]), -1.0, 1.0))
+        return self._inside(bridged(intervals(angles.time, tilt > TUMBLE), BRIDGE))
+
+    @cached_property
+    def phases(self) -> dict[str, tuple[Interval, ...]]:
+        """Phase -> when, s from the beginning; phases that did not occur or are not known are empty."""
+        length = self.span[1] - self.span[0]
+        logged = self.recording.airborne is not None
+        edges = [0.0, *(edge for part in self.airborne for edge in part), length]
+        ground = tuple((a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a) if logged else ()
+        return {
+            "ground": ground,
+            "air": self.airborne if logged else (),
+            "excitation": self._excited(),
+            "used": self.found.parts,
+            "saturated": self._saturated(),
+            "crash": intersection(self.tumbles, self.airborne),
+            "gaps": self._gaps(),
+        }
+
+    def _excited(self) -> tuple[Interval, ...]:
+        for name in ("u_bar", "r_bar"):
+            series = self.signal(name)
+            if series is not None and series.values.any():
+                return self._inside(bridged(intervals(series.time, np.any(series.values != 0, axis=1)), BRIDGE))
+        return ()
+
+    def _saturated(self) -> tuple[Interval, ...]:
+        parts: tuple[Interval, ...] = ()
+        torque, flown, motors = self.signal("u"), self.flown, self.further.motors
+        if torque is not None and flown is not None:
+            limit = np.array(flown.limits.moment_max[:2])
+            parts += intervals(torque.time, np.any(np.abs(torque.values) >= AT_LIMIT * limit, axis=1))
+        if motors is not None:
+            motors = self.since_begin(motors)
+            at_end = (motors.values >= 1 - END) | (motors.values <= END)
+            parts += intervals(motors.time, np.any(at_end, axis=1))
+        return intersection(self._inside(bridged(tuple(sorted(parts)), BRIDGE)), self.airborne)
+
+    def _gaps(self) -> tuple[Interval, ...]:
+        parts: list[Interval] = []
+        for name in ("u", "y_i", "y_o"):
+            series = self.signal(name)
+            if series is not None and len(series.time) > 2:
+                pauses, period = np.diff(series.time), sampling_period(series.time)
+                parts += [
+                    (float(series.time[k]), float(series.time[k + 1]))
+                    for k in np.flatnonzero(pauses > MAX_GAP * period * 1.001)
+                ]
+        return bridged(tuple(sorted(parts)), 0.0)
+
+    def _inside(self, parts: tuple[Interval, ...]) -> tuple[Interval, ...]:
+        return intersection(parts, ((0.0, self.span[1] - self.span[0]),))
+
+    @cached_property
+    def measured(self) -> PlantEstimates | None:
+        """Plant estimates; None if gains cannot be tuned from the log."""
+        return PlantEstimates(self.found.experiment) if self.found.experiment and not self.found.reason else None
+
+    @cached_property
+    def yaw_response(self) -> PlantResponse | None:
+        """Response of yaw; None where the log does not excite it."""
+        try:
+            return self.measured.yaw.response if self.measured else None
+        except TuningError:
+            return None
+
+    @cached_property
+    def wide(self) -> WideResponse | None:
+        """The response continued to all frequencies; None if too few are known."""
+        try:
+            return wide_response(self.measured) if self.measured else None
+        except TuningError:
+            return None
+
+    @property
+    def why_not(self) -> str:
+        """Why there is no frequency response; the whole reason is the page's conclusion."""
+        return "gains cannot be tuned from the log, see the top" if self.found.reason else ""
+
+    @cached_property
+    def flown(self) -> Gains | None:
+        """The gains that flew, also of a log that gains cannot be tuned from; None: not logged."""
+        if self.found.flown is not None or not self.recording.parameters:
+            return self.found.flown
+        begin = self.span[0] + (self.airborne[0][0] if self.airborne else 0.0)
+        parameters, _ = self.recording.parameters_during(begin, begin)
+        hertz = next((parameters[name] for name in RATES if parameters.get(name, 0) > 0), 0.0)
+        return flown_gains(parameters, parameters.get("MIMO_TS", 1 / hertz if hertz else 0.0) or USUAL_PERIOD)
+
+
+@dataclass(frozen=True, eq=False)
+class GainCase:
+    """A gain set around the plant of a flight, with its certificate from that flight.
+
+    Attributes
+    ----------
+    label : str
+    colour, dash : str
+    gains : Gains
+        With the certificate, where it could be made.
+    flight : ReportedFlight
+    flown : bool
+        Whether it flew in that flight.
+    problem : str
+        Why there is no certificate from the flight; empty: there is one.
+    """
+
+    label: str
+    colour: str
+    dash: str
+    gains: Gains
+    flight: ReportedFlight
+    flown: bool
+    problem: str = ""
+
+    @property
+    def look(self) -> dict[str, str]:
+        """Label, colour and line style of its curves."""
+        return {"label": self.label, "colour": self.colour, "dash": self.dash}
+
+
+def read_flights(logs: Sequence[Path], columns: Columns | None) -> list[ReportedFlight]:
+    """The logs of a report; names that repeat get the name of their folder.
+
+    Raises
+    ------
+    TuningError
+        When a file is no flight log, or is damaged.
+    """
+    names = [path.name for path in logs]
+    labels = [str(Path(path.parent.name) / path.name) if names.count(path.name) > 1 else path.name for path in logs]
+    flights = []
+    for place, (path, label) in enumerate(zip(logs, labels, strict=True)):
+        found = inspect_log(path, columns)
+        colour, dash = LOOKS[place % len(LOOKS)]
+        samples = MOST_SAMPLES if len(logs) == 1 else 2 * MOST_SAMPLES // (len(logs) + 1)
+        flights.append(ReportedFlight(label, found, further_signals(found.recording), colour, dash, samples))
+    return flights
+
+
+def gain_cases(
+    flights: Sequence[ReportedFlight], sets: Sequence[tuple[str, Gains]], spec: TuningSpec
+) -> list[GainCase]:
+    """The flown gains of every flight, then given sets around the first flight that gains can be tuned from.
+
+    Parameters
+    ----------
+    flights : sequence of ReportedFlight
+    sets : sequence of (name, Gains)
+    spec : TuningSpec
+        Its margins are those that the certificates need.
+    """
+    cases = []
+    for flight in flights:
+        flown = flight.flown
+        if flown is not None:
+            label = "flown" if len(flights) == 1 else f"flown in {flight.label}"
+            cases.append(GainCase(label, flight.colour, flight.dash, flown, flight, True))
+    tunable = next((flight for flight in flights if flight.measured), flights[0])
+    used = {(case.colour, case.dash) for case in cases}
+    free = [look for look in LOOKS if look not in used] or list(LOOKS)
+    for place, (name, gains) in enumerate(sets):
+        colour, dash = (SISO, "--") if gains.provenance.method == "siso" else free[place % len(free)]
+        cases.append(GainCase(name, colour, dash, gains, tunable, False))
+    return [_examined(case, spec) for case in cases]
+
+
+def _examined(case: GainCase, spec: TuningSpec) -> GainCase:
+    if case.flight.measured is None:
+        return replace(case, problem=case.flight.why_not)
+    try:
+        return replace(case, gains=certify_from_log(case.flight.measured.experiment, case.gains, spec))
+    except TuningError as error:
+        return replace(case, problem=str(error))

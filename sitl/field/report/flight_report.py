@@ -1,0 +1,116 @@
+"""The report of flights: reads the logs, examines the gains, and writes the page and its figures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mimopilot.common.errors import Error
+from mimopilot.common.figures import Chart
+from mimopilot.common.html_report import Headline, ReportTable, Section, write_report
+from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight, gain_cases, read_flights
+from mimopilot.sitl.field.report.headline import headline, lead
+from mimopilot.sitl.field.report.sections.compare import compare_section
+from mimopilot.sitl.field.report.sections.frequency import frequency_section
+from mimopilot.sitl.field.report.sections.gain_sets import gains_section, prediction_section
+from mimopilot.sitl.field.report.sections.spectra import filter_section, flight_spectra, spectra_section
+from mimopilot.sitl.field.report.sections.stability import stability_section
+from mimopilot.sitl.field.report.sections.steps import step_section
+from mimopilot.sitl.field.report.sections.timeline import contents_section, timeline_section
+from mimopilot.sitl.field.report.sections.tracking import tracking_section
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.logs.columns import Columns
+from mimopilot.tuning.spec import TuningSpec
+
+#: Most logs of one page, which stays below 6 MB: plotly.js has 4.8, a first log 0.5.
+MOST_LOGS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class FlightReport:
+    """A report: its conclusion, its sections, and what they are made of."""
+
+    title: str
+    lead: str
+    headline: Headline
+    sections: list[Section]
+    flights: list[ReportedFlight]
+    cases: list[GainCase]
+
+    @property
+    def tables(self) -> list[ReportTable]:
+        """The tables of all sections."""
+        return [table for section in self.sections for table in section.tables]
+
+    @property
+    def charts(self) -> list[Chart]:
+        """The figures of all sections."""
+        return [chart for section in self.sections for chart in section.charts]
+
+    def write(self, out: Path, figures: Path | None = None) -> list[Path]:
+        """Write the page, and its figures as PNG and SVG into a folder; returns the files."""
+        write_report(out, self.title, self.lead, self.sections, self.headline)
+        if figures is None:
+            return [out]
+        from mimopilot.common.figure_images import write_images
+
+        return [out, *write_images(self.charts, figures)]
+
+
+def check_count(logs: int) -> None:
+    """Refuse more logs than a page has room for.
+
+    Raises
+    ------
+    Error
+    """
+    if not 1 <= logs <= MOST_LOGS:
+        raise Error(f"{logs} logs: a report has room for 1 to {MOST_LOGS}; make more than one")
+
+
+def make_report(
+    logs: Sequence[Path],
+    sets: Sequence[tuple[str, Gains]] = (),
+    spec: TuningSpec | None = None,
+    columns: Columns | None = None,
+) -> FlightReport:
+    """The report of one flight, or of up to `MOST_LOGS` beside one another.
+
+    Parameters
+    ----------
+    logs : sequence of Path
+        The first is `before` where flights are compared.
+    sets : sequence of (name, Gains)
+        Shown beside the flown gains.
+    spec : TuningSpec, optional
+        Its margins are those that the certificates need.
+    columns : Columns, optional
+        Names and units in CSV and MATLAB files.
+
+    Raises
+    ------
+    Error
+        When there are too many logs, a file is no flight log, or two sets have one name.
+    """
+    check_count(len(logs))
+    task = spec or TuningSpec()
+    flights = read_flights(logs, columns)
+    cases = gain_cases(flights, sets, task)
+    spectra = [flight_spectra(flight) for flight in flights]
+    compared = compare_section(spectra, cases)
+    sections = [
+        timeline_section(flights),
+        *([compared] if compared else []),
+        tracking_section(flights, [gains for _, gains in sets]),
+        step_section(flights),
+        gains_section(cases),
+        prediction_section(cases),
+        stability_section(cases, task.certificate),
+        frequency_section(flights, cases),
+        spectra_section(spectra),
+        filter_section(spectra, cases, task.certificate),
+        contents_section(flights),
+    ]
+    title = " and ".join(flight.label for flight in flights)
+    return FlightReport(f"mimopilot report: {title}", lead(flights), headline(flights, cases), sections, flights, cases)

@@ -1,0 +1,251 @@
+"""Numbers of a report: step responses, tones, delays, margins, filters."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import butter, group_delay
+
+import mimopilot as mp
+from mimopilot.sitl.field.report.analysis.filters_advice import behind, filter_changes, least_phase, torque_noise
+from mimopilot.sitl.field.report.analysis.flight_data import PHASES
+from mimopilot.sitl.field.report.analysis.loop_filters import (
+    DERIVATIVE,
+    FIRST_ORDER,
+    LOW_PASS,
+    NOTCH,
+    LoopFilter,
+    filters_of,
+)
+from mimopilot.sitl.field.report.analysis.predicted_motion import doublet_setpoint, predicted_motion
+from mimopilot.sitl.field.report.analysis.step_response import WIDEST, estimate_step
+from mimopilot.sitl.field.report.analysis.vibration import Tone, air_spectrum, find_tones, spectrogram
+from mimopilot.sitl.field.report.flight_report import make_report
+from mimopilot.sitl.field.report.sections.frequency import coherence_band
+from mimopilot.sitl.field.report.sections.tracking import tracking_error
+from mimopilot.tuning.certificate import Thresholds
+from mimopilot.tuning.logs.resample import Series
+from mimopilot.tuning.reference_model import second_order
+from tests.tuning.logs.flights import make_flight, px4_topics, write_ulog
+
+
+def steps(Ts, seconds=40.0, size=0.2, hold=0.5):
+    """Time (N,) and setpoints (N, 1), rad, that step at random."""
+    t = np.arange(0, seconds, Ts)
+    choices = np.random.default_rng(0).choice([-size, 0.0, size], round(seconds / hold) + 1)
+    return t, choices.repeat(round(hold / Ts))[: len(t), None]
+
+
+@pytest.mark.parametrize(("Ts", "noise"), [(0.004, 0.002), (0.004, 0.05), (0.02, 0.005), (0.05, 0.002)])
+def test_the_step_response_of_a_known_system_is_within_its_band(Ts, noise):
+    t, r = steps(Ts)
+    model = second_order(9.0, 0.6, 0, Ts)
+    y = model.response(r) + noise * np.random.default_rng(1).standard_normal(r.shape)
+    found, why = estimate_step(Series(t, r, "r"), Series(t, y, "y"), [(0.0, 40.0)], 0)
+    assert why == ""
+    true = model.response(np.ones((round(1.4 / Ts), 1)))[:, 0]
+    error = found.step - np.interp(found.time, np.arange(len(true)) * Ts, true)
+    assert np.mean(np.abs(error) <= found.band) > 0.9
+    assert np.abs(error).max() < 0.03
+    assert found.width < 0.1
+    assert found.stretches == 21
+    # zeta = 0.6: exp(-pi zeta / sqrt(1 - zeta^2)) = 9.5 %.
+    assert found.overshoot() == pytest.approx(0.095, abs=0.02)
+
+
+def test_a_step_response_whose_band_is_wider_than_the_answer_is_refused():
+    t, r = steps(0.01, size=0.01)
+    noise = np.random.default_rng(2).standard_normal(r.shape)
+    found, why = estimate_step(Series(t, r, "r"), Series(t, noise, "y"), [(0.0, 40.0)], 0)
+    assert found is None
+    assert float(why.split(" stretches is ")[1].split(" times")[0]) >= WIDEST
+
+
+def test_a_setpoint_that_does_not_move_gives_no_step_response():
+    t, r = steps(0.01, size=0.0)
+    found, why = estimate_step(Series(t, r, "r"), Series(t, r, "y"), [(0.0, 40.0)], 0)
+    assert found is None
+    assert "in 0 stretches" in why
+
+
+def humming(tones, seconds=30.0, rate=500.0):
+    """A gyro (N, 3), rad/s, with noise and tones (Hz, amplitude, axis)."""
+    t = np.arange(0, seconds, 1 / rate)
+    values = 0.05 * np.random.default_rng(3).standard_normal((len(t), 3))
+    for hertz, amplitude, axis in tones:
+        values[:, axis] += amplitude * np.sin(2 * np.pi * hertz * t)
+    return Series(t, values, "gyro")
+
+
+def test_tones_are_found_at_their_frequency_and_harmonics_named():
+    series = humming([(83.37, 0.1, 0), (166.74, 0.06, 1), (41.2, 0.05, 2)])
+    found = {round(tone.hertz): tone for tone in find_tones(air_spectrum(series, [(0.0, 30.0)]))}
+    assert sorted(found) == [41, 83, 167]
+    assert found[83].hertz == pytest.approx(83.37, abs=0.15)
+    assert found[167].hertz == pytest.approx(166.74, abs=0.15)
+    assert [found[k].axis for k in (83, 167, 41)] == [0, 1, 2]
+    assert found[167].harmonic_of == pytest.approx(83.37, abs=0.15)
+    assert found[83].harmonic_of == 0.0
+
+
+def test_noise_alone_shows_no_tone():
+    assert find_tones(air_spectrum(humming([]), [(0.0, 30.0)])) == []
+    assert find_tones(air_spectrum(humming([], seconds=3.0), [(0.0, 3.0)])) == []
+
+
+def test_a_tone_that_moves_with_the_thrust_is_told_from_one_that_stays():
+    series = humming([(60.0, 0.1, 1)])
+    t = series.time
+    thrust_of = 0.5 + 0.1 * np.sin(2 * np.pi * t / 15)
+    turning = np.cumsum(150 * (1 + 0.5 * (thrust_of - 0.5))) * (t[1] - t[0])
+    series.values[:, 0] += 0.5 * np.sin(2 * np.pi * turning)
+    slices = spectrogram(series, [(0.0, 30.0)])
+    thrust = np.interp(slices[0], t, thrust_of)
+    found = find_tones(air_spectrum(series, [(0.0, 30.0)]), slices, thrust)
+    assert {tone.follows_thrust for tone in found if 140 < tone.hertz < 160} == {True}
+    assert [tone.follows_thrust for tone in found if 58 < tone.hertz < 62] == [False]
+
+
+@pytest.mark.parametrize("hertz", [20.0, 40.0, 90.0])
+def test_the_delay_of_a_low_pass_is_that_of_its_closed_form_and_of_the_sampled_filter(hertz):
+    second, first = LoopFilter("x", LOW_PASS, hertz), LoopFilter("x", FIRST_ORDER, hertz)
+    assert second.delay() == pytest.approx(math.sqrt(2) / (2 * math.pi * hertz))
+    assert first.delay() == pytest.approx(1 / (2 * math.pi * hertz))
+    rate = 8000.0
+    _, samples = group_delay(butter(2, hertz, fs=rate), w=[0.01], fs=rate)
+    assert second.delay() == pytest.approx(samples[0] / rate, rel=1e-3)
+    slow = np.array([0.01])
+    for one in (second, first, LoopFilter("x", NOTCH, hertz, width_hz=20.0, depth_db=40.0)):
+        assert one.delay() == pytest.approx(-np.angle(one.response(slow))[0] / slow[0], rel=1e-3)
+
+
+def test_a_notch_stops_its_frequency_and_a_low_pass_has_half_the_power_at_its_cut_off():
+    notch = LoopFilter("x", NOTCH, 80.0, width_hz=20.0)
+    at = 2 * np.pi * np.array([80.0, math.sqrt(80.0**2 + 10.0**2) - 10.0, 0.5])
+    assert np.abs(notch.response(at)) == pytest.approx([0.0, math.sqrt(0.5), 1.0], abs=1e-4)
+    assert abs(LoopFilter("x", LOW_PASS, 30.0).response(np.array([60 * math.pi]))[0]) == pytest.approx(math.sqrt(0.5))
+
+
+def test_filters_are_found_by_the_names_of_both_autopilots(gains):
+    px4 = filters_of({"IMU_GYRO_CUTOFF": 40.0, "IMU_GYRO_NF0_FRQ": 83.0, "IMU_GYRO_NF0_BW": 20.0}, gains)
+    assert [(one.kind, one.hertz) for one in px4] == [(LOW_PASS, 40.0), (NOTCH, 83.0), (FIRST_ORDER, 30.0)]
+    assert px4[2].acts_on == DERIVATIVE
+    harmonic = {"INS_HNTCH_ENABLE": 1.0, "INS_HNTCH_FREQ": 58.8, "INS_HNTCH_BW": 12.0, "INS_HNTCH_HMNCS": 3.0}
+    ardupilot = filters_of({"INS_GYRO_FILTER": 42.0, **harmonic}, None)
+    assert [(one.kind, one.hertz) for one in ardupilot] == [(LOW_PASS, 42.0), (NOTCH, 58.8), (NOTCH, 117.6)]
+    assert filters_of({"IMU_GYRO_CUTOFF": 0.0}, None) == []
+
+
+def test_the_interval_of_a_coherence_holds_it_and_shrinks_with_the_record():
+    omega, value = np.array([5.0, 20.0]), np.array([0.9, 0.5])
+    low, high = coherence_band(value, omega, 40.0)
+    assert np.all((low < value) & (value < high) & (high < 1))
+    longer = coherence_band(value, omega, 400.0)
+    assert np.all(longer[1] - longer[0] < high - low)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
+    """A flight with excitation, its log, a gain set, and their report."""
+    log = tmp_path_factory.mktemp("bench") / "flight.ulg"
+    flight = mp.experiment("adam0", log, seed=1, seconds_per_axis=8.0)
+    gains = flight.flown.with_elements({"RP_RR": 0.18, "RP_PP": 0.18, "RI_RR": 0.1, "RI_PP": 0.1})
+    return flight, gains, make_report([log], [("new", gains)])
+
+
+def test_margins_are_those_of_the_certificate(bench):
+    flight, gains, report = bench
+    certificate = mp.certify(flight, gains).certificate
+    case = next(case for case in report.cases if case.label == "new")
+    assert case.gains.certificate.figures == certificate.figures
+    table = next(table for table in report.tables if table.caption == "Margins by the certificate")
+    shown = {row[0]: row[table.columns.index("new")] for row in table.rows}
+    assert shown["Ms"] == f"{certificate.figures['Ms']:.2f} +- {certificate.figures['Ms_error']:.2f}"
+    assert shown["phase margin, roll"].startswith(f"{certificate.figures['phase_margin_deg']['roll']:.0f} +-")
+    assert shown["delay margin, pitch"] == f"{certificate.figures['delay_margin_ms']['pitch']:.1f} ms"
+
+
+def test_predicted_doublets_and_steps_of_torque_end_at_rest_with_the_figures_of_tune(bench):
+    _, gains, report = bench
+    motion = predicted_motion(gains, report.flights[0].wide)
+    # Nothing moves before; the doublet is followed and ends; the integral removes the step of torque.
+    assert np.abs(motion.doublet[motion.time < 0]).max() < 0.1
+    assert np.abs(motion.torque[motion.time < 0]).max() < 0.02
+    held = (motion.time > 0.5) & (motion.time < 0.6)
+    assert motion.doublet[held, 0, 0] == pytest.approx(doublet_setpoint(motion.time)[held], abs=1.0)
+    assert np.abs(motion.doublet[-10:]).max() < 0.3
+    pushed = motion.torque[:, 0, 0]
+    assert 0.2 < pushed.max() < 2.0
+    assert abs(pushed[-1]) < 0.7 * pushed.max()
+
+
+def test_a_filter_costs_the_phase_that_it_takes_at_the_crossover(bench):
+    report = bench[2]
+    case = next(case for case in report.cases if case.label == "new")
+    notch = LoopFilter("notch", NOTCH, 45.0, width_hz=30.0)
+    response = case.flight.measured.response
+    changed = behind(response, None, notch)
+    assert changed.G_i / response.G_i == pytest.approx(
+        np.broadcast_to(notch.response(response.omega)[:, None, None], response.G_i.shape)
+    )
+    assert np.array_equal(changed.G_o, response.G_o)
+    assert behind(changed, notch, None).G_i == pytest.approx(response.G_i)
+    torque = air_spectrum(case.flight.signal("u"), case.flight.airborne)
+    found = filter_changes(case, [], [Tone(45.0, 20.0, 0)], torque, Thresholds())
+    crossing = 20.0  # rad/s, about: of the sensitivity's rise
+    assert [change.text for change in found] == ["add a notch: IMU_GYRO_NF0_FRQ 45, IMU_GYRO_NF0_BW 10"]
+    narrow = LoopFilter("notch", NOTCH, 45.0, width_hz=10.0)
+    assert found[0].margin_deg == pytest.approx(-narrow.lag_deg(crossing), abs=0.5)
+    assert found[0].margin_deg < 0
+    assert not found[0].advised
+
+
+def test_advice_rests_on_the_torque_and_the_certificate_not_on_the_tone_alone(bench):
+    case = next(case for case in bench[2].cases if case.label == "new")
+    flight = case.flight
+    torque = flight.signal("u")
+    loud = Series(torque.time, torque.values + 0.05 * np.sin(2 * np.pi * 70 * torque.time)[:, None], "u")
+    for series, advised in ((torque, False), (loud, True)):
+        spectrum = air_spectrum(series, flight.airborne)
+        change = filter_changes(case, [], [Tone(70.0, 20.0, 0)], spectrum, Thresholds())[0]
+        assert change.advised is advised, change.why
+    strict = Thresholds(Ms=1.05, thin_Ms=1.1)
+    assert not filter_changes(case, [], [Tone(70.0, 20.0, 0)], spectrum, strict)[0].advised
+
+
+def test_a_lower_derivative_filter_quiets_the_predicted_torque(bench):
+    _, gains, report = bench
+    case = next(case for case in report.cases if case.label == "new")
+    cutoffs = [
+        replace(gains, filters=replace(gains.filters, derivative_cutoff_hz=hertz)) for hertz in (10.0, 30.0, 60.0)
+    ]
+    noise = [torque_noise(one, case.flight.wide) for one in cutoffs]
+    assert noise[0] < noise[1] < noise[2]
+    assert least_phase(case.gains.certificate) == min(case.gains.certificate.figures["phase_margin_deg"].values())
+
+
+def test_phases_of_a_flight_are_told_apart(tmp_path):
+    flight = make_flight(seconds=12.0, still=(2.0, 1.0))
+    landed = ((flight.t < 12.0) | (flight.t > 21.0)).astype(np.uint8)
+    topics = px4_topics(
+        flight, vehicle_land_detected={"timestamp": np.round(flight.t * 1e6).astype(np.uint64), "landed": landed}
+    )
+    report = make_report([write_ulog(tmp_path / "hop.ulg", topics)])
+    phases = report.flights[0].phases
+    assert set(phases) == set(PHASES)
+    (first, last) = phases["ground"]
+    assert first == pytest.approx((0.0, 2.0), abs=0.01)
+    assert last == pytest.approx((11.0, 12.0), abs=0.01)
+    assert phases["air"][0] == pytest.approx((2.0, 11.0), abs=0.01)
+    assert not phases["crash"] and not phases["gaps"]
+    assert report.sections[0].heading == "Timeline"
+
+
+def test_the_tracking_error_is_that_of_the_signals_in_the_air():
+    t = np.arange(0, 10, 0.01)
+    setpoint, answer = np.zeros((len(t), 2)), np.zeros((len(t), 2))
+    setpoint[t >= 5] = math.radians(2.0)
+    error = tracking_error(Series(t, setpoint, "r"), Series(t, answer, "y"), [(4.0, 6.0)])
+    assert np.sqrt(np.mean(error**2, axis=0)) == pytest.approx([math.sqrt(2.0)] * 2, rel=0.01)
+    assert tracking_error(None, Series(t, answer, "y"), [(4.0, 6.0)]) is None
