@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from mimopilot.common.blas import reproducible
 
 if TYPE_CHECKING:
+    from mimopilot.sitl.field.autotune_run import AutotuneDialogue
+    from mimopilot.sitl.field.decisions import Decisions
     from mimopilot.sitl.field.report.flight_report import FlightReport
     from mimopilot.sitl.flight.metrics import Performance
     from mimopilot.sitl.flight.scenario import Scenario
@@ -648,6 +650,69 @@ def upload(
     done = upload_and_verify(plan, options, loaded, moment_scale)
     done.check()
     return done.outcome
+
+
+def autotune(
+    connect: str,
+    out: PathLike,
+    *,
+    profile: str = "mimo",
+    take_off: float | None = None,
+    arm: bool = False,
+    seconds_per_axis: float = 20.0,
+    amplitude: float | None = None,
+    dialogue: AutotuneDialogue | None = None,
+    timeout: float = 12.0,
+    signing_key: PathLike | None = None,
+    system: int = 0,
+) -> Decisions:
+    """Tune a vehicle in the field: experiment, gains, check flight; keep the new gains, or go back to the old ones.
+
+    Parameters
+    ----------
+    connect, timeout, signing_key, system
+        As in `upload`.
+    out : str or Path
+        Folder of logs, gains, decisions and report; after an interruption the same one goes on.
+    profile : str
+        ``mimo``: our module.
+    take_off : float, optional, m
+        Arm, take off to this height, and land. None: a pilot does that.
+    arm : bool
+        Arm a vehicle that does not say that it is simulated.
+    seconds_per_axis, amplitude
+        Of the excitation, as the command's options.
+    dialogue : AutotuneDialogue, optional
+        What is told and asked. None: nothing; every answer is yes.
+
+    Returns
+    -------
+    Decisions
+        What was done, when the new gains were kept.
+
+    Raises
+    ------
+    Error
+        When they were not: the message says why, and which gains the vehicle holds.
+    """
+    from mimopilot.sitl.field.autotune_console import SilentAnswers
+    from mimopilot.sitl.field.autotune_run import AutotuneOptions
+    from mimopilot.sitl.field.workflow import autotune as run
+
+    options = AutotuneOptions(
+        connect,
+        Path(out),
+        profile=profile,
+        take_off=take_off,
+        yes=dialogue is None,
+        arm=arm,
+        seconds_per_axis=seconds_per_axis,
+        amplitude=amplitude,
+        system=system,
+        timeout=timeout,
+        signing_key=Path(signing_key) if signing_key else None,
+    )
+    return run(options, dialogue or SilentAnswers())
 
 
 def list_logs(
