@@ -40,6 +40,12 @@ SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast
 LogOutOption = Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")]
 UncertifiedOption = Annotated[bool, typer.Option("--uncertified", help="Accept gains whose stability is in doubt.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Controller: mimo (our module), px4-stock or ardupilot-stock (the autopilot's own).", show_default="mimo"
+    ),
+]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 TimeoutOption = Annotated[
     float, typer.Option(min=0.5, max=600, help="Abort after this many seconds without a message from the vehicle.")

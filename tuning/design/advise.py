@@ -171,7 +171,7 @@ def _candidate(name: str, gains: Gains, model: ContinuousModel, bench: ResponseD
 def _slowest_zero(experiment: Experiment, cutoff_hz: float) -> float | None:
     """Slowest non-minimum-phase zero from torque to rate of the two axes, rad/s; None: there is none."""
     start, external = second_order(*FLEXIBLE, experiment.Ts), external_signal(experiment)[0]
-    flown = experiment.flown.filters if experiment.flown else Filters(experiment.Ts)
+    flown = experiment.flown.for_our_law().filters if experiment.flown else Filters(experiment.Ts)
     filters = replace(flown, Ts=experiment.Ts, derivative_cutoff_hz=cutoff_hz)
     models = [
         flexible_model(

@@ -25,6 +25,7 @@ from mimopilot.tuning.design.constraints import (
     Distance,
     MotorLimit,
     NoiseLimit,
+    ParameterRange,
     gain_above_band,
     structural_modes,
 )
@@ -308,6 +309,8 @@ class ResponseDesign:
             found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
         if TERMS["D"].matrix in free.units:
             found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(2))]
+        largest = free.base.filters.law.largest or {}
+        found += [ParameterRange(name, np.array(largest[name][:2])) for name in free.units if name in largest]
         motors = experiment.motors or USUAL_MOTORS
         # The rotors' torque stays within the range. Their command may exceed it for less than their lag.
         room, size = np.column_stack([motors.hover, 1 - motors.hover]), flown_amplitude(experiment)

@@ -14,9 +14,11 @@ from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
 from mimopilot.tuning.design.prediction import Prediction, offaxis_doubt, predict, reasons_to_keep
 from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign, vehicle_damps
+from mimopilot.tuning.design.stock_profile import WORTH, at_loop_rates, in_digits, our_module, stock_starts, worth
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS
+from mimopilot.tuning.law_terms import MIMO
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ContinuousModel, SecondOrder
@@ -67,7 +69,7 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
     if vehicle_damps(found):
         warnings.append(VEHICLE_DAMPS)
     provenance = Provenance(
-        method=spec.method,
+        method=spec.label,
         inner_model=(inner, inner),
         outer_model=(found.model, found.model),
         standard_deviation={name: value.tolist() for name, value in bench.deviations(found).items()},
@@ -94,8 +96,13 @@ def _certified_design(
     source = measured[0].experiment.source
     bandwidth = None
     for _ in range(MAX_DESIGNS):
-        found = bench.design(starts, spec.structure, spec.method == "mimo", bandwidth)
-        certificates = [certificate(found.gains, one, spec, inner, found.model) for one in measured]
+        found = bench.design(starts, spec.structure, spec.full, bandwidth)
+        found = replace(found, gains=in_digits(found.gains))
+        certificates = [
+            certificate(at_loop_rate, one, spec, inner, found.model)
+            for one in measured
+            for at_loop_rate in at_loop_rates(found.gains, one.experiment)
+        ]
         missing = [one for one in certificates if one.verdict != Verdict.CERTIFIED]
         if not missing:
             return found, certificates
@@ -142,6 +149,8 @@ def starting_points(
     """Gain sets that a search begins at, and their origin: VRFT's of the first log, and the flown ones."""
     first, B = measured[0].experiment, bench.plants[0].body.B
     base = starting_set(first, spec)
+    if spec.profile != MIMO:
+        return stock_starts(base, first, inner.omega, B), "flown, rigid body"
     # The bandwidth is the design's.
     filters = replace(base.filters, model_omega=FIRST_BANDWIDTH if spec.follow_model else 0.0)
     inverse = np.asarray(np.linalg.inv(B), np.float64)
@@ -167,14 +176,19 @@ def starting_points(
 def comparison(
     found: Design, measured: Sequence[PlantEstimates], bench: ResponseDesign, spec: TuningSpec
 ) -> dict[str, Any]:
-    """Predicted figures as plain values: of a design, of the flown gains, and of the same design axis by axis.
+    """Predicted figures as plain values: of a design, of the flown gains, and of an alternative.
+
+    That is the same design axis by axis, or for a stock controller our module's with full matrices.
 
     ``keep_flown`` says why the flown gains are better; it is empty if they are not.
     """
     tasks = [(plant, manoeuvres(plant, found.model.discretise(plant.Ts))) for plant in bench.plants]
     new = [predict(found.gains, *task) for task in tasks]
     shown = {"tuned": new}
-    if spec.method == "mimo":
+    if spec.profile != MIMO:
+        module = our_module(found, bench, spec)
+        shown["module"] = [predict(module.gains, *task) for task in tasks]
+    elif spec.full:
         siso = bench.design([found.gains], spec.structure, full=False, bandwidth=found.model.omega)
         shown["siso"] = [predict(siso.gains, *task) for task in tasks]
     result: dict[str, Any] = {}
@@ -188,6 +202,8 @@ def comparison(
         ]
         keep = reasons_to_keep(new, shown["flown"], spec.design, found.model.omega / fastest, doubts)
         result |= {"better_than_flown": not keep, "keep_flown": keep}
+    if spec.profile != MIMO:
+        result |= {WORTH: worth(shown)}
     return {"predicted": {name: _plain(figures) for name, figures in shown.items()}, **result}
 
 
