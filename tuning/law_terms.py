@@ -116,7 +116,7 @@ class Filters:
         return followed_model(self.model_omega, self.model_damping, self.Ts) if self.model_omega else None
 
     @property
-    def law(self) -> Law:
+    def law(self) -> ControlLaw:
         """The law of the gains."""
         return LAWS[MIMO if self.stock is None else self.stock.controller]
 
@@ -148,7 +148,7 @@ class Term:
 
 
 @dataclass(frozen=True)
-class Law:
+class ControlLaw:
     """One control law.
 
     Attributes
@@ -261,8 +261,8 @@ _MIMO_TEXT = (
 )
 #: Name of a law -> the law.
 LAWS = {
-    MIMO: Law(LOOP_TERMS, _MIMO_TEXT, coupled=True, delay=0, lacks=()),
-    PX4_STOCK: Law(
+    MIMO: ControlLaw(LOOP_TERMS, _MIMO_TEXT, coupled=True, delay=0, lacks=()),
+    PX4_STOCK: ControlLaw(
         _PX4_TERMS,
         (
             "# mimopilot gains for PX4's stock controllers: MC_*RATE_P, I, D (K = 1), FF; diagonal, roll then pitch.",
@@ -279,7 +279,7 @@ LAWS = {
             "Kff_i": (5.0, 5.0, 5.0),
         },
     ),
-    ARDUPILOT_STOCK: Law(
+    ARDUPILOT_STOCK: ControlLaw(
         _ARDUPILOT_TERMS,
         (
             "# mimopilot gains for ArduPilot's stock controllers: ATC_RAT_*_P, I, D, FF; diagonal, roll then pitch.",
