@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -134,7 +135,7 @@ class Experiment:
 
 
 def external_signal(experiment: Experiment) -> tuple[Signal, str]:
-    """External signal, (N, 2), and its name: injected torque, else injected rate setpoint, else attitude setpoint.
+    """External signal, (N, n), and its name: injected torque, else injected rate setpoint, else attitude setpoint.
 
     Raises
     ------
@@ -147,9 +148,22 @@ def external_signal(experiment: Experiment) -> tuple[Signal, str]:
             return signal, name
     raise TuningError(
         f"{experiment.source}: no excitation: no injected torque or rate setpoint and no varying attitude setpoint is "
-        "logged; "
-        "fly an experiment with a torque injected on roll, then on pitch"
+        "logged; fly an experiment with a torque injected on roll, then on pitch"
     )
+
+
+def excited_segments(segments: Sequence[tuple[int, int]], signal: Signal) -> list[tuple[int, int]]:
+    """The part of each segment from the first to the last sample at which an external signal (N,) is not zero.
+
+    A signal that does not vary excites nothing.
+    """
+    found = []
+    for start, stop in segments:
+        part = signal[start:stop]
+        moving = start + np.flatnonzero(part if np.ptp(part) > 0 else 0 * part)
+        if len(moving):
+            found.append((int(moving[0]), int(moving[-1]) + 1))
+    return found
 
 
 def manoeuvre_size(angles: Signal) -> float:

@@ -84,7 +84,7 @@ class Matrices(Protocol):
 def rate_matrices(gains: Matrices) -> dict[str, Signal]:
     """Letter of the law's terms -> matrix of the rate controller."""
     tuned = {letter: getattr(gains, term.matrix) for letter, term in LOOP_TERMS.items()}
-    return tuned | fixed_matrices(gains.filters, 2)
+    return tuned | fixed_matrices(gains.filters, np.shape(tuned["P"])[-1])
 
 
 def fixed_matrices(filters: Filters, n: int) -> dict[str, Signal]:

@@ -66,9 +66,11 @@ class StockFilters:
                 if not NOT_NEGATIVE.holds(value):
                     raise TuningError(f"filters.{name} ({axis}): got {value}, expected {NOT_NEGATIVE}")
 
-    def on(self, axes: slice) -> StockFilters:
-        """The filters of some axes."""
-        return replace(self, **{name: getattr(self, name)[axes] for name in STOCK_FILTERS})
+    def on(self, axes: slice, yaw_unit: float = 1.0) -> StockFilters:
+        """The filters of some axes, see `Filters.on`."""
+        found = replace(self, **{name: getattr(self, name)[axes] for name in STOCK_FILTERS})
+        *others, yaw = found.derivative_feedforward
+        return found if yaw_unit == 1.0 else replace(found, derivative_feedforward=(*others, yaw / yaw_unit))
 
 
 #: Names of the filters and fixed gains.
@@ -120,9 +122,9 @@ class Filters:
         """The law of the gains."""
         return LAWS[MIMO if self.stock is None else self.stock.controller]
 
-    def on(self, axes: slice) -> Filters:
-        """The filters of some axes: 0 roll, 1 pitch, 2 yaw."""
-        return self if self.stock is None else replace(self, stock=self.stock.on(axes))
+    def on(self, axes: slice, yaw_unit: float = 1.0) -> Filters:
+        """The filters of some axes: 0 roll, 1 pitch, 2 yaw, the last with another unit of torque."""
+        return self if self.stock is None else replace(self, stock=self.stock.on(axes, yaw_unit))
 
 
 @dataclass(frozen=True)

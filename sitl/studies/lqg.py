@@ -19,7 +19,7 @@ from scipy.linalg import solve_discrete_are
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.sitl.physics.linear_model import control_effectiveness, linear_model_with_noise
 from mimopilot.sitl.studies.linear_loop import LinearController, LinearLoop
-from mimopilot.tuning.analysis.manoeuvres import SECONDS, STEP_ACCELERATION
+from mimopilot.tuning.analysis.manoeuvres import ROLL_PITCH_FAMILY
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace
 
@@ -45,8 +45,8 @@ def lqg_with_noise(airframe: Airframe, model: ReferenceModel, noise: Signal) -> 
     """
     plant = linear_model_with_noise(airframe, model.Ts)
     # A random walk that in the mean doublet of the design's cost reaches its step of torque.
-    step = STEP_ACCELERATION / np.abs(np.diag(control_effectiveness(airframe)))
-    drift = step * np.sqrt(model.Ts / SECONDS)
+    step = ROLL_PITCH_FAMILY.acceleration / np.abs(np.diag(control_effectiveness(airframe)))
+    drift = step * np.sqrt(model.Ts / ROLL_PITCH_FAMILY.seconds)
     low, high = np.log(WEIGHTS)
     while high - low > ACCURACY:
         middle = (low + high) / 2

@@ -280,5 +280,3 @@ def _plain(found: dict[str, float]) -> dict[str, float | None]:
 
 def _shown(value: float) -> str:
     return f"{value:.2f}" if np.isfinite(value) else "never"
-
-

@@ -283,7 +283,7 @@ def _optimum_figures(vehicle: DrawnVehicle, truth: TruePlant, best: Design, limi
         "cost": best.cost,
         "Ms": truth.sensitivity_peak(best.gains),
         "limited_by": best.active,
-        "follow_ratio": float(np.hypot(*ours.follow_deg) / np.hypot(*before.follow_deg)),
-        "offaxis_deg": [float(np.hypot(*one.offaxis_deg)) for one in (ours, before)],
+        "follow_ratio": float(np.linalg.norm(ours.follow_deg) / np.linalg.norm(before.follow_deg)),
+        "offaxis_deg": [float(np.linalg.norm(one.offaxis_deg)) for one in (ours, before)],
         "reasons_to_keep": reasons,
     }

@@ -8,7 +8,7 @@ from scipy.optimize import isotonic_regression
 
 from mimopilot.tuning.analysis import margins
 from mimopilot.tuning.analysis.closed_loop import cascade_loop, singular_values
-from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.axes import Law
 from mimopilot.tuning.law import cascade_response
 from mimopilot.tuning.plant.frequency_response import COHERENT, PlantResponse
 
@@ -31,12 +31,12 @@ MIN_DISTANCE = 1e-6
 Signal = NDArray[np.float64]
 
 
-def reason_beyond_band(gains: Gains, known: PlantResponse, gain_above: float) -> str:
+def reason_beyond_band(gains: Law, known: PlantResponse, gain_above: float) -> str:
     """Why the loop cannot be judged outside the band; empty when the assumptions made there hold.
 
     Parameters
     ----------
-    gains : Gains
+    gains : Law
     known : PlantResponse
         In the band.
     gain_above : float
@@ -68,7 +68,7 @@ def reason_beyond_band(gains: Gains, known: PlantResponse, gain_above: float) ->
     return ""
 
 
-def loop_gain_above(gains: Gains, plant: PlantResponse) -> Signal:
+def loop_gain_above(gains: Law, plant: PlantResponse) -> Signal:
     """Upper bound of the rate loop's gain above each frequency of the plant, (K,).
 
     The supremum over w > w_k of sigma_max(G(w_k)) (w_k / w) sigma_max(C_y)(w). A rate is the integral of the torque
@@ -91,7 +91,7 @@ def falling_gain(plant: PlantResponse) -> Signal:
     return gain
 
 
-def attitude_gain_above(gains: Gains, plant: PlantResponse) -> float:
+def attitude_gain_above(gains: Law, plant: PlantResponse) -> float:
     """Upper bound of what the attitude path C_o G_o adds to the loop's gain above the plant's band.
 
     G_o falls at least like 1/w^2 there, see `loop_gain_above`.
@@ -101,22 +101,22 @@ def attitude_gain_above(gains: Gains, plant: PlantResponse) -> float:
     return float(np.linalg.norm(plant.G_o[-1], ord=2) * path.max())
 
 
-def sensitivity_at_band_start(gains: Gains, known: PlantResponse) -> float:
+def sensitivity_at_band_start(gains: Law, known: PlantResponse) -> float:
     """The sensitivity's largest singular value at the lowest frequency of the band."""
     return margins.peak(margins.sensitivity(cascade_loop(gains, known.at(np.array([0])))))
 
 
-def loop_at_band_start(gains: Gains, known: PlantResponse) -> float:
+def loop_at_band_start(gains: Law, known: PlantResponse) -> float:
     """The loop's smallest singular value at the lowest frequency of the band."""
     return float(np.linalg.svd(cascade_loop(gains, known.at(np.array([0]))).L_u, compute_uv=False).min())
 
 
-def find_structural_mode(gains: Gains, plant: PlantResponse) -> tuple[float, float] | None:
+def find_structural_mode(gains: Law, plant: PlantResponse) -> tuple[float, float] | None:
     """Measured frequency above the crossover at which the rate loop's gain exceeds the limit again.
 
     Parameters
     ----------
-    gains : Gains
+    gains : Law
     plant : PlantResponse
         The whole response, known or not.
 
@@ -132,12 +132,12 @@ def find_structural_mode(gains: Gains, plant: PlantResponse) -> tuple[float, flo
     return float(plant.omega[surest]), float((gain + error)[surest])
 
 
-def exceeded_frequencies(gains: Gains, plant: PlantResponse) -> NDArray[np.bool_]:
+def exceeded_frequencies(gains: Law, plant: PlantResponse) -> NDArray[np.bool_]:
     """Measured frequencies above the crossover at which the rate loop's gain may exceed the limit, (K,)."""
     return _exceeded(gains, plant)[0]
 
 
-def _exceeded(gains: Gains, plant: PlantResponse) -> tuple[NDArray[np.bool_], Signal, Signal]:
+def _exceeded(gains: Law, plant: PlantResponse) -> tuple[NDArray[np.bool_], Signal, Signal]:
     """See `exceeded_frequencies`; and the gain and its error, (K,)."""
     gain, error = _rate_loop_gain(gains, plant)
     known = np.flatnonzero(plant.known())
@@ -149,13 +149,13 @@ def _exceeded(gains: Gains, plant: PlantResponse) -> tuple[NDArray[np.bool_], Si
     return _measured(plant, gain, error) & above_crossover & (gain + error > MAX_GAIN_ABOVE_BAND), gain, error
 
 
-def sensitivity_peak_above(gains: Gains, plant: PlantResponse, end: float) -> float:
+def sensitivity_peak_above(gains: Law, plant: PlantResponse, end: float) -> float:
     """Largest sensitivity at measured frequencies above `end` (rad/s), errors included; 0: none measured."""
     gain, error = _rate_loop_gain(gains, plant)
     counts = _measured(plant, gain, error) & (plant.omega > end)
     if not counts.any():
         return 0.0
-    least = singular_values(np.eye(2) + cascade_loop(gains, plant.at(counts)).L_u)[1] - error[counts]
+    least = singular_values(np.eye(plant.axes) + cascade_loop(gains, plant.at(counts)).L_u)[1] - error[counts]
     return float(1 / max(least.min(), MIN_DISTANCE))
 
 
@@ -171,7 +171,7 @@ def _measured(plant: PlantResponse, gain: Signal, error: Signal) -> NDArray[np.b
     return np.asarray(plant.known() | (seen & neighbour))
 
 
-def _rate_loop_gain(gains: Gains, plant: PlantResponse) -> tuple[Signal, Signal]:
+def _rate_loop_gain(gains: Law, plant: PlantResponse) -> tuple[Signal, Signal]:
     """sigma_max of the rate loop, (K,), and the RMS of the error's norm: two deviations of an element."""
     controller = cascade_response(gains, plant.omega)[2]
     gain = singular_values(controller @ plant.G_i)[0]

@@ -25,9 +25,9 @@ from mimopilot.tuning.analysis.beyond_band import (
 from mimopilot.tuning.analysis.closed_loop import model_spectral_radius, slow_growth
 from mimopilot.tuning.analysis.nyquist import NyquistCount
 from mimopilot.tuning.analysis.stability_figures import nominal_and_drawn_loops, stability_figures
+from mimopilot.tuning.axes import Law
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Certificate, Thresholds, Verdict
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.frequency_response import DRAWS, LATE, MIN_FREQUENCIES, PlantResponse
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody, continued_below, rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel
@@ -38,7 +38,7 @@ UNSTABLE_RADIUS = 1.0005
 
 
 def certify(
-    gains: Gains,
+    gains: Law,
     plant: PlantResponse,
     inner: Sequence[ReferenceModel],
     outer: Sequence[ReferenceModel],
@@ -50,12 +50,12 @@ def certify(
 
     Parameters
     ----------
-    gains : Gains
+    gains : Law
     plant : PlantResponse
         Measured response, from `tuning.plant.frequency_response.plant_response`. If its period is not that of the
         gains, it is carried to theirs, see `PlantResponse.at_period`.
-    inner, outer : sequence of 2 ReferenceModel
-        Of the rate and the attitude loop, roll and pitch; they only normalise the determinants.
+    inner, outer : sequence of n ReferenceModel
+        Of the rate and the attitude loop, one for each axis; they only normalise the determinants.
     log_sha256 : str
         Hash of the log that the response comes from.
     thresholds : Thresholds
@@ -78,13 +78,9 @@ def certify(
         return Certificate(text, reason + carried, figures, band, thresholds.model_dump(), log_sha256)
 
     try:
-        body = rigid_body(plant)
+        body, known = _known(plant)
     except TuningError as error:
         return verdict(Verdict.NOT_CERTIFIED, str(error), {}, (0.0, 0.0))
-    known = plant.at(plant.known_run())
-    if len(known.omega) < MIN_FREQUENCIES:
-        reason = f"the excitation reaches fewer than {MIN_FREQUENCIES} frequencies in a row"
-        return verdict(Verdict.NOT_CERTIFIED, reason, {}, (0.0, 0.0))
     band = (float(known.omega[0]), float(known.omega[-1]))
     gain_above = float(loop_gain_above(gains, known)[-1])
     dense, nominal, draws = nominal_and_drawn_loops(gains, continued_below(known, body))
@@ -116,13 +112,43 @@ def certify(
         f"assumed: above {band[1]:.0f} rad/s the plant falls at least like an integrator; "
         f"below {band[0]:.1f} rad/s it is the fitted rigid body"
     )
-    short = _missed_thresholds(figures, thresholds.Ms, thresholds.phase_deg)
+    short = missed_thresholds(figures, thresholds.Ms, thresholds.phase_deg)
     if not short:
         return verdict(Verdict.CERTIFIED, assumed, figures, band)
-    too_short = _missed_thresholds(figures, thresholds.thin_Ms, thresholds.thin_phase_deg)
+    too_short = missed_thresholds(figures, thresholds.thin_Ms, thresholds.thin_phase_deg)
     if too_short:
         return verdict(Verdict.NOT_CERTIFIED, "; ".join(["the margin is too thin", *too_short]), figures, band)
     return verdict(Verdict.THIN, "; ".join([*short, assumed]), figures, band)
+
+
+def _known(plant: PlantResponse) -> tuple[RigidBody, PlantResponse]:
+    """The fitted rigid body, and the response where it is known.
+
+    Raises
+    ------
+    TuningError
+        When it is known at too few frequencies.
+    """
+    body, known = rigid_body(plant), plant.at(plant.known_run())
+    if len(known.omega) < MIN_FREQUENCIES:
+        raise TuningError(f"the excitation reaches fewer than {MIN_FREQUENCIES} frequencies in a row")
+    return body, known
+
+
+def reason_unknown(gains: Law, plant: PlantResponse) -> str:
+    """Why a response does not show the loop of a law; empty: it does.
+
+    Parameters
+    ----------
+    gains : Law
+    plant : PlantResponse
+        With the period of the law.
+    """
+    try:
+        _, known = _known(plant)
+    except TuningError as error:
+        return str(error)
+    return reason_beyond_band(gains, known, float(loop_gain_above(gains, known)[-1]))
 
 
 def _carried(measured: PlantResponse, Ts: float) -> str:
@@ -133,7 +159,7 @@ def _carried(measured: PlantResponse, Ts: float) -> str:
     return f"{rates} {LATE * (Ts - measured.Ts) * 1e3:.1f} ms later, as after one period of computing"
 
 
-def _missed_thresholds(figures: Mapping[str, Any], Ms: float, phase_deg: float) -> list[str]:
+def missed_thresholds(figures: Mapping[str, Any], Ms: float, phase_deg: float) -> list[str]:
     """One text for each margin that misses its threshold, error included."""
     missed = []
     if figures["Ms"] + figures["Ms_error"] > Ms:
@@ -145,7 +171,7 @@ def _missed_thresholds(figures: Mapping[str, Any], Ms: float, phase_deg: float) 
     return missed
 
 
-def _reason_for_doubt(gains: Gains, plant: PlantResponse, known: PlantResponse, body: RigidBody) -> str:
+def _reason_for_doubt(gains: Law, plant: PlantResponse, known: PlantResponse, body: RigidBody) -> str:
     """Why a loop may be unstable although Nyquist's count finds it stable; empty when nothing suggests it."""
     mode = find_structural_mode(gains, plant)
     if mode is not None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning import law
-from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.axes import Law
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.statespace import StateSpace
 
@@ -21,10 +21,16 @@ Signal = NDArray[np.float64]
 
 
 def singular_values(matrices: Complex) -> tuple[Signal, Signal]:
-    """Largest and smallest singular value of 2x2 matrices (..., 2, 2), each (...).
+    """Largest and smallest singular value of matrices (..., n, n), each (...).
 
-    In closed form: LAPACK's would take half of a tuning's time.
+    Those of 2x2 matrices in closed form: LAPACK's would take half of a tuning's time.
     """
+    if matrices.shape[-1] == 1:
+        only: Signal = np.abs(matrices[..., 0, 0])
+        return only, only
+    if matrices.shape[-1] > 2:
+        values: Signal = np.linalg.svd(matrices, compute_uv=False).astype(np.float64)
+        return values[..., 0], values[..., -1]
     size = np.sum(np.abs(matrices) ** 2, axis=(-2, -1))
     determinant = np.abs(matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0])
     largest = np.sqrt((size + np.sqrt(np.maximum(size**2 - 4 * determinant**2, 0.0))) / 2)
@@ -33,7 +39,7 @@ def singular_values(matrices: Complex) -> tuple[Signal, Signal]:
 
 @dataclass(frozen=True, eq=False)
 class CascadeLoop:
-    """Frequency responses of a gain set around a plant, (K, 2, 2) each.
+    """Frequency responses of a gain set around a plant, (K, n, n) each.
 
     Attributes
     ----------
@@ -49,33 +55,34 @@ class CascadeLoop:
     U_o: Complex
 
 
-def whole_loop(gains: Gains, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
-    """L_i and L_u as in `CascadeLoop`, and the setpoint's path C_ref, (K, 2, 2) each."""
+def whole_loop(gains: Law, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
+    """L_i and L_u as in `CascadeLoop`, and the setpoint's path C_ref, (K, n, n) each."""
     C_ref, C_o, C_y = law.cascade_response(gains, plant.omega)
     L_i = C_y @ plant.G_i
     return L_i, L_i + C_o @ plant.G_o, C_ref
 
 
-def cascade_loop(gains: Gains, plant: PlantResponse) -> CascadeLoop:
+def cascade_loop(gains: Law, plant: PlantResponse) -> CascadeLoop:
     """Open and closed loop of a gain set around a measured plant."""
     L_i, L_u, forward = whole_loop(gains, plant)
-    U_o: Complex = np.linalg.solve(np.eye(2) + L_u, forward).astype(np.complex128)
+    U_o: Complex = np.linalg.solve(np.eye(plant.axes) + L_u, forward).astype(np.complex128)
     return CascadeLoop(L_i, L_u, plant.G_o @ U_o, U_o)
 
 
-def closed_loop_poles(gains: Gains, plant: StateSpace) -> Complex:
+def closed_loop_poles(gains: Law, plant: StateSpace) -> Complex:
     """Poles of the closed loop around a plant, without limits: those of the rate loop alone, then of the whole cascade.
 
     Parameters
     ----------
-    gains : Gains
+    gains : Law
     plant : StateSpace
         From torque to body rates; the angles are their integrals.
     """
     flown = law.state_space(law.rate_matrices(gains), gains.filters)
     n, m = len(plant.A), len(flown.A)
-    start = np.eye(n + m + 4)
-    state, memory, rate, angle = np.split(start, [n, n + m, n + m + 2])
+    axes = len(plant.C)
+    start = np.eye(n + m + 2 * axes)
+    state, memory, rate, angle = np.split(start, [n, n + m, n + m + axes])
     now = plant.C @ state
     before, angle = angle, angle + gains.Ts / 2 * (now + rate)
     poles = []
@@ -88,7 +95,7 @@ def closed_loop_poles(gains: Gains, plant: StateSpace) -> Complex:
         step = np.vstack([plant.A @ state + plant.B @ torque, ahead, now, angle])
         kept = np.ones(len(step), bool)
         if not setpoint.any():  # the rate loop alone: the angle is not fed back
-            kept[-2:] = False
+            kept[-axes:] = False
         # A filter whose output is not used, such as an integral with zero gain, is not part of the loop.
         kept[n : n + m] = np.any(flown.C, axis=0)
         poles.append(np.linalg.eigvals(step[np.ix_(kept, kept)]))
@@ -96,17 +103,17 @@ def closed_loop_poles(gains: Gains, plant: StateSpace) -> Complex:
     return found
 
 
-def model_spectral_radius(gains: Gains, plant: StateSpace) -> float:
+def model_spectral_radius(gains: Law, plant: StateSpace) -> float:
     """Spectral radius of the closed loop around an identified plant; see `closed_loop_poles`."""
     return float(np.abs(closed_loop_poles(gains, plant)).max())
 
 
-def slow_growth(gains: Gains, plant: StateSpace, below: float) -> float | None:
+def slow_growth(gains: Law, plant: StateSpace, below: float) -> float | None:
     """Frequency (rad/s) of an unstable mode of the loop around a model, slower than `below`; None: there is none.
 
     Parameters
     ----------
-    gains : Gains
+    gains : Law
     plant : StateSpace
         From torque to body rates.
     below : float, rad/s

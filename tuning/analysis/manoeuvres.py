@@ -1,4 +1,4 @@
-"""The manoeuvres that a gain set is judged by: a family of doublets on each axis, and a step of torque.
+"""The manoeuvres that a gain set is judged by: doublets of several lengths on each axis, and a step of torque.
 
 All figures are energies by Parseval's theorem, so the time after a manoeuvre counts until everything is at rest.
 """
@@ -16,16 +16,8 @@ from mimopilot.tuning.plant.rigid_body_fit import LOWEST
 from mimopilot.tuning.plant.wide_response import WideResponse, hat_weights
 from mimopilot.tuning.reference_model import ReferenceModel
 
-#: Whole lengths of the doublets, s: from a sharp stick input to slow flight.
-PERIODS = (0.4, 0.7, 1.2, 2.0)
 #: Amplitude of the doublets that the step of torque is compared with, rad (10 degrees).
 AMPLITUDE = np.radians(10.0)
-#: Energy of a mean doublet of amplitude 1, s: its length.
-SECONDS = float(np.mean(PERIODS))
-#: Angular acceleration of the step of torque, rad/s^2. By trial on the simulated airframes and PX4's simulator:
-#: half and double of it change following by less than 10 %; without it the integral goes to its lower bound, and with
-#: model following the attitude gain, too.
-STEP_ACCELERATION = 1.5
 #: Frequencies on which the spectra are integrated: a doublet of 2 s has a lobe every 3 rad/s.
 FINE = 20_000
 #: The same for the torque at a few times, which are at most two periods after the doublet begins.
@@ -39,6 +31,44 @@ Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
 
+@dataclass(frozen=True)
+class ManoeuvreFamily:
+    """The manoeuvres of roll and pitch, or of yaw.
+
+    Attributes
+    ----------
+    periods : tuple of float, s
+        Whole lengths of the doublets.
+    acceleration : float, rad/s^2
+        Angular acceleration of the step of torque.
+    amplitudes : tuple of 2 float, rad
+        Range of the size of the manoeuvres that the limits of the actuators are computed for.
+    """
+
+    periods: tuple[float, ...]
+    acceleration: float
+    amplitudes: tuple[float, float]
+
+    @property
+    def seconds(self) -> float:
+        """Energy of a mean doublet of amplitude 1, s: its length."""
+        return float(np.mean(self.periods))
+
+
+#: Doublets from a sharp stick input to slow flight, within a normal flight's attitudes (5 to 30 degrees). The step of
+#: torque by trial on the simulated airframes and PX4's simulator: half and double of it change following by less than
+#: 10 %; without it the integral goes to its lower bound, and with model following the attitude gain, too.
+ROLL_PITCH_FAMILY = ManoeuvreFamily((0.4, 0.7, 1.2, 2.0), 1.5, (np.radians(5.0), np.radians(30.0)))
+#: A multirotor's yaw has about a fifth of the others' bandwidth and torque, and a third of the disturbance: no gust
+#: lifts one side. A heading setpoint is limited in its slew by position controllers and pilots: its jumps are small.
+YAW_FAMILY = ManoeuvreFamily((1.2, 2.0, 3.5, 6.0), 0.5, (np.radians(5.0), np.radians(10.0)))
+
+
+def family_of(axes: int) -> ManoeuvreFamily:
+    """The manoeuvres of a number of axes, see `tuning.axes`: one is yaw."""
+    return YAW_FAMILY if axes == 1 else ROLL_PITCH_FAMILY
+
+
 @dataclass(frozen=True, eq=False)
 class Manoeuvres:
     """Weights of the manoeuvres on the frequencies of a plant.
@@ -47,18 +77,20 @@ class Manoeuvres:
     ----------
     omega : (K,) array, rad/s
     doublets : (4, K) array, s
-        One row for each of `PERIODS`: the energy of E times a doublet of amplitude 1 is the sum over frequency of the
-        row times |E|^2.
-    step : (K, 2) array, s
+        One row for each of the family's periods: the energy of E times a doublet of amplitude 1 is the sum over
+        frequency of the row times |E|^2.
+    step : (K, n) array, s
         The same for D and the step of torque on each axis.
     model : ReferenceModel
-        What the attitude should follow, on both axes.
+        What the attitude should follow, on every axis.
+    family : ManoeuvreFamily
     """
 
     omega: Signal
     doublets: Signal
     step: Signal
     model: ReferenceModel
+    family: ManoeuvreFamily
 
     @cached_property
     def target(self) -> Complex:
@@ -72,19 +104,19 @@ class Manoeuvres:
 
     @cached_property
     def following(self) -> Signal:
-        """Weights of the mean relative energy of the error over all doublets and both axes, (K,)."""
-        weight: Signal = self.doublets.mean(axis=0) / self.moved / 2
+        """Weights of the mean relative energy of the error over all doublets and axes, (K,)."""
+        weight: Signal = self.doublets.mean(axis=0) / self.moved / self.step.shape[1]
         return weight
 
     @cached_property
     def disturbance(self) -> Signal:
-        """Weights of the relative energy of the angles after the step of torque, mean over both axes, (K, 2)."""
-        weight: Signal = self.step / (AMPLITUDE**2 * SECONDS) / 2
+        """Weights of the relative energy of the angles after the step of torque, mean over the axes, (K, n)."""
+        weight: Signal = self.step / (AMPLITUDE**2 * self.family.seconds) / self.step.shape[1]
         return weight
 
 
 def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
-    """The family of doublets and the step of torque on the frequencies of a plant.
+    """The doublets and the step of torque of its axes on the frequencies of a plant.
 
     Parameters
     ----------
@@ -92,16 +124,18 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
     model : ReferenceModel
         Of the attitude.
     """
+    family = family_of(plant.axes)
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, FINE)
-    spectra = np.array([np.abs(doublet_spectrum(fine, period)) ** 2 / np.pi for period in PERIODS])
+    spectra = np.array([np.abs(doublet_spectrum(fine, period)) ** 2 / np.pi for period in family.periods])
     logarithmic = np.geomspace(LOWEST, fine[-1], FINE)
     step = hat_weights(plant.omega, logarithmic, logarithmic**-2.0 / np.pi)
-    torque = STEP_ACCELERATION / np.abs(np.diag(plant.body.B))
+    torque = family.acceleration / np.abs(np.diag(plant.body.B))
     return Manoeuvres(
         omega=plant.omega,
         doublets=hat_weights(plant.omega, fine, spectra.T).T,
         step=step[:, None] * torque**2,
         model=model,
+        family=family,
     )
 
 
@@ -119,7 +153,7 @@ def doublet_torque(plant: WideResponse, amplitude: float, lag: float = 0.0) -> C
     """
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, COARSE)
     rows = []
-    for period in PERIODS:
+    for period in family_of(plant.axes).periods:
         spectrum = amplitude * doublet_spectrum(fine, period) / np.pi / (1 + 1j * fine * lag)
         times = [begin + (k + 0.5) * plant.Ts for begin in (0.0, period / 2, period) for k in AFTER]
         rows.append(hat_weights(plant.omega, fine, spectrum[:, None] * np.exp(1j * np.outer(fine, times))).T)

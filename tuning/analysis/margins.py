@@ -8,30 +8,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop
-from mimopilot.tuning.parameter_row import ROLL_PITCH
+from mimopilot.tuning.axes import axis_names
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
 
 def sensitivity(loop: CascadeLoop) -> Complex:
-    """S = (I + L_u)^-1 at the plant's input, (K, 2, 2)."""
-    S: Complex = np.linalg.inv(np.eye(2) + loop.L_u).astype(np.complex128)
+    """S = (I + L_u)^-1 at the plant's input, (K, n, n)."""
+    S: Complex = np.linalg.inv(np.eye(loop.L_u.shape[-1]) + loop.L_u).astype(np.complex128)
     return S
 
 
 def peak(S: Complex) -> float:
-    """Ms: the largest singular value of a sensitivity (K, 2, 2) over all frequencies."""
+    """Ms: the largest singular value of a sensitivity (K, n, n) over all frequencies."""
     return float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
 
 
 def disk_margin(S: Complex) -> float:
-    """Radius of the largest disk about 1 of complex factors that both channels tolerate at once.
+    """Radius of the largest disk about 1 of complex factors that all channels tolerate at once.
 
     1 over the peak of S - I/2 (P. Seiler, A. Packard, P. Gahinet, "An introduction to disk margins", IEEE Control
     Systems 40, 2020).
     """
-    return 1 / peak(S - np.eye(2) / 2)
+    return 1 / peak(S - np.eye(S.shape[-1]) / 2)
 
 
 def simultaneous_margins(disk: float) -> tuple[float, float]:
@@ -41,8 +41,8 @@ def simultaneous_margins(disk: float) -> tuple[float, float]:
 
 
 def axis_loops(S: Complex) -> Complex:
-    """The loop of each axis with the other one closed, 1 / S_ii - 1, (2, K)."""
-    loops: Complex = 1 / np.stack([S[:, 0, 0], S[:, 1, 1]]) - 1
+    """The loop of each axis with the others closed, 1 / S_ii - 1, (n, K)."""
+    loops: Complex = 1 / np.diagonal(S, axis1=1, axis2=2).T - 1
     return loops
 
 
@@ -79,7 +79,7 @@ def gain_margins(loops: Complex, gain_above: float) -> dict[str, Any]:
 
     Parameters
     ----------
-    loops : (2, K) array
+    loops : (n, K) array
         In the band.
     gain_above : float
         Upper bound of the loop's gain above the band: no margin larger than 1 / gain_above is claimed.
@@ -92,7 +92,7 @@ def gain_margins(loops: Complex, gain_above: float) -> dict[str, Any]:
     """
     ceiling = -20 * float(np.log10(gain_above)) if gain_above > 0 else np.inf
     margins, kinds = {}, {}
-    for axis, loop in zip(ROLL_PITCH, loops, strict=True):
+    for axis, loop in zip(axis_names(len(loops)), loops, strict=True):
         found = gain_margin(loop)
         if found <= ceiling:
             margins[axis], kinds[axis] = found, "exact"

@@ -26,11 +26,11 @@ class NyquistCount:
 
     Parameters
     ----------
-    inner, outer : sequence of 2 ReferenceModel
+    inner, outer : sequence of n ReferenceModel
         Of the rate and the attitude loop.
     omega : (K,) array, rad/s
         Frequencies of the loops.
-    Ki_i : (2, 2) array
+    Ki_i : (n, n) array
         Integral gains of the rate controller.
     """
 
@@ -58,7 +58,7 @@ class NyquistCount:
 
     def encirclements(self, loop: CascadeLoop) -> tuple[int, int]:
         """Encirclements of 0: rate loop, whole cascade."""
-        identity = np.eye(2)
+        identity = np.eye(loop.L_i.shape[-1])
         counts = []
         for n, L, after in ((self.n_i, loop.L_i, self.after[0]), (self.n_o, loop.L_u, self.after[1])):
             f = n * np.linalg.det(identity + L)

@@ -9,8 +9,7 @@ import numpy as np
 
 from mimopilot.tuning.analysis import margins
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop, cascade_loop
-from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameter_row import ROLL_PITCH
+from mimopilot.tuning.axes import Law, axis_names
 from mimopilot.tuning.plant.frequency_response import DRAWS, PlantResponse
 from mimopilot.tuning.reference_model import ReferenceModel
 
@@ -19,7 +18,7 @@ from mimopilot.tuning.reference_model import ReferenceModel
 GRID_STEP = 0.05
 
 
-def nominal_and_drawn_loops(gains: Gains, plant: PlantResponse) -> tuple[PlantResponse, CascadeLoop, list[CascadeLoop]]:
+def nominal_and_drawn_loops(gains: Law, plant: PlantResponse) -> tuple[PlantResponse, CascadeLoop, list[CascadeLoop]]:
     """The plant on a grid that resolves narrow peaks, its loop, and the loops of plants drawn from its error."""
     generator, dense = np.random.default_rng(0), plant.interpolated(GRID_STEP)
     others = (plant.draw(generator).interpolated(GRID_STEP) for _ in range(DRAWS))
@@ -48,10 +47,10 @@ def stability_figures(
         The response that `nominal` is made of.
     nominal, draws
         See `nominal_and_drawn_loops`.
-    inner : sequence of 2 ReferenceModel
+    inner : sequence of n ReferenceModel
         Of the rate loop.
     """
-    identity = np.eye(2)
+    identity, names = np.eye(plant.axes), axis_names(plant.axes)
     m = np.stack([model.frequency_response(plant.omega) for model in inner], axis=1)[:, :, None] * identity
 
     def delta(loop: CascadeLoop) -> float:
@@ -81,7 +80,7 @@ def stability_figures(
         "simultaneous_gain_db": gain_db,
         "simultaneous_phase_deg": phase_deg,
         **margins.gain_margins(loops, gain_above),
-        "phase_margin_deg": {axis: phase for axis, (phase, _) in zip(ROLL_PITCH, found, strict=True)},
-        "phase_margin_error_deg": dict(zip(ROLL_PITCH, spread, strict=True)),
-        "delay_margin_ms": {axis: delay for axis, (_, delay) in zip(ROLL_PITCH, found, strict=True)},
+        "phase_margin_deg": {axis: phase for axis, (phase, _) in zip(names, found, strict=True)},
+        "phase_margin_error_deg": dict(zip(names, spread, strict=True)),
+        "delay_margin_ms": {axis: delay for axis, (_, delay) in zip(names, found, strict=True)},
     }

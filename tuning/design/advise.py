@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
+from mimopilot.tuning.analysis.certify_axes import certify_axes
 from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.design.prediction import Prediction, predict
 from mimopilot.tuning.design.response_design import BANDWIDTHS, ResponseDesign
-from mimopilot.tuning.design.tune_by_design import certificate, tune_by_design
+from mimopilot.tuning.design.tune_by_design import tune_by_design
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
 from mimopilot.tuning.experiment import Experiment, external_signal
@@ -123,6 +124,11 @@ def advise(
         As `tuning.design.tune_by_design.tune_by_design`.
     """
     measured = PlantEstimates(experiment)
+
+    def certified(gains: Gains, outer: ContinuousModel) -> Gains:
+        rate, attitude = ([model.discretise(gains.Ts)] * 2 for model in (inner, outer))
+        return gains.with_certificate(certify_axes(gains, measured, rate, attitude, spec.certificate))
+
     best = tune_by_design([measured], spec)
     assert best.provenance.inner_model is not None and best.provenance.outer_model is not None
     inner, outer = best.provenance.inner_model[0], best.provenance.outer_model[0]
@@ -131,8 +137,7 @@ def advise(
     refused: dict[str, str] = {}
     if experiment.flown is not None:
         flown = replace(experiment.flown, filters=replace(experiment.flown.filters, Ts=experiment.Ts))
-        flown = flown.with_certificate(certificate(flown, measured, spec, inner, outer))
-        found.append(_candidate("flown", flown, outer, bench))
+        found.append(_candidate("flown", certified(flown, outer), outer, bench))
     for one in watch(_alternatives(best, outer.bandwidth, spec)):
         limits = spec.design.model_copy(update={"noise": one.noise})
         start = replace(best, filters=replace(best.filters, derivative_cutoff_hz=one.cutoff_hz))
@@ -141,9 +146,7 @@ def advise(
         except TuningError as error:
             refused[one.name] = str(error)
             continue
-        model = design.model
-        gains = design.gains.with_certificate(certificate(design.gains, measured, spec, inner, model))
-        found.append(_candidate(one.name, gains, model, bench))
+        found.append(_candidate(one.name, certified(design.gains, design.model), design.model, bench))
     return Advice(tuple(found), refused, _slowest_zero(experiment, best.derivative_cutoff_hz))
 
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from mimopilot.tuning.analysis.certify import certify
-from mimopilot.tuning.certificate import Verdict
+from mimopilot.tuning.analysis.certify_axes import certify_axes
+from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.quality_checks import check_saturation
 from mimopilot.tuning.design.stock_profile import check_profile
 from mimopilot.tuning.design.tune_by_design import tune_by_design
 from mimopilot.tuning.design.tune_for_models import tune_for_models
+from mimopilot.tuning.design.yaw_design import tune_yaw, with_yaw
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
 from mimopilot.tuning.experiment import Experiment, external_signal
@@ -70,7 +71,13 @@ def tune(
         return _with_origin(tune_by_design(estimates, spec), flights, doubts)
     if len(flights) > 1:
         raise TuningError(f"{len(flights)} logs: reference models are for one; leave out --inner and --outer")
-    tuned = _certified(_with_origin(tune_for_models(estimates[0], spec, repeat), flights, doubts), estimates[0], spec)
+    tuned = _with_origin(tune_for_models(estimates[0], spec, repeat), flights, doubts)
+    fastest = min(model.bandwidth for model in spec.continuous("outer"))
+    yaw = tune_yaw(estimates, spec, tuned, fastest)
+    tuned, yaw, certificate = with_yaw(tuned, yaw, lambda gains: _certificate(gains, estimates[0], spec))
+    details = {**tuned.provenance.details, "yaw": yaw.details}
+    provenance = replace(tuned.provenance, details=details, warnings=(*tuned.provenance.warnings, *yaw.warnings))
+    tuned = replace(tuned, provenance=provenance).with_certificate(certificate)
     verdict, reason = tuned.verdict()
     if verdict == Verdict.UNSTABLE:
         raise TuningError(
@@ -110,12 +117,10 @@ def _check_one_vehicle(flights: Sequence[Experiment]) -> None:
             raise TuningError(f"{other.source}: u = 1 is another torque than in {first.source}; not the same allocator")
 
 
-def _certified(gains: Gains, measured: PlantEstimates, spec: TuningSpec) -> Gains:
-    """The gains with their certificate."""
+def _certificate(gains: Gains, measured: PlantEstimates, spec: TuningSpec) -> Certificate:
+    """The certificate of a set, for the reference models of a specification."""
     inner, outer = spec.models("inner", gains.Ts), spec.models("outer", gains.Ts)
-    sha256, thresholds = measured.experiment.sha256, spec.certificate
-    found = certify(gains, measured.response, inner, outer, sha256, thresholds, lambda: measured.model)
-    return gains.with_certificate(found)
+    return certify_axes(gains, measured, inner, outer, spec.certificate)
 
 
 def at_rate(gains: Gains, hertz: float) -> Gains:
@@ -131,6 +136,8 @@ def at_rate(gains: Gains, hertz: float) -> Gains:
     if not 0 < hertz < np.inf:
         raise TuningError(f"rate: got {hertz:g} Hz, expected more than 0")
     details = {name: value for name, value in gains.provenance.details.items() if name not in OF_ONE_RATE}
+    if "yaw" in details:
+        details["yaw"] = {name: value for name, value in details["yaw"].items() if name not in OF_ONE_RATE}
     return replace(
         gains,
         filters=replace(gains.filters, Ts=1 / hertz),
@@ -162,4 +169,4 @@ def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | No
             f"{experiment.source}: u = 1 stands for {theirs} N m (roll, pitch), in the gains for {ours}; convert the "
             "gains (mimopilot convert), or certify them with a log of their own allocator"
         )
-    return _certified(gains, PlantEstimates(experiment), spec or TuningSpec())
+    return gains.with_certificate(_certificate(gains, PlantEstimates(experiment), spec or TuningSpec()))

@@ -85,7 +85,7 @@ class Distance:
 
     def _loop(self, loop: LoopGradient) -> tuple[Complex, ProductGradient, Signal]:
         """I + L, its derivative, and the least distance at each frequency."""
-        where, eye = self.where, np.eye(2)
+        where, eye = self.where, np.eye(loop.plant.axes)
         if self.cut is Cut.ATTITUDE:
             S = eye - loop.T[where]
             P = np.linalg.inv(S).astype(np.complex128)
@@ -101,11 +101,12 @@ class Distance:
 
     def margin(self, loop: LoopGradient) -> float:
         """See `Constraint`."""
+        eye = np.eye(loop.plant.axes)
         if self.cut is Cut.ATTITUDE:
-            return float(np.min(1 / singular_values(np.eye(2) - loop.T[self.where])[0]) / self.floor - 1)
+            return float(np.min(1 / singular_values(eye - loop.T[self.where])[0]) / self.floor - 1)
         whole = self.cut is Cut.TORQUE
         L = loop.L_u if whole else loop.L_i
-        distance = singular_values(np.eye(2) + L[self.where])[1] - loop.loop_error(whole)[self.where]
+        distance = singular_values(eye + L[self.where])[1] - loop.loop_error(whole)[self.where]
         return float(np.min(distance) / self.floor - 1)
 
     def add(self, problem: ConicProblem, loop: LoopGradient) -> None:
@@ -116,12 +117,15 @@ class Distance:
         Q = P.conj().transpose(0, 2, 1) @ P
         # d(P^H P_c + P_c^H P) = w r' + (w r')^H, with w = P_c^H left and r the row.
         w, r = dP.left[near] @ P.conj(), dP.right[near]
+        scale = 1 / np.maximum(np.abs(Q).max(axis=(1, 2)), 1.0)
+        if len(loop.plant.body.B) == 1:
+            problem.above(2 * np.real(w[:, :, 0] * r[:, :, 0]) * scale[:, None], (Q[:, 0, 0].real - least**2) * scale)
+            return
         d11, d22 = (2 * np.real(w[:, :, i] * r[:, :, i]) for i in range(2))
         d12 = w[:, :, 0] * r[:, :, 1] + np.conj(w[:, :, 1] * r[:, :, 0])
         slope = np.stack([d11 + d22, d11 - d22, 2 * d12.real, 2 * d12.imag], axis=1)
         a, b, c = Q[:, 0, 0].real, Q[:, 0, 1], Q[:, 1, 1].real
         value = np.stack([a + c - 2 * least**2, a - c, 2 * b.real, 2 * b.imag], axis=1)
-        scale = 1 / np.maximum(np.abs(Q).max(axis=(1, 2)), 1.0)
         problem.cone(slope * scale[:, None, None], value * scale[:, None])
 
 
@@ -131,7 +135,7 @@ class NoiseLimit:
 
     Attributes
     ----------
-    limit : (2,) array
+    limit : (n,) array
         RMS (normalised).
     above : float, rad/s
         Only the noise at higher frequencies counts.
@@ -168,9 +172,9 @@ class GainLimit:
     ----------
     name : str
     omega : (K,) array, rad/s
-    G : (K, 2, 2) array
+    G : (K, n, n) array
         Response from torque to rates.
-    deviation : (K, 2, 2) array
+    deviation : (K, n, n) array
         Standard deviation of its elements.
     limit : float
         Twice the deviation included.
@@ -190,7 +194,7 @@ class GainLimit:
         return controller @ self.G, self.limit - error
 
     def _shapes(self, free: FreeGains) -> dict[str, Complex]:
-        one = np.ones((1, 2))
+        one = np.ones((1, self.G.shape[-1]))
         return {
             name: rate_response({LETTERS[name]: one}, free.base.filters, self.omega)[1]
             for name in free.units
@@ -209,7 +213,7 @@ class GainLimit:
         product, left = self._gain(loop)
         shapes = self._shapes(loop.free)
         U, sizes, V = np.linalg.svd(product)
-        for part in range(2):
+        for part in range(loop.plant.axes):
             slope = np.zeros((len(product), problem.size))
             right = (self.G @ V[:, part].conj()[:, :, None])[:, :, 0]
             for place, (name, row, column) in enumerate(loop.free.places()):
@@ -222,7 +226,7 @@ def gain_above_band(plant: WideResponse) -> GainLimit:
     """Limit of the rate loop above the band, see `tuning.analysis.beyond_band.loop_gain_above`."""
     known = plant.response.at(plant.response.known_run())
     omega = plant.omega[plant.band.stop - 1 :]
-    G = (falling_gain(known)[-1] / omega)[:, None, None] * np.eye(2, dtype=complex)
+    G = (falling_gain(known)[-1] / omega)[:, None, None] * np.eye(plant.axes, dtype=complex)
     return GainLimit("gain above the band", omega, G, np.zeros(G.shape), SHARE * MAX_GAIN_ABOVE_BAND)
 
 
@@ -262,19 +266,22 @@ class Definite:
     Attributes
     ----------
     matrix : str
-    B : (2, 2) array
+    B : (n, n) array
     floor : float
         In the unit of B times the matrix.
+    limits : str
+        What it limits besides its sign, for messages; empty: nothing.
     """
 
     matrix: str
     B: Signal
     floor: float
+    limits: str = ""
 
     @property
     def name(self) -> str:
         """See `Constraint`."""
-        return f"{self.matrix} not negative"
+        return self.limits or f"{self.matrix} not negative"
 
     def _scale(self, loop: LoopGradient) -> float:
         return float(np.abs(self.B).max()) * loop.free.units[self.matrix]
@@ -286,19 +293,26 @@ class Definite:
 
     def add(self, problem: ConicProblem, loop: LoopGradient) -> None:
         """See `Constraint`."""
-        scale, slope = self._scale(loop), np.zeros((3, problem.size))
+        scale, n = self._scale(loop), len(self.B)
+        slope = np.zeros((1 if n == 1 else 3, problem.size))
 
         def parts(product: Signal) -> Signal:
+            if n == 1:
+                return np.array([2 * product[0, 0]])
             (a, b), (c, d) = product
             return np.array([a + d, a - d, b + c])
 
         for place, (name, row, column) in enumerate(loop.free.places()):
             if name == self.matrix:
-                product = np.zeros((2, 2))
+                product = np.zeros((n, n))
                 product[:, column] = self.B[:, row] * loop.free.units[name] / scale
                 slope[:, place] = parts(product)
-        value = parts(self.B @ loop.matrices[self.matrix] / scale) - np.array([2 * self.floor / scale, 0.0, 0.0])
-        problem.cone(slope[None], value[None])
+        value = parts(self.B @ loop.matrices[self.matrix] / scale)
+        value[0] -= 2 * self.floor / scale
+        if n == 1:
+            problem.above(slope, value)
+        else:
+            problem.cone(slope[None], value[None])
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,8 +355,8 @@ class MotorLimit:
     ----------
     torque : (T, K) array
         Weights that give the torque at T times of a doublet of that size from its response U, real part.
-    mixer : (m, 2) array
-        Change of each motor's command for u = 1 on roll and on pitch.
+    mixer : (m, n) array
+        Change of each motor's command for u = 1 on each axis.
     room : (m, 2) array
         How far each command may fall and rise from hover.
     """
@@ -353,9 +367,10 @@ class MotorLimit:
     name: str = "range of the motors"
 
     def _used(self, responses: Complex) -> Signal:
-        """Used share of each command's range, (..., T, axes, m), from U or its derivatives (..., K, 2, 2)."""
-        flat = responses.reshape(*responses.shape[:-2], 4)
-        torque = np.real(self.torque @ flat).reshape(*responses.shape[:-3], len(self.torque), 2, 2)
+        """Used share of each command's range, (..., T, axes, m), from U or its derivatives (..., K, n, n)."""
+        n = responses.shape[-1]
+        flat = responses.reshape(*responses.shape[:-2], n * n)
+        torque = np.real(self.torque @ flat).reshape(*responses.shape[:-3], len(self.torque), n, n)
         return np.swapaxes(torque, -1, -2) @ self.mixer.T
 
     def margin(self, loop: LoopGradient) -> float:

@@ -138,11 +138,12 @@ class DesignTask:
 
 def _errors(loop: LoopGradient, task: Manoeuvres, derivative: bool = False) -> Iterator[tuple[Complex, Complex]]:
     """Weighted errors whose squared sum is the cost, (m,), and their derivatives (n, m): following, disturbance."""
-    own_and_other = np.array([[1.0, OTHER_AXIS], [OTHER_AXIS, 1.0]])
+    eye = np.eye(loop.plant.axes)
+    own_and_other = np.where(eye, 1.0, OTHER_AXIS)
     following = np.sqrt(task.following)[:, None, None] * own_and_other
     disturbance = np.sqrt(task.disturbance)[:, None, :]
     none, count = np.empty((0, 0), complex), len(loop.vector)
-    error = loop.T - task.target[:, None, None] * np.eye(2)
+    error = loop.T - task.target[:, None, None] * eye
     yield (following * error).ravel(), (following * loop.dT.whole()).reshape(count, -1) if derivative else none
     yield (disturbance * loop.D).ravel(), (disturbance * loop.dD.whole()).reshape(count, -1) if derivative else none
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mimopilot.tuning.axes import Law
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, TERMS
 from mimopilot.tuning.parameter_row import Shape
@@ -32,15 +33,15 @@ class FreeGains:
 
     Attributes
     ----------
-    base : Gains
-        Everything else. Matrices that are neither free nor in the structure are zero.
+    base : Law
+        Everything else, without a certificate. Matrices that are neither free nor in the structure are zero.
     units : mapping
         Name of a free matrix -> size of 1 in the vector, in the order of the vector.
-    where : (2, 2) bool array
+    where : (n, n) bool array
         Elements that may change: all, or the diagonal (SISO).
     """
 
-    base: Gains
+    base: Law
     units: Mapping[str, float]
     where: NDArray[np.bool_]
 
@@ -55,25 +56,27 @@ class FreeGains:
             for row, column in np.argwhere(self.where):
                 yield name, int(row), int(column)
 
-    def vector(self, gains: Gains) -> Signal:
+    def vector(self, gains: Law) -> Signal:
         """The free elements of a set."""
         return np.concatenate([getattr(gains, name)[self.where] / unit for name, unit in self.units.items()])
 
-    def gains(self, vector: Signal) -> Gains:
+    def gains(self, vector: Signal) -> Law:
         """The set with these free elements."""
-        parts = dict.fromkeys(self.units, np.zeros((2, 2)))
+        parts: dict[str, Signal] = {}
         for name, values in zip(self.units, np.split(vector * self.size, len(self.units)), strict=True):
-            matrix = np.zeros((2, 2))
+            matrix = np.zeros(self.where.shape)
             matrix[self.where] = values
             parts[name] = matrix
-        return replace(self.base, certificate=None, **parts)  # type: ignore[arg-type]
+        return replace(self.base, **parts)  # type: ignore[arg-type]
 
     def coupling(self, B: Signal) -> Signal:
-        """Coupling that the gains add through a plant, as a matrix (2 m, n) to multiply the vector with.
+        """Coupling that gains of roll and pitch add through a plant, as a matrix (2 m, n) to multiply the vector with.
 
         The off-diagonal elements of B times each rate gain, and of the attitude gain, in units of the diagonal: zero
         when the gains decouple the rigid body.
         """
+        if len(B) == 1:
+            return np.zeros((0, len(self.size)))
         found = np.zeros((2 * len(self.units), len(self.size)))
         names = list(self.units)
         for place, (name, row, column) in enumerate(self.places()):
@@ -82,13 +85,13 @@ class FreeGains:
         return found
 
 
-def free_gains(base: Gains, body: RigidBody, structure: str = "".join(LOOP_TERMS), full: bool = True) -> FreeGains:
+def free_gains(base: Law, body: RigidBody, structure: str = "".join(LOOP_TERMS), full: bool = True) -> FreeGains:
     """The attitude gain, the terms of a structure and, where `base` follows a model, its feed-forward.
 
     Parameters
     ----------
-    base : Gains
-        Filters, attitude model, limits and yaw.
+    base : Law
+        Filters, attitude model, and what else is not tuned.
     body : RigidBody
         Its control effectiveness gives the units.
     structure : str
@@ -103,6 +106,7 @@ def free_gains(base: Gains, body: RigidBody, structure: str = "".join(LOOP_TERMS
     units |= {TERMS[letter].matrix: proportional * ratio[letter] for letter in structure}
     if base.filters.followed is not None:
         units |= {ATTITUDE_FEEDFORWARD.matrix: 1.0, ACCELERATION.matrix: acceleration}
-    zero = {row.key: np.zeros((2, 2)) for row in rows(Shape.MATRIX) if row.key not in units}
-    where = np.ones((2, 2), bool) if full else np.eye(2, dtype=bool)
-    return FreeGains(replace(base, certificate=None, **zero), units, where)  # type: ignore[arg-type]
+    zero = {row.key: np.zeros(body.B.shape) for row in rows(Shape.MATRIX) if row.key not in units}
+    where = np.ones(body.B.shape, bool) if full else np.eye(len(body.B), dtype=bool)
+    uncertified = base.with_certificate(None) if isinstance(base, Gains) else base
+    return FreeGains(replace(uncertified, **zero), units, where)  # type: ignore[arg-type]

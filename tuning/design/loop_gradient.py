@@ -81,8 +81,8 @@ class LoopGradient:
 
     @cached_property
     def _shapes(self) -> Mapping[str, tuple[Complex, Complex]]:
-        """Rate controller's matrix -> responses (K, 1, 2) of its columns from the rate setpoint and rate to u."""
-        one, shape = np.ones((1, 2)), (len(self.plant.omega), 1, 2)
+        """Rate controller's matrix -> responses (K, 1, n) of its columns from the rate setpoint and rate to u."""
+        one, shape = np.ones((1, self.plant.axes)), (len(self.plant.omega), 1, self.plant.axes)
         found = {
             name: rate_response({LETTERS[name]: one}, self.free.base.filters, self.plant.omega)
             for name in self.free.units
@@ -92,19 +92,19 @@ class LoopGradient:
 
     @cached_property
     def C_r(self) -> Complex:  # noqa: N802
-        """From the rate setpoint to u, (K, 2, 2)."""
+        """From the rate setpoint to u, (K, n, n)."""
         tuned = np.asarray(sum(of_r * self.matrices[name] for name, (of_r, _) in self._shapes.items()), complex)
-        fixed = fixed_matrices(self.free.base.filters, 2)
+        fixed = fixed_matrices(self.free.base.filters, self.plant.axes)
         return tuned + rate_response(fixed, self.free.base.filters, self.plant.omega)[0] if fixed else tuned
 
     @cached_property
     def C_y(self) -> Complex:  # noqa: N802
-        """From the measured rates to -u, (K, 2, 2)."""
+        """From the measured rates to -u, (K, n, n)."""
         return np.asarray(sum(of_y * self.matrices[name] for name, (_, of_y) in self._shapes.items()), complex)
 
     @cached_property
     def C_o(self) -> Complex:  # noqa: N802
-        """From the measured angles to -u, (K, 2, 2)."""
+        """From the measured angles to -u, (K, n, n)."""
         return self.C_r @ self.matrices[ATTITUDE.matrix] * self._delay
 
     @cached_property
@@ -114,18 +114,18 @@ class LoopGradient:
 
     @cached_property
     def L_i(self) -> Complex:  # noqa: N802
-        """The rate loop cut at u, (K, 2, 2)."""
+        """The rate loop cut at u, (K, n, n)."""
         return self.C_y @ self.plant.G_i
 
     @cached_property
     def L_u(self) -> Complex:  # noqa: N802
-        """The whole loop cut at u, (K, 2, 2)."""
+        """The whole loop cut at u, (K, n, n)."""
         return self.L_i + self.C_o @ self.plant.G_o
 
     @cached_property
     def S(self) -> Complex:  # noqa: N802
-        """Sensitivity at u, (K, 2, 2)."""
-        return np.linalg.inv(np.eye(2) + self.L_u).astype(np.complex128)
+        """Sensitivity at u, (K, n, n)."""
+        return np.linalg.inv(np.eye(self.plant.axes) + self.L_u).astype(np.complex128)
 
     @cached_property
     def _model(self) -> tuple[Complex, Complex, Complex]:
@@ -134,7 +134,7 @@ class LoopGradient:
 
     @cached_property
     def _rate_setpoint(self) -> Complex:
-        """From the attitude setpoint to the rate setpoint, without the measured angles, (K, 2, 2)."""
+        """From the attitude setpoint to the rate setpoint, without the measured angles, (K, n, n)."""
         angle, rate, _ = self._model
         found: Complex = self.matrices[ATTITUDE.matrix] * angle * self._delay
         return found + self.matrices[ATTITUDE_FEEDFORWARD.matrix] * rate if self._follows else found
@@ -145,30 +145,30 @@ class LoopGradient:
 
     @cached_property
     def C_ref(self) -> Complex:  # noqa: N802
-        """From the attitude setpoint to u, loops open, (K, 2, 2)."""
+        """From the attitude setpoint to u, loops open, (K, n, n)."""
         found: Complex = self.C_r @ self._rate_setpoint
         return found + self.matrices[ACCELERATION.matrix] * self._model[2] if self._follows else found
 
     @cached_property
     def U(self) -> Complex:  # noqa: N802
-        """From the attitude setpoint to u, (K, 2, 2)."""
+        """From the attitude setpoint to u, (K, n, n)."""
         return self.S @ self.C_ref
 
     @cached_property
     def T(self) -> Complex:  # noqa: N802
-        """From the attitude setpoint to the attitude, (K, 2, 2)."""
+        """From the attitude setpoint to the attitude, (K, n, n)."""
         return self.plant.G_o @ self.U
 
     @cached_property
     def D(self) -> Complex:  # noqa: N802
-        """From a torque disturbance to the attitude, (K, 2, 2)."""
+        """From a torque disturbance to the attitude, (K, n, n)."""
         return self.plant.G_o @ self.S
 
     @cached_property
     def noise(self) -> Complex:
-        """Square root of the spectrum of u that noise causes, (K, 2, 4)."""
-        N = self.plant.noise
-        return self.S @ (self.C_y @ N[:, :2] + self.C_o @ N[:, 2:])
+        """Square root of the spectrum of u that noise causes, (K, n, 2n)."""
+        of_rates, of_angles = np.split(self.plant.noise, 2, axis=1)
+        return self.S @ (self.C_y @ of_rates + self.C_o @ of_angles)
 
     def noise_rms(self, above: float = 0.0) -> Signal:
         """RMS of u at hover (normalised) that noise causes at frequencies above one (rad/s), (2,)."""
@@ -187,11 +187,12 @@ class LoopGradient:
     @cached_property
     def _rows(self) -> Mapping[str, Complex]:
         """alpha, beta, gamma, xi of the module's equations and beta of the rate loop alone, (K, n, ...) each."""
-        count, eye, N = len(self.plant.omega), np.eye(2), self.plant.noise
-        Kp_o, delay = self.matrices[ATTITUDE.matrix] * self._delay, self._delay[:, 0]
-        angle, noise_o = Kp_o @ self.plant.G_o, Kp_o @ N[:, 2:]
+        count, n, N = len(self.plant.omega), self.plant.axes, self.plant.noise
+        eye, delay = np.eye(n), self._delay[:, 0]
+        Kp_o = self.matrices[ATTITUDE.matrix] * self._delay
+        angle, noise_o = Kp_o @ self.plant.G_o, Kp_o @ N[:, n:]
         model_angle, model_rate, model_acceleration = (part[:, 0] for part in self._model)
-        none, noiseless = np.zeros(2), np.zeros(4)
+        none, noiseless = np.zeros(n), np.zeros(2 * n)
         parts: dict[str, list[Complex]] = {name: [] for name in ("alpha", "beta", "gamma", "xi", "beta_i")}
 
         def add(**rows: NDArray[np.generic]) -> None:
@@ -204,7 +205,7 @@ class LoopGradient:
                     alpha=self.C_r[:, :, row],
                     beta=self.plant.G_o[:, column] * delay,
                     gamma=model_angle * eye[column] * delay,
-                    xi=N[:, 2 + column] * delay,
+                    xi=N[:, n + column] * delay,
                     beta_i=none,
                 )
             elif name in LETTERS:

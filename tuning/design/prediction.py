@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mimopilot.tuning.analysis.closed_loop import singular_values
-from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, PERIODS, Manoeuvres, manoeuvres
+from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, Manoeuvres, manoeuvres
+from mimopilot.tuning.axes import Law
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
-from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import DesignLimits
@@ -30,78 +30,80 @@ DRAWS = 12
 #: Share of a limit within which a design keeps it.
 ROUNDING = 0.01
 
-Pair = tuple[float, float]
+#: One number for each axis.
+ByAxis = tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Figures of a gain set, predicted from the measured response. Pairs are for roll and pitch.
+    """Figures of a gain set, predicted from the measured response; one number for each axis.
 
     Attributes
     ----------
-    follow_deg, offaxis_deg : tuple of 2 float, deg
-        RMS over the doublets of 10 degrees and 1 s after: error to the attitude model; angle of the other axis.
-    disturbance_deg : tuple of 2 float, deg
-        RMS of the angles over 1 s after a step of torque that accelerates by 1.5 rad/s^2.
-    noise : tuple of 2 float
+    follow_deg, offaxis_deg : tuple of n float, deg
+        RMS over the doublets of 10 degrees and 1 s after: error to the attitude model; angles of the other axes.
+    disturbance_deg : tuple of n float, deg
+        RMS of the angles over 1 s after the step of torque: 1.5 rad/s^2, on yaw 0.5 rad/s^2.
+    noise : tuple of n float
         RMS of the torque (normalised) at hover that the log's noise causes.
-    fast_noise : tuple of 2 float
+    fast_noise : tuple of n float
         Its part above 30 rad/s, from sensors and vibration: gusts cause the rest.
     Ms : float
         Largest singular value of the sensitivity, cut at the torques.
     """
 
-    follow_deg: Pair
-    offaxis_deg: Pair
-    disturbance_deg: Pair
-    noise: Pair
-    fast_noise: Pair
+    follow_deg: ByAxis
+    offaxis_deg: ByAxis
+    disturbance_deg: ByAxis
+    noise: ByAxis
+    fast_noise: ByAxis
     Ms: float
 
 
-def predict(gains: Gains, plant: WideResponse, task: Manoeuvres) -> Prediction:
+def predict(gains: Law, plant: WideResponse, task: Manoeuvres) -> Prediction:
     """Figures of a gain set around a plant.
 
     Parameters
     ----------
-    gains : Gains
+    gains : Law
     plant : WideResponse
     task : Manoeuvres
         On the plant's frequencies.
     """
     free = free_gains(gains, plant.body)
     loop = LoopGradient(plant, free, free.vector(gains))
-    follow = [_rms(np.abs(loop.T[:, i, i] - task.target) ** 2, task) for i in range(2)]
-    offaxis = [_rms(np.abs(loop.T[:, 1 - i, i]) ** 2, task) for i in range(2)]
+    power, eye = np.abs(loop.T) ** 2, np.eye(plant.axes, dtype=bool)
+    follow = [_rms(np.abs(loop.T[:, i, i] - task.target) ** 2, task) for i in range(plant.axes)]
+    offaxis = [_rms(power[:, ~eye[i], i].sum(axis=1), task) for i in range(plant.axes)]
     noise, fast = loop.noise_rms(), loop.noise_rms(FAST)
     disturbance = np.degrees(np.sqrt(np.einsum("ki,kji->i", task.step, np.abs(loop.D) ** 2) / TAIL))
     return Prediction(
-        follow_deg=(follow[0], follow[1]),
-        offaxis_deg=(offaxis[0], offaxis[1]),
-        disturbance_deg=(float(disturbance[0]), float(disturbance[1])),
-        noise=(float(noise[0]), float(noise[1])),
-        fast_noise=(float(fast[0]), float(fast[1])),
+        follow_deg=tuple(follow),
+        offaxis_deg=tuple(offaxis),
+        disturbance_deg=tuple(disturbance.tolist()),
+        noise=tuple(noise.tolist()),
+        fast_noise=tuple(fast.tolist()),
         Ms=_peak(loop),
     )
 
 
-def sensitivity_peak(gains: Gains, plant: WideResponse) -> float:
+def sensitivity_peak(gains: Law, plant: WideResponse) -> float:
     """Ms of a set: largest singular value of the sensitivity, cut at the torques."""
     free = free_gains(gains, plant.body)
     return _peak(LoopGradient(plant, free, free.vector(gains)))
 
 
 def _peak(loop: LoopGradient) -> float:
-    return float(1 / singular_values(np.eye(2) + loop.L_u[: loop.plant.band.stop])[1].min())
+    return float(1 / singular_values(np.eye(loop.plant.axes) + loop.L_u[: loop.plant.band.stop])[1].min())
 
 
 def _rms(power: np.ndarray, task: Manoeuvres) -> float:  # type: ignore[type-arg]
     """RMS over all doublets, deg, of a response whose squared size is `power`."""
     energy = task.doublets @ power
-    return float(np.degrees(AMPLITUDE) * np.sqrt(np.mean(energy / (np.array(PERIODS) + TAIL))))
+    return float(np.degrees(AMPLITUDE) * np.sqrt(np.mean(energy / (np.array(task.family.periods) + TAIL))))
 
 
-def bandwidth(gains: Gains, plant: WideResponse, candidates: Sequence[float], damping: float) -> float:
+def bandwidth(gains: Law, plant: WideResponse, candidates: Sequence[float], damping: float) -> float:
     """Bandwidth (rad/s) of the attitude model that a set follows best, of some candidates."""
     free = free_gains(gains, plant.body)
     T = LoopGradient(plant, free, free.vector(gains)).T
@@ -109,17 +111,17 @@ def bandwidth(gains: Gains, plant: WideResponse, candidates: Sequence[float], da
 
     def error(omega: float) -> float:
         asked = replace(task, model=second_order(omega, damping, 0, plant.Ts))
-        return float(asked.following @ sum(np.abs(T[:, i, i] - asked.target) ** 2 for i in range(2)))
+        return float(asked.following @ sum(np.abs(T[:, i, i] - asked.target) ** 2 for i in range(plant.axes)))
 
     return min(candidates, key=error)
 
 
-def offaxis_doubt(new: Gains, flown: Gains, plant: WideResponse, task: Manoeuvres) -> float:
+def offaxis_doubt(new: Law, flown: Law, plant: WideResponse, task: Manoeuvres) -> float:
     """Standard deviation (deg) of the difference of both sets' off-axis motion, from the error of the response."""
     generator, found = np.random.default_rng(0), []
     for _ in range(DRAWS):
         drawn = plant.draw(generator)
-        ours, theirs = (np.hypot(*predict(gains, drawn, task).offaxis_deg) for gains in (new, flown))
+        ours, theirs = (np.linalg.norm(predict(gains, drawn, task).offaxis_deg) for gains in (new, flown))
         found.append(ours - theirs)
     return float(np.std(found))
 
@@ -148,10 +150,10 @@ def reasons_to_keep(
     if slower < SLOWEST and all(one.Ms <= Ms for one in flown):
         reasons.append(f"its attitude is slower: {slower:.0%} of the flown bandwidth")
     for ours, theirs, doubt in zip(new, flown, doubts or [0.0] * len(new), strict=True):
-        follow, before = np.hypot(*ours.follow_deg), np.hypot(*theirs.follow_deg)
+        follow, before = (float(np.linalg.norm(one.follow_deg)) for one in (ours, theirs))
         if follow >= before:
             reasons.append(f"it follows its attitude model no better ({follow:.2f} degrees, flown {before:.2f})")
-        offaxis, before = np.hypot(*ours.offaxis_deg), np.hypot(*theirs.offaxis_deg)
+        offaxis, before = (float(np.linalg.norm(one.offaxis_deg)) for one in (ours, theirs))
         if offaxis > max(before, DECOUPLED):
             reasons.append(f"it moves the other axis more ({offaxis:.2f} degrees, flown {before:.2f})")
         elif offaxis > DECOUPLED and offaxis + doubt > before:

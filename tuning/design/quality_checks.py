@@ -11,12 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mimopilot.tuning.axes import axis_names
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import Stretches
 from mimopilot.tuning.estimation.regression import Solution
 from mimopilot.tuning.estimation.vrft import LoopEstimate
 from mimopilot.tuning.experiment import Experiment
-from mimopilot.tuning.parameter_row import ROLL_PITCH
+from mimopilot.tuning.parameter_row import AXES, ROLL_PITCH
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 
 #: Share of a regressor's power that the excitation explains: below the first the log is refused, below the second
@@ -152,9 +153,10 @@ def check_saturation(experiment: Experiment) -> list[str]:
     if experiment.flown is None:
         return []
     warnings = []
-    limit = np.array(experiment.flown.limits.moment_max[:2])
+    names = axis_names(experiment.u.shape[1])
+    limit = np.array([experiment.flown.limits.moment_max[AXES.index(name)] for name in names])
     used = np.vstack([experiment.u[start:stop] for start, stop in experiment.segments])
-    for name, share in zip(ROLL_PITCH, (np.abs(used) >= AT_LIMIT * limit).mean(axis=0), strict=True):
+    for name, share in zip(names, (np.abs(used) >= AT_LIMIT * limit).mean(axis=0), strict=True):
         text = f"the {name} torque is at its limit for {share:.0%} of the flight"
         if share > OFTEN_SATURATED:
             raise TuningError(

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.beyond_band import MAX_SENSITIVITY_BELOW_BAND, exceeded_frequencies
 from mimopilot.tuning.analysis.closed_loop import model_spectral_radius
-from mimopilot.tuning.analysis.manoeuvres import doublet_torque, manoeuvres
+from mimopilot.tuning.analysis.manoeuvres import doublet_torque, family_of, manoeuvres
+from mimopilot.tuning.axes import Law, flown_law
 from mimopilot.tuning.design.constraints import (
     SHARE,
     Constraint,
@@ -35,7 +36,7 @@ from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.design.positive_integral import MIN_INTEGRAL_RATIO
 from mimopilot.tuning.design.prediction import FAST, SLOWEST, bandwidth, sensitivity_peak
 from mimopilot.tuning.experiment import Experiment, manoeuvre_size
-from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains import Gains, Limits
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS
 from mimopilot.tuning.motors import Motors
 from mimopilot.tuning.plant.noise_spectrum import flown_torque_noise
@@ -57,8 +58,6 @@ DAMPING = 0.7
 #: A descent during the search ends with a step that lowers the merit by less than this share, the last one sooner than
 #: that.
 ROUGHLY, EXACTLY = 2e-2, 1e-4
-#: Range of the manoeuvres' size, rad (5 to 30 degrees): what moved in the flight, within a normal flight's attitudes.
-AMPLITUDES = (np.radians(5.0), np.radians(30.0))
 #: Motors of a log that does not hold their commands: a quadrotor, X, that hovers at half thrust.
 USUAL_MOTORS = Motors(np.array([[-0.5, 0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, -0.5]]), np.full(4, 0.5))
 #: Share of a motor's range that the rotors' torque may use in the doublets, and the peak of its command. In PX4's
@@ -87,8 +86,8 @@ class Design:
 
     Attributes
     ----------
-    gains : Gains
-        Without a certificate.
+    law : Law
+        Of its axes, without a certificate.
     model : SecondOrder
         The attitude model that they follow.
     cost : float
@@ -101,13 +100,19 @@ class Design:
         What was solved, and its solution.
     """
 
-    gains: Gains
+    law: Law
     model: SecondOrder
     cost: float
     violation: float
     active: list[str]
     task: DesignTask
     vector: Signal
+
+    @property
+    def gains(self) -> Gains:
+        """The set that was designed for roll and pitch."""
+        assert isinstance(self.law, Gains)
+        return self.law
 
     @property
     def feasible(self) -> bool:
@@ -125,7 +130,7 @@ class ResponseDesign:
         One for each log.
     experiments : sequence of Experiment
     limits : DesignLimits
-    noise : sequence of (2, 2) array
+    noise : sequence of (2, n) array
         RMS of the torque at hover under the flown gains, for each log: all of it, and its part above `FAST`.
     limited : sequence of (K,) bool array
         Frequencies of each measured response at which the rate loop's gain is limited, whatever the fitted body says.
@@ -133,6 +138,8 @@ class ResponseDesign:
         Of the attitude model that the flown gains follow best, the fastest of all logs. None: not known.
     slowest : float, rad/s
         Least bandwidth of a design: the flown one, if the flown gains keep the limit of Ms.
+    bandwidths : tuple of float, rad/s
+        Those that the attitude model may have, in rising order.
     """
 
     plants: Sequence[WideResponse]
@@ -142,9 +149,12 @@ class ResponseDesign:
     limited: Sequence[NDArray[np.bool_]]
     flown_bandwidth: float | None = None
     slowest: float = BANDWIDTHS[0]
+    bandwidths: tuple[float, ...] = BANDWIDTHS
 
     @classmethod
-    def of(cls, measured: Sequence[PlantEstimates], limits: DesignLimits) -> ResponseDesign:
+    def of(
+        cls, measured: Sequence[PlantEstimates], limits: DesignLimits, bandwidths: tuple[float, ...] = BANDWIDTHS
+    ) -> ResponseDesign:
         """Designs on the responses measured in one or more flights.
 
         Raises
@@ -152,25 +162,30 @@ class ResponseDesign:
         TuningError
             When a response is known at too few frequencies.
         """
-        return cls.around([wide_response(one) for one in measured], [one.experiment for one in measured], limits)
+        plants, flights = [wide_response(one) for one in measured], [one.experiment for one in measured]
+        return cls.around(plants, flights, limits, bandwidths)
 
     @classmethod
     def around(
-        cls, plants: Sequence[WideResponse], experiments: Sequence[Experiment], limits: DesignLimits
+        cls,
+        plants: Sequence[WideResponse],
+        experiments: Sequence[Experiment],
+        limits: DesignLimits,
+        bandwidths: tuple[float, ...] = BANDWIDTHS,
     ) -> ResponseDesign:
         """Designs on given responses; of the experiments only the flown gains, motors and attitudes are used."""
         noise = [flown_noise(one, plant) for one, plant in zip(experiments, plants, strict=True)]
         limited = [np.zeros(len(one.response.omega), bool) for one in plants]
-        flown = [one.flown for one in experiments]
-        if not all(flown):
-            return cls(plants, experiments, limits, noise, limited)
+        flown = [flown_law(one) for one in experiments]
         pairs = [(one, plant) for one, plant in zip(flown, plants, strict=True) if one is not None]
-        fastest = max(bandwidth(one, plant, BANDWIDTHS, DAMPING) for one, plant in pairs)
+        if len(pairs) < len(plants):
+            return cls(plants, experiments, limits, noise, limited, None, bandwidths[0], bandwidths)
+        fastest = max(bandwidth(one, plant, bandwidths, DAMPING) for one, plant in pairs)
         safe = all(sensitivity_peak(one, plant) <= limits.Ms for one, plant in pairs)
-        slowest = SLOWEST * fastest if safe else BANDWIDTHS[0]
-        return cls(plants, experiments, limits, noise, limited, fastest, slowest)
+        slowest = SLOWEST * fastest if safe else bandwidths[0]
+        return cls(plants, experiments, limits, noise, limited, fastest, slowest, bandwidths)
 
-    def tighter(self, gains: Gains) -> ResponseDesign:
+    def tighter(self, gains: Law) -> ResponseDesign:
         """The design after gains that lacked a certificate.
 
         The rate loop is limited where its gain may have exceeded the certificate's limit; if it did so nowhere, the
@@ -183,7 +198,7 @@ class ResponseDesign:
 
     def design(
         self,
-        starts: Sequence[Gains],
+        starts: Sequence[Law],
         structure: str,
         full: bool,
         bandwidth: float | None = None,
@@ -192,8 +207,8 @@ class ResponseDesign:
 
         Parameters
         ----------
-        starts : sequence of Gains
-            Where the search begins; the first gives filters, limits and yaw. If it follows a model, the model's
+        starts : sequence of Law
+            Where the search begins; the first gives what is not tuned. If it follows a model, the model's
             bandwidth is that of the design.
         structure : str
             Letters of `tuning.law.LOOP_TERMS`.
@@ -203,7 +218,8 @@ class ResponseDesign:
             Of the attitude model; by default it is found.
         """
         free = free_gains(starts[0], self.plants[0].body, structure, full)
-        first = self.flown_bandwidth or FIRST_BANDWIDTH
+        wanted = self.flown_bandwidth or FIRST_BANDWIDTH
+        first = min(self.bandwidths, key=lambda one: abs(one - wanted))
         task = self.task(free, starts, first if bandwidth is None else bandwidth)
         stable = [start for start in starts if self.is_stable(start)]
         ends = [descend(task, _scaled(task, start), ROUGHLY) for start in stable or starts]
@@ -212,7 +228,7 @@ class ResponseDesign:
             bandwidth, task, vector = self._best_bandwidth(task, vector, first)
         vector = descend(task, vector, EXACTLY)
         return Design(
-            gains=task.free.gains(vector),
+            law=task.free.gains(vector),
             model=SecondOrder(bandwidth, DAMPING),
             cost=task.cost(vector),
             violation=task.violation(vector),
@@ -221,21 +237,21 @@ class ResponseDesign:
             vector=vector,
         )
 
-    def is_stable(self, gains: Gains) -> bool:
+    def is_stable(self, gains: Law) -> bool:
         """Whether the loop around every fitted rigid body is stable: a descent keeps what it starts with."""
         return all(model_spectral_radius(gains, plant.body.model(plant.Ts)) < 1 for plant in self.plants)
 
     def _best_bandwidth(self, task: DesignTask, vector: Signal, begin: float) -> tuple[float, DesignTask, Signal]:
         """The largest bandwidth of nearly the least merit: along the table from the first one."""
-        first = BANDWIDTHS.index(begin)
+        first, table = self.bandwidths.index(begin), self.bandwidths
         found = {first: (task.merit(vector), task, vector)}
 
         def merit(place: int) -> float:
-            if not 0 <= place < len(BANDWIDTHS) or BANDWIDTHS[place] < self.slowest:
+            if not 0 <= place < len(table) or table[place] < self.slowest:
                 return np.inf
             if place not in found:
                 nearest = min(found, key=lambda known: abs(known - place))
-                moved = _with_bandwidth(task, BANDWIDTHS[place])
+                moved = _with_bandwidth(task, table[place])
                 end = descend(moved, found[nearest][2], ROUGHLY)
                 found[place] = moved.merit(end), moved, end
             return found[place][0]
@@ -247,10 +263,10 @@ class ResponseDesign:
         enough = max(GOOD, NEARLY_BEST * merit(best))
         while merit(best + 1) <= enough:
             best += 1
-        return BANDWIDTHS[best], *found[best][1:]
+        return table[best], *found[best][1:]
 
     def deviations(self, design: Design) -> dict[str, Signal]:
-        """Matrix -> (2, 2) standard deviations in its unit: the spread to expect if the flight were repeated.
+        """Matrix -> (n, n) standard deviations in its unit: the spread to expect if the flight were repeated.
 
         Of the steps that plants drawn from the errors of the response ask for.
         """
@@ -258,7 +274,7 @@ class ResponseDesign:
         generator = np.random.default_rng(0)
         around = task.step(vector, LARGEST_RADIUS)
         steps = [self._drawn(task, generator).step(vector, LARGEST_RADIUS) - around for _ in range(DRAWS)]
-        found = {name: np.zeros((2, 2)) for name in task.free.units}
+        found = {name: np.zeros(task.free.where.shape) for name in task.free.units}
         spread = np.sqrt(np.mean(np.square(steps), axis=0)) * task.free.size
         for (name, row, column), value in zip(task.free.places(), spread, strict=True):
             found[name][row, column] = value
@@ -277,7 +293,7 @@ class ResponseDesign:
             plants.append(replace(one, plant=plant, constraints=limits))
         return replace(task, plants=plants)
 
-    def task(self, free: FreeGains, starts: Sequence[Gains], bandwidth: float) -> DesignTask:
+    def task(self, free: FreeGains, starts: Sequence[Law], bandwidth: float) -> DesignTask:
         """Cost and constraints around every plant."""
         model = SecondOrder(bandwidth, DAMPING).discretise(free.base.Ts)
         return DesignTask(
@@ -288,9 +304,9 @@ class ResponseDesign:
             ],
         )
 
-    def _constraints(self, free: FreeGains, starts: Sequence[Gains], place: int) -> list[Constraint]:
+    def _constraints(self, free: FreeGains, starts: Sequence[Law], place: int) -> list[Constraint]:
         """The constraints around one of the plants."""
-        plant, experiment, noise = self.plants[place], self.experiments[place], self.noise[place]
+        plant, noise = self.plants[place], self.noise[place]
         B, floor = plant.body.B, 1 / self.limits.Ms
         proportional = max(float(plant.body.least(start.Kp_i)) for start in starts)
         begin = slice(plant.band.start, plant.band.start + 1)
@@ -303,53 +319,68 @@ class ResponseDesign:
             ),
             gain_above_band(plant),
             structural_modes(plant, self.limited[place]),
-            Definite(ATTITUDE.matrix, np.eye(2), 0.0),
+            Definite(ATTITUDE.matrix, np.eye(plant.axes), 0.0),
         ]
         if TERMS["I"].matrix in free.units:
             found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
         if TERMS["D"].matrix in free.units:
-            found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(2))]
+            found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(plant.axes))]
         largest = free.base.filters.law.largest or {}
-        found += [ParameterRange(name, np.array(largest[name][:2])) for name in free.units if name in largest]
-        motors = experiment.motors or USUAL_MOTORS
+        axes = slice(2, 3) if plant.axes == 1 else slice(0, plant.axes)
+        found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
+        return found + self._actuators(place)
+
+    def _actuators(self, place: int) -> list[Constraint]:
+        """Limits of the motors in the manoeuvres of the flown size; for yaw those of its torque and its rate."""
+        plant, experiment = self.plants[place], self.experiments[place]
+        size, flown, found = flown_amplitude(experiment), flown_law(experiment), list[Constraint]()
+        if plant.axes == 1:
+            limits = experiment.flown.limits if experiment.flown else Limits()
+            mixer, room, name = np.ones((1, 1)), np.full((1, 2), limits.moment_max[2]), "range of the yaw torque"
+            fastest = limits.rate_max[2] / (2 * size)  # a doublet's setpoint jumps by twice its size
+            found.append(Definite(ATTITUDE.matrix, -np.eye(1), -fastest, "limit of the yaw rate"))
+        else:
+            motors = experiment.motors or USUAL_MOTORS
+            mixer, room = motors.mixer, np.column_stack([motors.hover, 1 - motors.hover])
+            name = "range of the motors"
+        loop = None if flown is None else _loop_of(flown, plant)
         # The rotors' torque stays within the range. Their command may exceed it for less than their lag.
-        room, size = np.column_stack([motors.hover, 1 - motors.hover]), flown_amplitude(experiment)
-        flown = None if experiment.flown is None else _loop_of(experiment.flown, plant)
         for share, lag in ((RANGE, plant.shape[1]), (PEAK, 0.0)):
-            limit = MotorLimit(doublet_torque(plant, size, lag), motors.mixer, share * room)
+            limit = MotorLimit(doublet_torque(plant, size, lag), mixer, share * room, name)
             # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
-            used = 1.0 if flown is None else max(1.0, 1 - limit.margin(flown))
+            used = 1.0 if loop is None else max(1.0, 1 - limit.margin(loop))
             found.append(replace(limit, room=used * limit.room))
         return found
 
 
 def flown_noise(experiment: Experiment, plant: WideResponse) -> Signal:
-    """RMS of the torque at hover (normalised) under the flown gains, all of it and its part above `FAST`, (2, 2).
+    """RMS of the torque at hover (normalised) under the flown gains, all of it and its part above `FAST`, (2, n).
 
     As recorded where the flown gains are not known.
     """
-    if experiment.flown is None:
+    flown = flown_law(experiment)
+    if flown is None:
         return np.array([flown_torque_noise(experiment, plant.response, plant.omega, above) for above in (0.0, FAST)])
-    loop = _loop_of(experiment.flown, plant)
+    loop = _loop_of(flown, plant)
     return np.array([loop.noise_rms(above) for above in (0.0, FAST)])
 
 
-def _loop_of(flown: Gains, plant: WideResponse) -> LoopGradient:
+def _loop_of(flown: Law, plant: WideResponse) -> LoopGradient:
     """The loop of flown gains, at the period of the log: a logger's clock differs a little from the controller's."""
     free = free_gains(replace(flown, filters=replace(flown.filters, Ts=plant.Ts)), plant.body)
     return LoopGradient(plant, free, free.vector(flown))
 
 
 def flown_amplitude(experiment: Experiment) -> float:
-    """Size of the flown manoeuvres, rad, within `AMPLITUDES`."""
+    """Size of the flown manoeuvres, rad, within the range of their family."""
     size = experiment.amplitude
     if size is None:
         used = np.concatenate([experiment.y_o[start:stop] for start, stop in experiment.segments])
         size = manoeuvre_size(used)
-    return float(np.clip(size, *AMPLITUDES))
+    return float(np.clip(size, *family_of(experiment.u.shape[1]).amplitudes))
 
 
-def _scaled(task: DesignTask, start: Gains) -> Signal:
+def _scaled(task: DesignTask, start: Law) -> Signal:
     """A starting point with its rate gains scaled to the least merit: the search begins near its constraints."""
     rate = [term.matrix for term in LOOP_TERMS.values()]
     scaled = [
@@ -377,7 +408,7 @@ def _following(free: FreeGains, bandwidth: float) -> FreeGains:
 def vehicle_damps(design: Design) -> bool:
     """Whether the bound on the derivative gain is active and costs following: a negative one would follow better."""
     task, vector = design.task, design.vector
-    name = Definite(TERMS["D"].matrix, np.eye(2), 0.0).name
+    name = Definite(TERMS["D"].matrix, np.eye(1), 0.0).name
     if name not in task.active(vector, ACTIVE):
         return False
     plants = [

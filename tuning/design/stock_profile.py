@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
+from mimopilot.tuning.axes import Law
 from mimopilot.tuning.design.prediction import Prediction
 from mimopilot.tuning.design.response_design import Design, ResponseDesign
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains, Matrix
 from mimopilot.tuning.law import LOOP_TERMS
-from mimopilot.tuning.law_terms import LAWS, MIMO
+from mimopilot.tuning.law_terms import MIMO
 from mimopilot.tuning.logs.flown_gains import LACKING, LOOP_RATE
 from mimopilot.tuning.logs.imported_gains import SAME_RATE
 from mimopilot.tuning.spec import TuningSpec
@@ -23,6 +24,9 @@ from mimopilot.tuning.spec import TuningSpec
 DIGITS = 4
 #: Details of a gain set's origin: what the off-diagonals of our module would bring.
 WORTH = "worth_of_off_diagonals"
+
+
+AnyLaw = TypeVar("AnyLaw", bound=Law)
 
 
 def check_profile(experiment: Experiment, spec: TuningSpec) -> None:
@@ -71,30 +75,31 @@ def stock_starts(base: Gains, experiment: Experiment, omega: float, B: Matrix) -
     return [replace(base, **flown), rigid]
 
 
-def in_digits(gains: Gains) -> Gains:
-    """A stock set with its gains rounded to `DIGITS`, within the autopilot's ranges; ours as it is."""
-    largest = LAWS[gains.controller].largest
+def in_digits(law: AnyLaw) -> AnyLaw:
+    """A stock law with its gains rounded to `DIGITS`, within the autopilot's ranges; ours as it is."""
+    largest = law.filters.law.largest
     if largest is None:
-        return gains
+        return law
 
     def rounded(name: str) -> Matrix:
-        values = np.diag(getattr(gains, name))
-        return np.diag([min(float(f"{v:.{DIGITS}g}"), top) for v, top in zip(values, largest[name][:2], strict=True)])
+        values = np.diag(getattr(law, name))
+        tops = largest[name][-1:] if len(values) == 1 else largest[name][: len(values)]
+        return np.diag([min(float(f"{v:.{DIGITS}g}"), top) for v, top in zip(values, tops, strict=True)])
 
     changed: dict[str, Any] = {name: rounded(name) for name in largest}
-    return replace(gains, **changed)
+    return replace(law, **changed)
 
 
-def at_loop_rates(gains: Gains, experiment: Experiment) -> list[Gains]:
-    """The set at the control rate of the log and, if the parameters of a stock one say another, at that.
+def at_loop_rates(law: AnyLaw, experiment: Experiment) -> list[AnyLaw]:
+    """The law at the control rate of the log and, if the parameters of a stock one say another, at that.
 
     A log may leave out samples, and a simulated vehicle may be slower than its parameter.
     """
     details = experiment.flown.provenance.details if experiment.flown is not None else {}
     rate = details.get(LOOP_RATE)
-    if gains.controller == MIMO or not rate or abs(rate * gains.Ts - 1) <= SAME_RATE:
-        return [gains]
-    return [gains, replace(gains, filters=replace(gains.filters, Ts=1 / rate))]
+    if law.filters.stock is None or not rate or abs(rate * law.Ts - 1) <= SAME_RATE:
+        return [law]
+    return [law, replace(law, filters=replace(law.filters, Ts=1 / rate))]
 
 
 def our_module(found: Design, bench: ResponseDesign, spec: TuningSpec) -> Design:

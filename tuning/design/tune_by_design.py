@@ -8,26 +8,24 @@ from typing import Any
 
 import numpy as np
 
-from mimopilot.tuning.analysis.certify import certify
+from mimopilot.tuning.analysis.certify_axes import certify_axes
 from mimopilot.tuning.analysis.manoeuvres import manoeuvres
-from mimopilot.tuning.certificate import Certificate, Verdict
+from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
+from mimopilot.tuning.design.certified_design import certified_design, rate_model, uncertified, weakest
 from mimopilot.tuning.design.prediction import Prediction, offaxis_doubt, predict, reasons_to_keep
 from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign, vehicle_damps
-from mimopilot.tuning.design.stock_profile import WORTH, at_loop_rates, in_digits, our_module, stock_starts, worth
+from mimopilot.tuning.design.stock_profile import WORTH, at_loop_rates, our_module, stock_starts, worth
+from mimopilot.tuning.design.yaw_design import tune_yaw, with_yaw
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS
 from mimopilot.tuning.law_terms import MIMO
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.provenance import Provenance
-from mimopilot.tuning.reference_model import ContinuousModel, SecondOrder
+from mimopilot.tuning.reference_model import SecondOrder
 from mimopilot.tuning.spec import TuningSpec
 
-#: The rate loop's model that VRFT starts from: bandwidth times delay and rotor lag, its range (rad/s), its damping.
-REACHABLE, SLOWEST, FASTEST, DAMPING = 1.0, 5.0, 60.0, 0.7
-#: Most designs: each that lacks a certificate tightens the next.
-MAX_DESIGNS = 5
 #: Matrices of the loop itself: without feed-forward from an attitude model.
 LOOP_MATRICES = (ATTITUDE.matrix, *(term.matrix for term in LOOP_TERMS.values()))
 MOTORS_UNKNOWN = (
@@ -62,9 +60,27 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
         When no gains of the structure are certified.
     """
     bench = ResponseDesign.of(measured, spec.design)
-    inner = _rate_model(bench)
+    inner = rate_model(bench)
     starts, origin = starting_points(measured, spec, inner, bench)
-    found, certificates = _certified_design(bench, measured, spec, starts, inner)
+    found, certificates = certified_design(bench, measured, spec, starts, inner)
+    missing = uncertified(certificates)
+    if missing:
+        limits = f"; the design is limited by {', '.join(found.active)}" if found.active else ""
+        raise TuningError(
+            f"{measured[0].experiment.source}: no gains of this structure are certified, nothing is written: "
+            f"{missing[0].reason}{limits}"
+        )
+    yaw = tune_yaw(measured, spec, found.gains, found.model.omega)
+
+    def certified(gains: Gains) -> Certificate:
+        certificates = []
+        for one in measured:
+            for at_rate in at_loop_rates(gains, one.experiment):
+                rate, attitude = ([model.discretise(at_rate.Ts)] * 2 for model in (inner, found.model))
+                certificates.append(certify_axes(at_rate, one, rate, attitude, spec.certificate))
+        return weakest(certificates)
+
+    gains, yaw, final = with_yaw(found.gains, yaw, certified)
     warnings = [] if all(one.experiment.motors for one in measured) else [MOTORS_UNKNOWN]
     if vehicle_damps(found):
         warnings.append(VEHICLE_DAMPS)
@@ -73,74 +89,17 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
         inner_model=(inner, inner),
         outer_model=(found.model, found.model),
         standard_deviation={name: value.tolist() for name, value in bench.deviations(found).items()},
-        warnings=tuple(warnings),
+        warnings=(*warnings, *yaw.warnings),
         details={
             "structure": spec.structure,
             "start": origin,
             "limited_by": found.active,
             "design": spec.design.model_dump(),
+            "yaw": yaw.details,
             **comparison(found, measured, bench, spec),
         },
     )
-    return replace(found.gains, provenance=provenance).with_certificate(_weakest(certificates))
-
-
-def _certified_design(
-    bench: ResponseDesign,
-    measured: Sequence[PlantEstimates],
-    spec: TuningSpec,
-    starts: Sequence[Gains],
-    inner: SecondOrder,
-) -> tuple[Design, list[Certificate]]:
-    """The first design that is certified on every log, with tighter limits after each that is not."""
-    source = measured[0].experiment.source
-    bandwidth = None
-    for _ in range(MAX_DESIGNS):
-        found = bench.design(starts, spec.structure, spec.full, bandwidth)
-        found = replace(found, gains=in_digits(found.gains))
-        certificates = [
-            certificate(at_loop_rate, one, spec, inner, found.model)
-            for one in measured
-            for at_loop_rate in at_loop_rates(found.gains, one.experiment)
-        ]
-        missing = [one for one in certificates if one.verdict != Verdict.CERTIFIED]
-        if not missing:
-            return found, certificates
-        starts, bandwidth = [found.gains], found.model.omega
-        bench = bench.tighter(found.gains)
-    limits = f"; the design is limited by {', '.join(found.active)}" if found.active else ""
-    raise TuningError(
-        f"{source}: no gains of this structure are certified, nothing is written: {missing[0].reason}{limits}"
-    )
-
-
-def certificate(
-    gains: Gains, measured: PlantEstimates, spec: TuningSpec, inner: ContinuousModel, outer: ContinuousModel
-) -> Certificate:
-    """The certificate of a designed set from one log."""
-    return certify(
-        gains,
-        measured.response,
-        [inner.discretise(gains.Ts)] * 2,
-        [outer.discretise(gains.Ts)] * 2,
-        measured.experiment.sha256,
-        spec.certificate,
-        lambda: measured.model,
-    )
-
-
-def _weakest(certificates: Sequence[Certificate]) -> Certificate:
-    """The certificate with the thinnest margin; it holds those of the other logs."""
-    weakest = max(certificates, key=lambda one: one.figures["Ms"] + one.figures["Ms_error"])
-    return replace(weakest, further=tuple(one.as_table() for one in certificates if one is not weakest))
-
-
-def _rate_model(bench: ResponseDesign) -> SecondOrder:
-    """A rate loop that the slowest of the plants can reach."""
-    lag = max(plant.shape[0] + plant.shape[1] for plant in bench.plants)
-    top = min(plant.omega[plant.band.stop - 1] for plant in bench.plants) / 2
-    fastest = max(SLOWEST, min(FASTEST, float(top)))
-    return SecondOrder(round(float(np.clip(REACHABLE / max(lag, 1e-3), SLOWEST, fastest)), 1), DAMPING)
+    return replace(gains, provenance=provenance).with_certificate(final)
 
 
 def starting_points(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.signal import correlate
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.experiment import SIGNALS, Experiment, YawSignals, excited_segments, external_signal
 from mimopilot.tuning.parameter_row import ROLL_PITCH
 from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
 from mimopilot.tuning.plant.local_polynomial import local_response
@@ -116,12 +116,7 @@ def excited_stretches(experiment: Experiment, external: Signal, method: str) -> 
     """
     stretches: Stretches = []
     for axis in range(2):
-        active: list[tuple[int, int]] = []
-        for start, stop in experiment.segments:
-            signal = external[start:stop, axis]
-            moving = start + np.flatnonzero(signal if np.ptp(signal) > 0 else 0 * signal)
-            if len(moving):
-                active.append((int(moving[0]), int(moving[-1]) + 1))
+        active = excited_segments(experiment.segments, external[:, axis])
         if not active:
             name = ROLL_PITCH[axis]
             raise TuningError(f"{experiment.source}: not excited on {name}; inject a torque on that axis too")
@@ -163,6 +158,10 @@ def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment
 
 def _cut(experiment: Experiment, start: int, stop: int, segments: Sequence[tuple[int, int]]) -> Experiment:
     """Rows start..stop of all signals."""
-    values = {f.name: getattr(experiment, f.name) for f in fields(experiment)}
-    cut: dict[str, Any] = {name: value[start:stop] for name, value in values.items() if isinstance(value, np.ndarray)}
-    return replace(experiment, **cut, segments=tuple(segments))
+
+    def cut(signals: Experiment | YawSignals) -> dict[str, Any]:
+        values = {name: getattr(signals, name) for name in SIGNALS}
+        return {name: None if value is None else value[start:stop] for name, value in values.items()}
+
+    yaw = None if experiment.yaw is None else YawSignals(**cut(experiment.yaw))
+    return replace(experiment, **cut(experiment), yaw=yaw, segments=tuple(segments))

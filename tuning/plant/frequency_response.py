@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from mimopilot.tuning.axes import axis_names
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.plant.local_polynomial import local_response
@@ -46,24 +47,24 @@ Signal = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PlantResponse:
-    """Frequency response of the plant at K frequencies.
+    """Frequency response of the plant at K frequencies, for n axes: yaw, roll and pitch, or all; see `tuning.axes`.
 
     Attributes
     ----------
     omega : (K,) array, rad/s
         Frequencies.
-    G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
+    G_i, G_o : (K, n, n) arrays, rad/s and rad per unit of u
         Responses of rates and angles to the torque.
-    root : (K, 6, 6) array
+    root : (K, 3n, 3n) array
         Square root of the noise spectrum of [u, y_i, y_o].
-    reach : (K, 2, 2) array
-        With X (6, 2) of unit complex normals and E = root X reach, G_i + E_i - G_i E_u and G_o + E_o - G_o E_u are
+    reach : (K, n, n) array
+        With X (3n, n) of unit complex normals and E = root X reach, G_i + E_i - G_i E_u and G_o + E_o - G_o E_u are
         as likely as G_i and G_o.
-    coherence : (K, 2) array
+    coherence : (K, n) array
         Multiple coherence of each rate with the excitation.
     Ts : float, s
         Sampling period.
-    angle_noise : (K, 2, 6) array or None
+    angle_noise : (K, n, 3n) array or None
         Rows of the noise's root for the angles as measured; None: those of `root`. They differ where G_o is the
         integrated rate response, whose error is not that of the angles.
     """
@@ -77,15 +78,30 @@ class PlantResponse:
     Ts: float
     angle_noise: Complex | None = None
 
+    @property
+    def axes(self) -> int:
+        """Number n of axes."""
+        return int(self.G_i.shape[1])
+
+    def rate_residual(self) -> Complex:
+        """Root of the noise of y_i - G_i u, (K, n, 3n)."""
+        n = self.axes
+        return self.root[:, n : 2 * n] - self.G_i @ self.root[:, :n]
+
+    def angle_residual(self) -> Complex:
+        """Root of the noise of y_o - G_o u, (K, n, 3n)."""
+        n = self.axes
+        return self.root[:, 2 * n :] - self.G_o @ self.root[:, :n]
+
     def deviation(self) -> Signal:
-        """Standard deviation of each element of G_i, (K, 2, 2)."""
-        noise = np.linalg.norm(self.root[:, 2:4] - self.G_i @ self.root[:, :2], axis=2)
+        """Standard deviation of each element of G_i, (K, n, n)."""
+        noise = np.linalg.norm(self.rate_residual(), axis=2)
         reach = np.linalg.norm(self.reach, axis=1)
         deviation: Signal = noise[:, :, None] * reach[:, None, :]
         return deviation
 
     def known(self) -> NDArray[np.bool_]:
-        """Whether G_i is known: both rates are coherent, or the error is small, (K,)."""
+        """Whether G_i is known: all rates are coherent, or the error is small, (K,)."""
         error = self.rate_error()
         return np.asarray(np.all(self.coherence > COHERENT, axis=1) & (error < UNKNOWN) | (error < KNOWN))
 
@@ -115,7 +131,7 @@ class PlantResponse:
 
     def relative_error(self) -> Signal:
         """Standard deviation of G_o over its size, (K,), Frobenius norms."""
-        spread = (self.root[:, 4:] - self.G_o @ self.root[:, :2], self.reach, self.G_o)
+        spread = (self.angle_residual(), self.reach, self.G_o)
         noise, reach, size = (np.linalg.norm(matrix, axis=(1, 2)) for matrix in spread)
         relative: Signal = noise * reach / size
         return relative
@@ -136,7 +152,7 @@ class PlantResponse:
             return self
         plant = self.at(self.omega < np.pi / max(Ts, self.Ts))
         turn = np.exp(-1j * plant.omega * LATE * max(0.0, Ts - self.Ts))[:, None, None]
-        outputs = np.concatenate([plant.root[:, :2], turn * plant.root[:, 2:]], axis=1)
+        outputs = np.concatenate([plant.root[:, : self.axes], turn * plant.root[:, self.axes :]], axis=1)
         angles = None if plant.angle_noise is None else turn * plant.angle_noise
         return replace(plant, G_i=turn * plant.G_i, G_o=turn * plant.G_o, root=outputs, angle_noise=angles, Ts=Ts)
 
@@ -152,7 +168,7 @@ class PlantResponse:
             return self
         first, w = slice(0, 3), self.omega[:, None, None]
         below = low[:, None, None]
-        down = (self.omega[0] / below) ** np.repeat([0, 1, 2], 2)[:, None]
+        down = (self.omega[0] / below) ** np.repeat([0, 1, 2], self.axes)[:, None]
         return PlantResponse(
             omega=np.concatenate([low, self.omega]),
             G_i=np.concatenate([(w * self.G_i)[first].mean(axis=0) / below, self.G_i]),
@@ -185,10 +201,10 @@ class PlantResponse:
 
     def draw(self, generator: np.random.Generator) -> PlantResponse:
         """A plant drawn from the error distribution of the response."""
-        shape = (len(self.omega), 6, 2)
+        shape = (len(self.omega), 3 * self.axes, self.axes)
         X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
         E = self.root @ X @ self.reach
-        E_u, E_i, E_o = E[:, :2], E[:, 2:4], E[:, 4:]
+        E_u, E_i, E_o = np.split(E, 3, axis=1)
         return replace(self, G_i=self.G_i + E_i - self.G_i @ E_u, G_o=self.G_o + E_o - self.G_o @ E_u)
 
 
@@ -199,7 +215,7 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
     ----------
     experiment : Experiment
         One flight.
-    instrument : (N, 2) array
+    instrument : (N, n) array
         Its external signal w.
     upper : float, rad/s
         Largest frequency of interest; by default the Nyquist frequency.
@@ -207,19 +223,21 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
     Raises
     ------
     TuningError
-        When the flight is too short, or w does not excite both axes.
+        When the flight is too short, or w does not excite every axis.
     """
     signals = np.hstack([experiment.u, experiment.y_i, experiment.y_o])
     # The last window ends where the excitation does.
     upper = min(upper, 0.95 * np.pi / experiment.Ts, _reach(experiment, instrument) / (1 + GROWTH))
     found = local_response(instrument, signals, experiment.Ts, experiment.segments, upper, GROWTH)
-    T_u, T_i, T_o = found.response[:, :2], found.response[:, 2:4], found.response[:, 4:]
-    if np.any(np.linalg.matrix_rank(T_u) < 2):
-        raise TuningError("not excited: the external signal does not move both torques independently; excite each axis")
+    n = instrument.shape[1]
+    T_u, T_i, T_o = np.split(found.response, 3, axis=1)
+    if np.any(np.linalg.matrix_rank(T_u) < n):
+        raise TuningError("not excited: the external signal does not move every torque independently; excite each axis")
     for name, T in (("rates", T_i), ("angles", T_o)):
-        if np.any(np.linalg.matrix_rank(T) < 2):
+        if np.any(np.linalg.matrix_rank(T) < n):
             raise TuningError(
-                f"{experiment.source}: roll and pitch {name} are the same signal; check the source of pitch"
+                f"{experiment.source}: {' and '.join(axis_names(n))} {name} are the same signal, or constant; check "
+                f"the source of {axis_names(n)[-1]}"
             )
     inverse = np.linalg.inv(T_u)
     plant = PlantResponse(
@@ -228,13 +246,13 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
         G_o=T_o @ inverse,
         root=hermitian_root(found.noise),
         reach=hermitian_root(found.error).transpose(0, 2, 1) @ inverse,
-        coherence=found.explained[:, 2:4],
+        coherence=found.explained[:, n : 2 * n],
         Ts=experiment.Ts,
     )
     return _angles_from_rates(_smoothed(plant))
 
 
-@lru_cache(maxsize=1)  # the log checks and the tuning use the same response
+@lru_cache(maxsize=2)  # the log checks and the tuning use the same response
 def measured_plant(experiment: Experiment) -> PlantResponse:
     """The plant's frequency response from the experiment's external signal; see `plant_response`."""
     return plant_response(experiment, external_signal(experiment)[0])
@@ -278,10 +296,13 @@ def _smoothed(plant: PlantResponse) -> PlantResponse:
         values = ratio[near].reshape(len(near), -1)
         found = inverse @ (line.T @ (certainty[:, None] * values))
         # Windows overlap by half, so only half of them are independent.
-        misfit = float(np.sum(certainty[:, None] * np.abs(values - line @ found) ** 2)) / (4 * (len(near) - 2))
+        misfit = float(np.sum(certainty[:, None] * np.abs(values - line @ found) ** 2)) / (
+            plant.axes**2 * (len(near) - 2)
+        )
+        misfit /= plant.axes**2
         share = np.sqrt(2 * inverse[0, 0] * max(1.0, misfit) * certainty[near == k][0])
         if misfit < EXPLAINED and share < 1:
-            G_i[k] = shape[k] * found[0].reshape(2, 2)
+            G_i[k] = shape[k] * found[0].reshape(plant.axes, plant.axes)
             reach[k] *= share
     return replace(plant, G_i=G_i, reach=reach)
 
@@ -294,8 +315,8 @@ def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
     """
     s = 1j * plant.omega
     integral = plant.G_i / s[:, None, None]
-    spread = np.linalg.norm(plant.root[:, 4:] - plant.G_o @ plant.root[:, :2], axis=(1, 2))
-    of_rates = np.linalg.norm(plant.root[:, 2:4] - plant.G_i @ plant.root[:, :2], axis=(1, 2)) / plant.omega
+    spread = np.linalg.norm(plant.angle_residual(), axis=(1, 2))
+    of_rates = np.linalg.norm(plant.rate_residual(), axis=(1, 2)) / plant.omega
     both = plant.known() & (plant.relative_error() < SURE)
     if np.count_nonzero(both) < MIN_FREQUENCIES:
         return plant
@@ -306,11 +327,11 @@ def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
     better = of_rates < spread
     better[: np.flatnonzero(both)[-1] // 2] = False
     change = np.where(better, gain * np.exp(1j * plant.omega * lead) / s, 0)[:, None, None]
+    _, rates, angles = np.split(plant.root, 3, axis=1)
     root = plant.root.copy()
-    root[:, 4:] = np.where(better[:, None, None], change * root[:, 2:4], root[:, 4:])
+    root[:, 2 * plant.axes :] = np.where(better[:, None, None], change * rates, angles)
     G_o = np.where(better[:, None, None], change * plant.G_i, plant.G_o)
-    measured = plant.root[:, 4:] - plant.G_o @ plant.root[:, :2]
-    return replace(plant, G_o=G_o, root=root, angle_noise=measured)
+    return replace(plant, G_o=G_o, root=root, angle_noise=plant.angle_residual())
 
 
 def hermitian_root(matrices: Complex) -> Complex:

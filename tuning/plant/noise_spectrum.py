@@ -33,11 +33,11 @@ def noise_root(experiment: Experiment, plant: PlantResponse, omega: Signal) -> C
 
     Returns
     -------
-    (K, 4, 4) array
+    (K, 2n, 2n) array
         R with R R^H the spectrum, rad/s and rad; a variance is Ts / pi times its integral from 0 to pi / Ts.
     """
-    of_angles = plant.root[:, 4:] - plant.G_o @ plant.root[:, :2] if plant.angle_noise is None else plant.angle_noise
-    residual = np.concatenate([plant.root[:, 2:4] - plant.G_i @ plant.root[:, :2], of_angles], axis=1)
+    of_angles = plant.angle_residual() if plant.angle_noise is None else plant.angle_noise
+    residual = np.concatenate([plant.rate_residual(), of_angles], axis=1)
     inside = residual @ residual.conj().transpose(0, 2, 1)
     spectrum = inside[np.abs(plant.omega[:, None] - omega).argmin(axis=0)]
     above = omega > plant.omega[-1]
@@ -47,7 +47,7 @@ def noise_root(experiment: Experiment, plant: PlantResponse, omega: Signal) -> C
 
 
 def flown_torque_noise(experiment: Experiment, plant: PlantResponse, omega: Signal, lowest: float = 0.0) -> Signal:
-    """RMS of the torque (normalised) that noise caused in the flight, for each axis, (2,): its excitation is left out.
+    """RMS of the torque (normalised) that noise caused in the flight, for each axis, (n,): its excitation is left out.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def flown_torque_noise(experiment: Experiment, plant: PlantResponse, omega: Sign
     lowest : float, rad/s
         Only the noise at higher frequencies counts.
     """
-    root = plant.root[:, :2]
+    root = plant.root[:, : plant.axes]
     power = np.einsum("kij,kij->ki", root, root.conj()).real
     density = power[np.abs(plant.omega[:, None] - omega).argmin(axis=0)]
     above = omega > plant.omega[-1]

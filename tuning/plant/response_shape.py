@@ -37,17 +37,17 @@ def fit_shape(omega: Signal, G: Complex, weight: Signal) -> tuple[ResponseShape,
     Parameters
     ----------
     omega : (K,) array, rad/s
-    G : (K, 2, 2) array
+    G : (K, n, n) array
         Response from torque to rates.
-    weight : (K, 2, 2) array
+    weight : (K, n, n) array
         Inverse variances.
 
     Returns
     -------
     shape : ResponseShape
         The best of `SHAPES`: delay and lag (s), damping (1/s).
-    B : (2, 2) array, rad/s^2
-    power : (2, 2) array
+    B : (n, n) array, rad/s^2
+    power : (n, n) array
         Inverse variance of each element of B.
     misfit : float
         Weighted sum of squares of the residual.

@@ -1,4 +1,4 @@
-"""Rigid-body fit of a measured response: angular acceleration of roll and pitch per unit of torque."""
+"""Rigid-body fit of a measured response: angular acceleration of its n axes per unit of torque."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ Signal = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RigidBody:
-    """Angular acceleration about roll and pitch per unit of torque (control effectiveness).
+    """Angular acceleration about n axes per unit of torque (control effectiveness).
 
     Attributes
     ----------
-    B : (2, 2) array, rad/s^2
+    B : (n, n) array, rad/s^2
         Torque scale times the inverse of the inertia.
-    deviation : (2, 2) array, rad/s^2
+    deviation : (n, n) array, rad/s^2
         Standard deviation of each element.
     shape : ResponseShape
         Delay (s), rotor lag (s) and damping (1/s).
@@ -50,7 +50,7 @@ class RigidBody:
     shape: ResponseShape = (0.0, 0.0, 0.0)
 
     def determinant(self) -> tuple[float, float]:
-        """Determinant of B and its standard deviation, rad^2/s^4."""
+        """Determinant of B of roll and pitch and its standard deviation, rad^2/s^4."""
         (a, b), (c, d) = self.B
         gradient = np.array([[d, -c], [-b, a]])
         return float(a * d - b * c), float(np.linalg.norm(gradient * self.deviation))
@@ -62,7 +62,7 @@ class RigidBody:
 
         Parameters
         ----------
-        gain : (..., 2, 2) array
+        gain : (..., n, n) array
             Such as Kp_i or Ki_i.
 
         Returns
@@ -78,7 +78,8 @@ class RigidBody:
         The hold itself delays by half a period.
         """
         delay, lag, damping = self.shape
-        rate, one, none = -damping * np.eye(2), np.eye(2), np.zeros((2, 2))
+        axes = len(self.B)
+        rate, one, none = -damping * np.eye(axes), np.eye(axes), np.zeros((axes, axes))
         if lag > 0:
             A, B, C = (
                 np.block([[rate, self.B], [none, -one / lag]]),
@@ -88,14 +89,15 @@ class RigidBody:
         else:
             A, B, C = rate, self.B, one
         n, late = len(A), max(0, round(delay / Ts - 0.5))
-        held = expm(np.block([[A, B], [np.zeros((2, n + 2))]]) * Ts)
+        held = expm(np.block([[A, B], [np.zeros((axes, n + axes))]]) * Ts)
         A, B = held[:n, :n], held[:n, n:]
         # Every period of delay is a state that holds the torque.
-        chain = np.eye(2 * late, k=2)
-        chain[-2:] = 0.0
-        whole = np.block([[A, B, np.zeros((n, 2 * late - 2))], [np.zeros((2 * late, n)), chain]]) if late else A
-        drive = np.vstack([np.zeros((len(whole) - 2, 2)), one]) if late else B
-        return StateSpace(whole, drive, np.hstack([C, np.zeros((2, 2 * late))]), none, Ts)
+        chain = np.eye(axes * late, k=axes)
+        chain[-axes:] = 0.0
+        held_back = axes * late
+        whole = np.block([[A, B, np.zeros((n, held_back - axes))], [np.zeros((held_back, n)), chain]]) if late else A
+        drive = np.vstack([np.zeros((len(whole) - axes, axes)), one]) if late else B
+        return StateSpace(whole, drive, np.hstack([C, np.zeros((axes, held_back))]), none, Ts)
 
 
 def rigid_body(plant: PlantResponse) -> RigidBody:
@@ -119,7 +121,7 @@ def rigid_body(plant: PlantResponse) -> RigidBody:
     size = np.linalg.norm(plant.G_i, axis=(1, 2))[:, None, None]
     weight = 1 / (plant.deviation() ** 2 + (SHAPE_ERROR * size) ** 2)
     shape, B, power, misfit = fit_shape(plant.omega, plant.G_i, weight)
-    scale = max(1.0, misfit / (4 * len(plant.omega)))
+    scale = max(1.0, misfit / (plant.axes**2 * len(plant.omega)))
     return RigidBody(B, np.sqrt(scale / power), shape)
 
 
@@ -144,13 +146,14 @@ def continued_below(plant: PlantResponse, body: RigidBody) -> PlantResponse:
     G = body.B * shape_response(omega, (delay, lag, max(damping, LEAST_DAMPING)))[:, None, None]
     s = 1j * omega[:, None, None]
     # Its error is real, a few percent of B, where the loop's gain is large: no phase is drawn for it.
-    root = np.zeros((len(omega), 6, 6), complex)
+    n = plant.axes
+    root = np.zeros((len(omega), 3 * n, 3 * n), complex)
     return PlantResponse(
         omega=np.concatenate([omega, plant.omega]),
         G_i=np.concatenate([G, plant.G_i]),
         G_o=np.concatenate([G / s, plant.G_o]),
         root=np.concatenate([root, plant.root]),
-        reach=np.concatenate([np.broadcast_to(np.eye(2, dtype=complex), (len(omega), 2, 2)), plant.reach]),
-        coherence=np.concatenate([np.ones((len(omega), 2)), plant.coherence]),
+        reach=np.concatenate([np.broadcast_to(np.eye(n, dtype=complex), (len(omega), n, n)), plant.reach]),
+        coherence=np.concatenate([np.ones((len(omega), n)), plant.coherence]),
         Ts=plant.Ts,
     )

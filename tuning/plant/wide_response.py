@@ -34,14 +34,14 @@ class WideResponse:
     Attributes
     ----------
     omega : (K,) array, rad/s
-    G_i, G_o : (K, 2, 2) arrays, rad/s and rad per unit of u
+    G_i, G_o : (K, n, n) arrays, rad/s and rad per unit of u
     band : slice
         Frequencies at which it was measured. Below, the fitted rigid body behind rotors and a delay continues it, and
         above, its shape.
-    error_i, error_o : (K, 2, 6) arrays
-        With X (6, 2) of unit complex normals, error_i X reach is as likely as the error of G_i; zero above the band.
-    reach : (K, 2, 2) array
-    noise : (K, 4, 4) array
+    error_i, error_o : (K, n, 3n) arrays
+        With X (3n, n) of unit complex normals, error_i X reach is as likely as the error of G_i; zero above the band.
+    reach : (K, n, n) array
+    noise : (K, 2n, 2n) array
         Square root of the spectrum of the noise of rates and angles, see `tuning.plant.noise_spectrum`.
     noise_deviation : (K,) array
         Relative standard deviation of the noise's size.
@@ -68,6 +68,11 @@ class WideResponse:
     Ts: float
 
     @property
+    def axes(self) -> int:
+        """Number n of axes."""
+        return int(self.G_i.shape[1])
+
+    @property
     def noise_weight(self) -> Signal:
         """Weights of the sum over frequency that is a variance, (K,)."""
         weight: Signal = _trapezoid(self.omega) * self.Ts / np.pi
@@ -75,7 +80,7 @@ class WideResponse:
 
     def draw(self, generator: np.random.Generator) -> WideResponse:
         """A plant drawn from the errors of the response and of the noise."""
-        shape = (len(self.omega), 6, 2)
+        shape = (len(self.omega), 3 * self.axes, self.axes)
         X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
         return replace(
             self,
@@ -112,10 +117,11 @@ def wide_response(measured: PlantEstimates) -> WideResponse:
     omega = np.concatenate([dense.omega, high])
     first = known.omega[known.rate_error() < DEVIATION][:1]
     band = slice(int(np.searchsorted(omega, first[0] if len(first) else known.omega[0])), len(dense.omega))
-    error_i = np.zeros((len(omega), 2, 6), complex)
-    error_o, reach = np.zeros_like(error_i), np.zeros((len(omega), 2, 2), complex)
-    error_i[: band.stop] = dense.root[:, 2:4] - dense.G_i @ dense.root[:, :2]
-    error_o[: band.stop] = dense.root[:, 4:] - dense.G_o @ dense.root[:, :2]
+    n = plant.axes
+    error_i = np.zeros((len(omega), n, 3 * n), complex)
+    error_o, reach = np.zeros_like(error_i), np.zeros((len(omega), n, n), complex)
+    error_i[: band.stop] = dense.rate_residual()
+    error_o[: band.stop] = dense.angle_residual()
     reach[: band.stop] = dense.reach
     return WideResponse(
         omega=omega,

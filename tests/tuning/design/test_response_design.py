@@ -10,7 +10,7 @@ from mimopilot.sitl.flight.scenario import doublet, hover
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.studies.true_plant import TruePlant, flight_of, true_response
-from mimopilot.tuning.analysis.manoeuvres import PERIODS, manoeuvres
+from mimopilot.tuning.analysis.manoeuvres import ROLL_PITCH_FAMILY, manoeuvres
 from mimopilot.tuning.certificate import Verdict
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.design.free_gains import free_gains
@@ -97,7 +97,7 @@ def test_the_predicted_figures_are_those_of_flights(logs, tuned):
         found = predict(gains, plant, manoeuvres(plant, model))
         for column, axis in enumerate(("roll", "pitch")):
             follow, other = [], []
-            for period in PERIODS:
+            for period in ROLL_PITCH_FAMILY.periods:
                 task = doublet(axis, np.radians(10.0), period, log.Ts, tail=4.0)
                 flight = fly(airframe, Autopilot(airframe, gains), task, noise=False)
                 angles = np.degrees(flight.truth["attitude"][task.window[0] :, :2])

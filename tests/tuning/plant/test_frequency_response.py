@@ -163,5 +163,5 @@ def test_a_log_with_roll_in_place_of_pitch_is_refused(name, said):
 
 def test_a_torque_that_does_not_move_both_axes_is_refused():
     log = experiment("adam0", seconds=10.0)
-    with pytest.raises(TuningError, match="not excited: the external signal does not move both torques"):
+    with pytest.raises(TuningError, match="not excited: the external signal does not move every torque"):
         plant_response(replace(log, u=np.repeat(log.u[:, :1], 2, axis=1)), log.u_bar)
