@@ -199,9 +199,8 @@ def import_gains(
     if defaults is not None and stock is not PX4:
         raise TuningError(f"--defaults {defaults}: {source.name} is of {stock.name}; leave it out")
     if profile not in (MIMO, stock.profile):
-        raise TuningError(
-            f"--profile: got {profile!r}, but {source.name} is of {stock.name}: {MIMO} or {stock.profile}"
-        )
+        known = f"{MIMO} or {stock.profile}"
+        raise TuningError(f"--profile: got {profile!r}, but {source.name} is of {stock.name}: give {known}")
     exact = profile != MIMO
     wanted = [*needed_names(stock), *(stock.filter_names if exact else ())]
     needed = [name for name in dict.fromkeys(wanted) if not (rate is not None and name == stock.rate)]

@@ -253,9 +253,11 @@ def test_what_an_upload_writes_is_what_an_import_reads(tmp_path, profile, rate):
 
 
 def test_a_stock_set_needs_the_parameters_of_its_filters(tmp_path):
-    lacking = {name: value for name, value in ARDUPILOT_VALUES.items() if name != "ATC_RAT_PIT_FLTE"}
+    complete = dict.fromkeys(ARDUPILOT.filter_names, 20.0) | ARDUPILOT_VALUES
+    assert from_file(tmp_path / "z.parm", complete, profile="ardupilot-stock").gains.controller == "ardupilot-stock"
+    lacking = {name: value for name, value in complete.items() if name != "ATC_RAT_PIT_FLTE"}
     assert from_file(tmp_path / "x.parm", lacking).gains.controller == "mimo"
-    with pytest.raises(Error, match="lacks ATC_RAT_PIT_FLTE"):
+    with pytest.raises(Error, match="lacks ATC_RAT_PIT_FLTE; no gain gets"):
         from_file(tmp_path / "x.parm", lacking, profile="ardupilot-stock")
     older = {name: value for name, value in PX4_VALUES.items() if name != "MC_YAW_TQ_CUTOFF"}
     assert from_file(tmp_path / "y.parm", older, profile="px4-stock").gains.filters.stock.torque_hz == (0.0, 0.0, 0.0)

@@ -148,7 +148,7 @@ def test_a_vehicle_that_does_not_fit_the_profile_is_refused_with_the_one_that_fi
     gains = certified
     if stock:
         gains = tmp_path / "stock.gains.toml"
-        stock_gains(profile).with_certificate(Certificate(Verdict.CERTIFIED)).save(gains)
+        stock_gains(profile).with_certificate(Certificate(Verdict.CERTIFIED, "examined")).save(gains)
     with UdpVehicle(vehicle) as link:
         refused = upload(mimopilot, gains, link, *stock)
     assert_one_clear_line(refused, *parts, "nothing was written")
