@@ -480,8 +480,10 @@ def experiment(
     seed: int = 0,
     excitation_seed: int | None = None,
     both_axes: bool = False,
+    axis: str = "all",
+    yaw_amplitude: float | None = None,
 ) -> Experiment:
-    """Fly a simulated experiment with a PRBS added to the torque on roll, then on pitch.
+    """Fly a simulated experiment with a PRBS added to the torque on roll, then on pitch, then on yaw.
 
     Parameters
     ----------
@@ -499,7 +501,11 @@ def experiment(
     excitation_seed : int, optional
         Of the excitation.
     both_axes : bool
-        Excite roll and pitch at once, for `seconds_per_axis` in all.
+        Excite roll and pitch at once, for `seconds_per_axis`.
+    axis : str
+        ``all``, ``both`` (roll, then pitch), ``roll``, ``pitch`` or ``yaw``.
+    yaw_amplitude : float, optional
+        On yaw; by default 0.3, or less if the motors would saturate.
 
     Returns
     -------
@@ -516,7 +522,9 @@ def experiment(
 
     body, controller = vehicle(airframe, gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
-    plan = ExperimentPlan(body, controller, seconds_per_axis, strength, bandwidth, excitation_seed, both_axes)
+    plan = ExperimentPlan(
+        body, controller, seconds_per_axis, strength, bandwidth, excitation_seed, both_axes, axis, yaw_amplitude
+    )
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / "flight.ulg" if out is None else Path(out)
         check_survived(plan.record(path, seed))

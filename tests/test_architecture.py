@@ -29,13 +29,16 @@ LAYERS = (
     "mimopilot.sitl.mavlink.simulator_api",
     "mimopilot.sitl.mavlink.vehicle",
     "mimopilot.sitl.mavlink.ground_station",
+    "mimopilot.sitl.mavlink.ground_station.experiments",
     "mimopilot.sitl.mavlink.log_transfer",
     "mimopilot.sitl.campaign",
+    "mimopilot.sitl.field",
     "mimopilot.sitl.studies",
     "mimopilot",
     "mimopilot.cli",
 )
-#: What code generation and simulation may know of tuning; the studies tune, too.
+#: What code generation and simulation may know of tuning; these packages tune, too.
+TUNERS = ("mimopilot.sitl.studies", "mimopilot.sitl.field")
 CONTRACT = {
     "mimopilot.codegen": ("mimopilot.tuning",),
     "mimopilot.sitl": ("mimopilot.tuning", "mimopilot.tuning.logs"),
@@ -89,12 +92,18 @@ def test_a_package_imports_only_itself_and_those_below(package):
             assert not {name for name in ARROWS[module] if package_of(name) in above}, module
 
 
-def test_only_studies_and_the_public_api_know_how_gains_are_found():
+def test_only_studies_field_work_and_the_public_api_know_how_gains_are_found():
     for module in MODULES:
         contract = CONTRACT.get(".".join(module.split(".")[:2]))
-        if contract and package_of(module) != "mimopilot.sitl.studies":
+        if contract and package_of(module) not in TUNERS:
             tuning = {package_of(name) for name in ARROWS[module]}
             assert {name for name in tuning if name.startswith("mimopilot.tuning")} <= set(contract), module
+
+
+def test_only_the_front_door_imports_the_field_work():
+    for module in MODULES:
+        if any(package_of(name) == "mimopilot.sitl.field" for name in ARROWS[module]):
+            assert package_of(module) in ("mimopilot", "mimopilot.cli", "mimopilot.sitl.field"), module
 
 
 def test_no_modules_import_one_another_in_a_circle():

@@ -151,7 +151,7 @@ def test_models_window_and_specification_are_taken(mimopilot, log, tmp_path):
         (("tune", "LOG", "--method", "magic", "--out", "x.toml"), ("method", "'mimo' or 'siso'")),
         (("tune", "LOG", "--outer", "0.5,0.7,0", "--out", "x.toml"), ("too short",)),
         (("generate", "bad.toml", "--out", "cpp"), ("bad.toml", "schema")),
-        (("experiment", "adam0", "--axis", "roll", "--out", "x.ulg"), ("--axis", "belong to --connect")),
+        (("experiment", "adam0", "--axis", "up", "--out", "x.ulg"), ("axis: got 'up'",)),
         (("experiment", "adam0", "--tilt-deg", "0", "--out", "x.ulg"), ("--tilt-deg", "belong to --connect")),
         (("experiment", "adam0", "--bandwidth", "-5", "--out", "x.ulg"), ("bandwidth: got -5",)),
         (("experiment", "adam0", "--seconds-per-axis", "2", "--out", "text.ulg/x.ulg"), ("text.ulg",)),

@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.experiment import SIGNALS, Experiment, excited_segments, external_signal
+from mimopilot.tuning.experiment import MOVES, SIGNALS, Experiment, excited_segments, external_signal
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.parameters import MATRICES, YAW_GAINS
 
-#: Least movement of a heading setpoint that is an excitation, rad (5 degrees): less is drift of an estimate.
-LEAST_TURN = np.radians(5.0)
 #: Rate of yaw above which a vehicle turns, rad/s, and least distance of a setpoint from the heading that follows it,
 #: rad: at that rate a heading controller of 10 1/s lags by as much. A flight stack that is asked for a rate of yaw sets
 #: the setpoint to the heading.
@@ -104,7 +102,14 @@ def yaw_axis(experiment: Experiment) -> Experiment:
         raise TuningError(f"{experiment.source}: the log does not contain torque, rate and heading of yaw")
     signals = {name: getattr(yaw, name) for name in SIGNALS}
     columns = {name: None if signal is None else signal[:, None] for name, signal in signals.items()}
-    return replace(experiment, **columns, yaw=None, motors=None, amplitude=None)  # type: ignore[arg-type]
+    return replace(
+        experiment,
+        **columns,  # type: ignore[arg-type]  # of the names in Experiment
+        yaw=None,
+        motors=None,
+        amplitude=None,
+        segments=yaw.segments,
+    )
 
 
 def excited_yaw(experiment: Experiment) -> tuple[Experiment, NDArray[np.float64]]:
@@ -132,10 +137,10 @@ def _check_setpoint(axis: Experiment) -> None:
     assert axis.r_o is not None
     used = np.concatenate([np.arange(start, stop) for start, stop in axis.segments])
     moved = float(np.ptp(axis.r_o[used]))
-    if moved < LEAST_TURN:
+    if moved < MOVES:
         raise TuningError(
             f"nothing is injected on yaw, and its heading setpoint moves by {np.degrees(moved):.1f} degrees only (at "
-            f"least {np.degrees(LEAST_TURN):.0f})"
+            f"least {np.degrees(MOVES):.0f})"
         )
     turning = used[np.abs(axis.y_i[used, 0]) > TURNS]
     if len(turning) and np.median(np.abs(axis.r_o - axis.y_o)[turning]) < COPIED:
@@ -161,4 +166,4 @@ def all_axes(experiment: Experiment, yaw_unit: float = 1.0) -> Experiment:
         two, one = getattr(experiment, name), getattr(yaw, name)
         unit = yaw_unit if name in ("u", "u_bar") else 1.0
         joined[name] = None if two is None or one is None else np.hstack([two, one / unit])
-    return replace(experiment, **joined, yaw=None, motors=None, amplitude=None)
+    return replace(experiment, **joined, yaw=None, motors=None, amplitude=None, segments=experiment.all_segments)

@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
 
+#: How many times longer yaw's pulses are than those of roll and pitch, as in the firmware (`kYawHold`). Chosen: torque
+#: accelerates yaw 10 to 20 times less, so its loop is slower; pulses twice as long still excite it up to 8 Hz.
+YAW_HOLD = 2
+
 
 def hold_from_bandwidth(bandwidth: float, Ts: float) -> tuple[int, int]:
     """Hold times of a PRBS whose shortest pulse is half a period of `bandwidth`.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,14 @@ Signal = NDArray[np.float64]
 
 #: Names of the signals of an experiment, and of those of its yaw axis.
 SIGNALS = ("u", "y_i", "y_o", "u_bar", "r_bar", "r_o", "r_i")
+#: rad, peak to peak: attitude setpoints of a hover move less; chosen, as an estimator's attitude wanders by 1 to 3 deg.
+MOVES = np.radians(5.0)
+#: External signal -> what it is.
+EXTERNAL = {
+    "u_bar": "injected torque (u_bar)",
+    "r_bar": "injected rate setpoint (r_bar)",
+    "r_o": "attitude setpoint of a pilot or an off-board computer (r_o)",
+}
 #: Share of the samples that are within the size of a flight's manoeuvres.
 NEARLY_ALL = 0.999
 
@@ -26,6 +34,10 @@ class YawSignals:
 
     Attributes
     ----------
+    segments : tuple of (start, stop)
+        Stretches without a gap that tell about yaw, in samples, stop excluded: those in which yaw is excited, which
+        roll's and pitch's segments leave out. All signals of the experiment are known there, too. Empty: those of the
+        experiment.
     u : (N,) array
         Yaw torque (normalised) applied to the plant, after injection and saturation.
     y_i, y_o : (N,) arrays, rad/s, rad
@@ -45,6 +57,7 @@ class YawSignals:
     r_bar: Signal | None = None
     r_o: Signal | None = None
     r_i: Signal | None = None
+    segments: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,18 +119,25 @@ class Experiment:
     def __post_init__(self) -> None:
         if not self.segments:
             object.__setattr__(self, "segments", ((0, len(self.u)),))
+        yaw = self.yaw
+        if yaw is not None and not yaw.segments:
+            yaw = replace(yaw, segments=self.segments)
+            object.__setattr__(self, "yaw", yaw)
         for name in SIGNALS:
-            self._check(name, getattr(self, name), self.u.shape)
-            if self.yaw is not None:
-                self._check(f"yaw.{name}", getattr(self.yaw, name), self.u.shape[:1])
+            self._check(name, getattr(self, name), self.u.shape, self.segments)
+            if yaw is not None:
+                self._check(name, getattr(self, name), self.u.shape, yaw.segments)
+                self._check(f"yaw.{name}", getattr(yaw, name), self.u.shape[:1], yaw.segments)
 
-    def _check(self, name: str, signal: Signal | None, shape: tuple[int, ...]) -> None:
+    def _check(
+        self, name: str, signal: Signal | None, shape: tuple[int, ...], segments: tuple[tuple[int, int], ...]
+    ) -> None:
         """Refuse a signal of another shape, or with a sample in a segment that is not finite."""
         if signal is None:
             return
         if signal.shape != shape or self.u.ndim != 2:
             raise TuningError(f"{self.source}: {name}: got shape {signal.shape}, expected {shape}")
-        for start, stop in self.segments:
+        for start, stop in segments:
             if not 0 <= start < stop <= len(signal):
                 raise TuningError(f"{self.source}: segment {start}..{stop}: expected a part of 0..{len(signal)}")
             finite = np.isfinite(signal[start:stop])
@@ -132,6 +152,17 @@ class Experiment:
     def seconds(self) -> float:
         """Usable length of the flight, s."""
         return sum(stop - start for start, stop in self.segments) * self.Ts
+
+    @property
+    def all_segments(self) -> tuple[tuple[int, int], ...]:
+        """Stretches without a gap that tell about roll and pitch, or about yaw, in samples, stop excluded."""
+        joined: list[tuple[int, int]] = []
+        for start, stop in sorted((*self.segments, *(self.yaw.segments if self.yaw else ()))):
+            if joined and start <= joined[-1][1]:
+                before = joined.pop()
+                start, stop = before[0], max(stop, before[1])
+            joined.append((start, stop))
+        return tuple(joined)
 
 
 def external_signal(experiment: Experiment) -> tuple[Signal, str]:
@@ -164,6 +195,19 @@ def excited_segments(segments: Sequence[tuple[int, int]], signal: Signal) -> lis
         if len(moving):
             found.append((int(moving[0]), int(moving[-1]) + 1))
     return found
+
+
+def external_yaw_signal(yaw: YawSignals) -> tuple[Signal, str] | None:
+    """External signal of yaw, (N,), and its name, chosen as in `external_signal`; None: yaw is not excited.
+
+    A heading setpoint counts when it moves by `MOVES`.
+    """
+    for name in EXTERNAL:
+        signal = getattr(yaw, name)
+        least = MOVES if name == "r_o" else 0.0
+        if signal is not None and any(np.ptp(signal[start:stop]) > least for start, stop in yaw.segments):
+            return signal, name
+    return None
 
 
 def manoeuvre_size(angles: Signal) -> float:

@@ -10,8 +10,10 @@ them is `tuning.parameters`.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +141,9 @@ class Gains:
             matrix.flags.writeable = False
             object.__setattr__(self, name, matrix)
         for row in ROWS:
-            valid = replace(row.valid, highest=np.inf) if row.shape is Shape.POLE else row.valid  # a cut-off, Hz
+            valid, values = _valid(row), self._values(row)
+            if all(valid.holds(value) and not _exceeds_period(row, value, self.Ts) for value in values):
+                continue
             for where, value in self._named(row):
                 if not valid.holds(value):
                     raise TuningError(f"{where}: got {value}{_unit(row)}, expected {_expectation(valid)}")
@@ -364,6 +368,9 @@ class Gains:
         if stock is not None:
             moved = tuple(v * float(r) for v, r in zip(stock.derivative_feedforward, ratio, strict=True))
             stock = replace(stock, derivative_feedforward=moved)
+        of_yaw = deviations.get("yaw", {})
+        if of_yaw:
+            deviations["yaw"] = {n: v * float(ratio[2]) if n.endswith("_i") else v for n, v in of_yaw.items()}
         changed = replace(
             self,
             moment_scale=scale,
@@ -384,13 +391,19 @@ class Gains:
         write_atomically(Path(path), gains_to_toml(self))
 
 
+@cache
+def _valid(row: Row) -> Valid:
+    """Valid values of a row's numbers in a gains set."""
+    return replace(row.valid, highest=np.inf) if row.shape is Shape.POLE else row.valid  # a cut-off, Hz
+
+
 def _unit(row: Row) -> str:
     return f" {row.unit}" if row.unit and row.shape in (Shape.SCALAR, Shape.AXES) and row.unit != "norm" else ""
 
 
 def _exceeds_period(row: Row, value: float, Ts: float) -> bool:
     """Whether the product with the period is too large; in single precision, as the controller checks it."""
-    if not np.isfinite(row.largest_in_period):
+    if not math.isfinite(row.largest_in_period):
         return False
     with np.errstate(over="ignore"):
         return bool(np.float32(value) * np.float32(Ts) > np.float32(row.largest_in_period))

@@ -268,8 +268,9 @@ class Setting:
 
 #: The experiment in a vehicle's firmware: a PRBS added to the controller output.
 EXCITATION: tuple[Setting, ...] = (
-    Setting("MIMO_EX_AX", "", 0, 0, 3, True, "excite once: 0 none, 1 roll, 2 pitch, 3 roll then pitch"),
-    Setting("MIMO_EX_AMP", "norm", 0.1, 0.0, 0.5, False, "excitation: amplitude"),
+    Setting("MIMO_EX_AX", "", 0, 0, 5, True, "excite once: 1 roll, 2 pitch, 3 both, 4 yaw, 5 all, one by one"),
+    Setting("MIMO_EX_AMP", "norm", 0.1, 0.0, 0.5, False, "excitation: amplitude on roll and pitch"),
+    Setting("MIMO_EX_AMPY", "norm", 0.2, 0.0, 0.5, False, "excitation: amplitude on yaw"),
     Setting("MIMO_EX_HMIN", "", 10, 1, 10000, True, "excitation: shortest pulse, control periods"),
     Setting("MIMO_EX_HMAX", "", 60, 1, 10000, True, "excitation: longest pulse, control periods"),
     Setting("MIMO_EX_DUR", "s", 16.0, 0.1, 300.0, False, "excitation: time on each axis"),

@@ -27,7 +27,8 @@ class Provenance:
     inner_model, outer_model : tuple of 2 ContinuousModel, or None
         Reference models of the rate and the attitude loop, roll then pitch.
     standard_deviation : mapping
-        Matrix -> 2x2 list in its unit: the spread to expect if the flight were repeated with fresh noise.
+        Matrix -> 2x2 list in its unit: the spread to expect if the flight were repeated with fresh noise. ``yaw``:
+        gain -> number, where yaw was tuned.
     fit : tuple of float
         Share of the torque that each axis' rate regression explains, R^2.
     warnings : tuple of str
@@ -41,7 +42,7 @@ class Provenance:
     log_sha256: str = ""
     inner_model: Models | None = None
     outer_model: Models | None = None
-    standard_deviation: Mapping[str, list[list[float]]] = field(default_factory=dict)
+    standard_deviation: Mapping[str, Any] = field(default_factory=dict)
     fit: tuple[float, ...] = ()
     warnings: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)

@@ -11,7 +11,7 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = os.environ[
 
 import typer
 
-from mimopilot.cli import campaign, codegen, simulation, sitl, studies, tuning, vehicle
+from mimopilot.cli import campaign, codegen, field, simulation, sitl, studies, tuning, vehicle
 from mimopilot.common.errors import Error
 
 app = typer.Typer(
@@ -21,7 +21,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (studies, simulation, sitl, campaign, tuning, codegen, vehicle):
+for group in (studies, simulation, sitl, campaign, tuning, codegen, vehicle, field):
     group.register(app)
 
 

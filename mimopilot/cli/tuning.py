@@ -15,6 +15,7 @@ from mimopilot.cli.options import (
     ProfileOption,
     warn,
 )
+from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
 from mimopilot.common.console import print_json, print_table, progress_console
 from mimopilot.common.errors import check_not_given
 
@@ -148,6 +149,7 @@ def tune(
                 **found,
                 "derivative_cutoff_hz": gains.derivative_cutoff_hz,
                 "attitude_model": models["outer_model"][0],
+                "yaw": yaw_mapping(gains),
                 **comparison,
                 "certificate": certificate,
             }
@@ -156,6 +158,7 @@ def tune(
         names = " and ".join(log.name for log in logs)
         print_gains(f"{task.label.upper()} gains from {names} (standard deviation)", gains, deviations)
         print_comparison(gains, [log.name for log in logs])
+        print_yaw(gains)
         print_certificate(gains)
         print(f"written to {out}")
     if require_better and not comparison.get("better_than_flown", False):
@@ -291,6 +294,7 @@ def advise(
         print_json(
             {
                 "recommended": candidates[0],
+                "yaw": yaw_mapping(best.gains),
                 "nonminimum_phase_zero_rad_s": found.zero,
                 "candidates": candidates,
                 "refused": found.refused,
@@ -311,6 +315,7 @@ def advise(
     print_table(PREDICTED_TITLE.format(model="its own; flown: the recommended one's"), columns_shown, rows)
     for name, reason in found.refused.items():
         print(f"{name}: {reason}")
+    print_yaw(best.gains)
     print(
         "no non-minimum-phase zero from torque to rates"
         if found.zero is None
@@ -320,8 +325,6 @@ def advise(
 
 def print_certificate(gains: Gains) -> None:
     """Verdict, reason and margins of a certified set."""
-    from mimopilot.tuning.parameter_row import ROLL_PITCH
-
     certificate = gains.certificate
     assert certificate is not None
     figures = certificate.figures
@@ -336,7 +339,7 @@ def print_certificate(gains: Gains) -> None:
     if "predicted" not in gains.provenance.details:  # asked for a model of the rate loop
         delta = f"{figures['delta']:.2f} +- {figures['delta_error']:.2f}"
         rows.append(["small gain of the rate loop, delta", delta])
-    for axis in ROLL_PITCH:
+    for axis in figures["phase_margin_deg"]:
         kind = figures["gain_margin"][axis]
         gain = "gain not known" if kind == "not known" else f"{figures['gain_margin_db'][axis]:.1f} dB"
         phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
@@ -348,7 +351,9 @@ def print_certificate(gains: Gains) -> None:
             ]
         )
     low, high = certificate.band
+    rows += yaw_margins(figures)
     print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)
+    print_cross_terms(figures)
 
 
 def inspect(
@@ -432,7 +437,7 @@ def read_warned(log: Path, columns: Path | None) -> Experiment:
 
 
 def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None:
-    """The matrices of a set as a table, with standard deviations where they are known."""
+    """The matrices and the yaw gains of a set as a table, with standard deviations where they are known."""
     rows = []
     for name, matrix in gains.matrices.items():
         row = [name]
@@ -440,5 +445,5 @@ def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None
             for j in range(2):
                 text = f"{matrix[i][j]:.4f}"
                 row.append(f"{text} ({deviations[name][i][j]:.4f})" if name in deviations else text)
-        rows.append(row)
-    print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch"], rows)
+        rows.append([*row, yaw_cell(gains, name, deviations)])
+    print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch", "yaw"], rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 
 import matplotlib
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 #: Okabe-Ito colours (distinguishable with colour blindness); each has its own line style, for print.
@@ -16,9 +17,12 @@ PIXELS_PER_INCH = 160
 def svg(figure: Figure, name: str) -> str:
     """The figure as SVG text; the same data give the same bytes. `name` makes the ids unique within a page."""
     buffer = io.StringIO()
-    figure.draw_without_rendering()
-    figure.set_layout_engine("none")  # once is enough: savefig would compute the layout again
+    if (layout := figure.get_layout_engine()) is not None:
+        layout.execute(figure)
+    figure.set_layout_engine("none")
+    # `Figure.savefig` would draw three times as much: once for the layout, once to no purpose, once for the file.
+    figure.set_dpi(PIXELS_PER_INCH)
     with matplotlib.rc_context({"svg.hashsalt": f"mimopilot {name}"}):
-        figure.savefig(buffer, format="svg", dpi=PIXELS_PER_INCH, metadata={"Date": None, "Creator": None})
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]

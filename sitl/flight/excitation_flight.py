@@ -15,7 +15,7 @@ from mimopilot.common.parallel import processes, run_all
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.flight_log import save_flight
-from mimopilot.sitl.flight.scenario import excitation_flight
+from mimopilot.sitl.flight.scenario import EXCITED_AXES, excitation_flight
 from mimopilot.sitl.flight.simulator import Flight, fly
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY
@@ -23,6 +23,10 @@ from mimopilot.tuning.gains import Gains
 
 #: Largest amplitude (normalised) of the injected torque that is proposed, as in the demo.
 AMPLITUDE = 0.15
+#: The same of yaw, which a unit of torque accelerates 10 to 20 times less.
+YAW_AMPLITUDE = 0.3
+#: On a vehicle whose motors are not known: the default of MIMO_EX_AMPY.
+VEHICLE_YAW_AMPLITUDE = 0.2
 #: Share of the torque that saturates a motor in hover; chosen: the response of the loop and the other axes add to it.
 TORQUE_SHARE = 0.2
 
@@ -42,6 +46,10 @@ class ExperimentPlan:
         Seed of the injected torque; None: that of the flight, so that each flight has another excitation.
     both_axes : bool
         Excite roll and pitch at once, not one after the other.
+    axes : str
+        Axes to excite, see `sitl.flight.scenario.EXCITED_AXES`.
+    yaw_amplitude : float or None
+        On yaw; None: `default_yaw_amplitude`.
     """
 
     airframe: Airframe
@@ -51,17 +59,26 @@ class ExperimentPlan:
     bandwidth: float
     excitation_seed: int | None
     both_axes: bool = False
+    axes: str = "all"
+    yaw_amplitude: float | None = None
 
     @property
     def seconds(self) -> float:
         """Length of the flight, s."""
-        return self.seconds_per_axis * (1 if self.both_axes else 2)
+        return self.seconds_per_axis * (len(EXCITED_AXES[self.axes]) - self.both_axes)
 
     def fly(self, seed: int) -> Flight:
         """Fly the experiment; `seed` is that of the measurement noise."""
         generator = np.random.default_rng(seed if self.excitation_seed is None else self.excitation_seed)
         scenario = excitation_flight(
-            self.seconds_per_axis, self.amplitude, self.bandwidth, self.gains.Ts, generator, self.both_axes
+            self.seconds_per_axis,
+            self.amplitude,
+            self.bandwidth,
+            self.gains.Ts,
+            generator,
+            self.both_axes,
+            self.axes,
+            default_yaw_amplitude(self.airframe) if self.yaw_amplitude is None else self.yaw_amplitude,
         )
         return fly(self.airframe, Autopilot(self.airframe, self.gains), scenario, seed)
 
@@ -77,10 +94,19 @@ def default_amplitude(airframe: Airframe) -> float:
 
     The response of the loop and the other axes add to the injected torque, so only a share of the margin is used.
     """
+    return _unsaturated(airframe, slice(0, 2), AMPLITUDE)
+
+
+def default_yaw_amplitude(airframe: Airframe) -> float:
+    """The same on yaw: at most 0.3."""
+    return _unsaturated(airframe, slice(2, 3), YAW_AMPLITUDE)
+
+
+def _unsaturated(airframe: Airframe, axes: slice, largest: float) -> float:
     plant, allocation = airframe.plant(), airframe.allocation()
     hover = plant.mass * GRAVITY / (len(plant.rotors) * plant.thrust_max)
-    margin = min(hover, 1 - hover) / float(np.abs(allocation.mixer[:, :2]).max())
-    return min(AMPLITUDE, float(f"{TORQUE_SHARE * margin:.2g}"))
+    margin = min(hover, 1 - hover) / float(np.abs(allocation.mixer[:, axes]).max())
+    return min(largest, float(f"{TORQUE_SHARE * margin:.2g}"))
 
 
 def check_survived(flight: Flight) -> None:

@@ -32,9 +32,11 @@ from mimopilot.common.toml import checked, read_toml
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import Fault, make_fault, parse_fault
-from mimopilot.tuning.excitation import hold_from_bandwidth, prbs
+from mimopilot.tuning.excitation import YAW_HOLD, hold_from_bandwidth, prbs
 
 AXES = ("roll", "pitch")
+#: Name -> axes that an experiment excites, one after the other.
+EXCITED_AXES = {"roll": (0,), "pitch": (1,), "both": (0, 1), "yaw": (2,), "all": (0, 1, 2)}
 LEAD = 1.0  # s of hover before a manoeuvre; chosen: the measured rates and the integrators have settled
 #: Defaults of a manoeuvre, deg, s, s: the doublet of the thesis; the tail is chosen.
 AMPLITUDE_DEG, PERIOD_S, TAIL_S = 22.5, 0.42, 1.5
@@ -234,8 +236,10 @@ def excitation_flight(
     Ts: float,
     generator: np.random.Generator,
     together: bool = False,
+    axes: str = "both",
+    yaw_amplitude: float | None = None,
 ) -> Scenario:
-    """Hover with a PRBS torque injected on roll, then on pitch; or on both at once, each with its own.
+    """Hover with a PRBS torque injected on one axis after the other; or on roll and pitch at once, each with its own.
 
     Parameters
     ----------
@@ -250,23 +254,38 @@ def excitation_flight(
     generator : numpy.random.Generator
         Source of the pulse lengths.
     together : bool
-        Excite both axes at once, for `seconds_per_axis` in all.
+        Excite roll and pitch at once, for `seconds_per_axis`.
+    axes : str
+        One of `EXCITED_AXES`. The pulses of an axis do not depend on which others are excited.
+    yaw_amplitude : float, optional
+        Torque on yaw (normalised), at most 1; by default `amplitude`. Its pulses are `YAW_HOLD` times longer.
     """
     _check_length("seconds_per_axis", seconds_per_axis, Ts)
-    if not 0 < amplitude <= 1:
-        raise SitlError(f"amplitude: got {amplitude}, expected above 0 and at most 1, the largest torque")
+    if axes not in EXCITED_AXES:
+        raise SitlError(f"axis: got {axes!r}, expected one of {', '.join(EXCITED_AXES)}")
+    excited = EXCITED_AXES[axes]
+    if together and not {0, 1} <= set(excited):
+        raise SitlError(f"axis: got {axes!r}, expected both or all to excite roll and pitch at once")
+    amplitudes = (amplitude, amplitude, amplitude if yaw_amplitude is None else yaw_amplitude)
+    for name, value in zip(("amplitude", "yaw_amplitude"), amplitudes[1:], strict=True):
+        if not 0 < value <= 1:
+            raise SitlError(f"{name}: got {value}, expected above 0 and at most 1, the largest torque")
     hold_min, hold_max = hold_from_bandwidth(bandwidth, Ts)
-    if hold_max * Ts > seconds_per_axis:
+    longest = hold_max * (YAW_HOLD if 2 in excited else 1)
+    if longest * Ts > seconds_per_axis:
         raise SitlError(
-            f"bandwidth: at {bandwidth:g} rad/s a pulse may last {hold_max * Ts:.3g} s, longer than the "
+            f"bandwidth: at {bandwidth:g} rad/s a pulse may last {longest * Ts:.3g} s, longer than the "
             f"{seconds_per_axis:g} s on each axis; raise one of them"
         )
     samples = round(seconds_per_axis / Ts)
-    excitation = np.zeros((samples if together else 2 * samples, 3))
-    for axis in range(2):
-        start = 0 if together else axis * samples
-        samples_of_axis = slice(start, start + samples)
-        excitation[samples_of_axis, axis] = prbs(samples, amplitude, hold_min, hold_max, generator)
+    stretches = [(0, 1), *((axis,) for axis in excited if axis == 2)] if together else [(axis,) for axis in excited]
+    excitation = np.zeros((len(stretches) * samples, 3))
+    for axis in range(max(excited) + 1):
+        longer = YAW_HOLD if axis == 2 else 1
+        pulses = prbs(samples, amplitudes[axis], longer * hold_min, longer * hold_max, generator)
+        for number, stretch in enumerate(stretches):
+            if axis in stretch:
+                excitation[number * samples : (number + 1) * samples, axis] = pulses
     return Scenario("experiment", Ts, np.zeros_like(excitation), excitation, 0, (0, len(excitation)))
 
 

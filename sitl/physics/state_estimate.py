@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.signal import butter
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.compiled_step import inlined
@@ -48,8 +47,11 @@ def low_pass(cutoff_hz: float, Ts: float) -> NDArray[np.float64]:
         )
     if cutoff_hz == 0:
         return np.array([1.0, 0.0, 0.0, 0.0, 0.0])
-    b, a = butter(2, cutoff_hz, fs=1 / Ts)
-    return np.concatenate([b, a[1:]]).astype(np.float64)
+    # Bilinear transform, with the cut-off prewarped, of 1 / (s^2 + sqrt(2) s + 1).
+    s = np.tan(np.pi * cutoff_hz * Ts)
+    scale = 1 + np.sqrt(2) * s + s**2
+    b0 = s**2 / scale
+    return np.array([b0, 2 * b0, b0, 2 * (s**2 - 1) / scale, (1 - np.sqrt(2) * s + s**2) / scale])
 
 
 def frame_mode(frequency_hz: float, damping: float, gain: float, Ts: float) -> NDArray[np.float64]:

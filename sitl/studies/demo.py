@@ -18,6 +18,7 @@ from mimopilot.common.files import inside
 from mimopilot.common.html_report import ReportTable, Section, write_report
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.flight.excitation_flight import default_yaw_amplitude
 from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
 from mimopilot.sitl.flight.flight_log import save_flight
 from mimopilot.sitl.flight.metrics import Performance, performance
@@ -104,10 +105,13 @@ def run_demo(out: Path, seed: int) -> DemoSummary:
     vehicle = load_airframe(AIRFRAME)
     airframe, gains = vehicle.airframe, {"default": vehicle.default_gains()}
 
-    with _stage("experiment: 40 s of flight with a PRBS torque on roll, then on pitch (the first run compiles)"):
+    with _stage("experiment: 60 s of flight with a PRBS torque on roll, pitch, then yaw (the first run compiles)"):
         controllers = {"default": _controller(gains["default"], firmware["default"])}
         generator = np.random.default_rng(seed)
-        scenario = excitation_flight(SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH, gains["default"].Ts, generator)
+        yaw = default_yaw_amplitude(airframe)
+        scenario = excitation_flight(
+            SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH, gains["default"].Ts, generator, axes="all", yaw_amplitude=yaw
+        )
         autopilot = Autopilot(airframe, gains["default"], controllers["default"])
         flight = _survived(fly(airframe, autopilot, scenario, seed))
         save_flight(log, flight, airframe, gains["default"])
@@ -255,7 +259,7 @@ def _write_report(
     ]
     lead = (
         "ADAM-0 with 10 % inertia coupling (class values: the thesis prints no inertia), tuned from one "
-        f"{2 * SECONDS_PER_AXIS:g} s closed-loop flight without a model of the vehicle. The design finds the attitude "
+        f"{3 * SECONDS_PER_AXIS:g} s closed-loop flight without a model of the vehicle. The design finds the attitude "
         f"model that can be followed within its limits: {outer.label} (rad/s, damping, delay in samples). SISO: the "
         "same design, axis by axis."
     )
@@ -263,8 +267,8 @@ def _write_report(
     sections = [
         Section(
             "Experiment",
-            f"PRBS torque of amplitude {AMPLITUDE:g} and bandwidth {BANDWIDTH:g} rad/s on roll, then on pitch, "
-            "under the flown gains.",
+            f"PRBS torque on roll, then on pitch (amplitude {AMPLITUDE:g}, bandwidth {BANDWIDTH:g} rad/s), then on yaw "
+            f"({np.abs(experiment.scenario.excitation[:, 2]).max():g}, half the bandwidth), under the flown gains.",
             figures=[svg(experiment_figure(experiment), "experiment")],
         ),
         Section(

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.tuning.analysis.closed_loop import singular_values
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ERROR, RATE, SETPOINT, rate_matrices, state_space
 from mimopilot.tuning.reference_model import ReferenceModel
+from mimopilot.tuning.small_matrices import singular_values
 from mimopilot.tuning.statespace import StateSpace
 
 #: Poles slower than this are dominant, rad/s: three times the usual attitude model. Faster ones are those of rotors,

@@ -160,8 +160,8 @@ class Transcript:
         Return values of start, stop and status.
     other : list of str
         Remaining lines.
-    announced : list of bool
-        For each row of `out`: whether the module published the excitation, too.
+    names : list of str
+        For each row of `out`: the name with which the module published the excitation, or "silent".
     """
 
     out: np.ndarray
@@ -169,7 +169,12 @@ class Transcript:
     log: list[str]
     exits: list[int]
     other: list[str]
-    announced: list[bool]
+    names: list[str]
+
+    @property
+    def announced(self) -> np.ndarray:
+        """For each row of `out`: whether the module published the excitation, too, (N,)."""
+        return np.array(self.names) != "silent"
 
 
 def drive(program: Path, commands: Iterable[str]) -> Transcript:
@@ -178,13 +183,13 @@ def drive(program: Path, commands: Iterable[str]) -> Transcript:
     result = subprocess.run([str(program)], input=text, capture_output=True, text=True, check=False, timeout=60)
     assert result.returncode == 0, result.stdout[-500:] + result.stderr
     assert "two publishers" not in result.stdout
-    rows, ticks, log, exits, other, announced = [], [], [], [], [], []
+    rows, ticks, log, exits, other, names = [], [], [], [], [], []
     for line in result.stdout.splitlines():
         kind, _, rest = line.partition(" ")
         if kind == "out":
             words = rest.split()
-            assert words[-1] in ("MIMO_EXC", "silent")
-            announced.append(words[-1] == "MIMO_EXC")
+            assert words[-1] in ("MIMO_EXC", "MIMO_EXY", "silent")
+            names.append(words[-1])
             rows.append([int(word, 16) for word in words[1:-1]])
         if kind in ("out", "quiet"):
             ticks.append(kind == "out")
@@ -195,4 +200,4 @@ def drive(program: Path, commands: Iterable[str]) -> Transcript:
         else:
             other.append(line)
     out = np.array(rows, np.uint32).reshape(len(rows), sum(WORDS.values())).view(OUT)[:, 0]
-    return Transcript(out, ticks, log, exits, other, announced)
+    return Transcript(out, ticks, log, exits, other, names)

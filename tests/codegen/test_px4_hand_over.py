@@ -105,7 +105,7 @@ def test_a_change_ends_the_excitation(program):
     x = result.out["excitation"][:, 0]
     change = int(np.flatnonzero(np.diff(np.array(result.ticks[1:], int)) < 0)[0])
     assert x[change - 1] != 0 and not x[change:].any()
-    assert any("on the ground or disarmed" in line or "stopped: mode" in line for line in result.log)
+    assert any("on the ground or disarmed" in line or "stop: mode" in line for line in result.log)
     assert lines(result, "excitation ended") == ["excitation ended 0 0 -1"]
 
 

@@ -252,6 +252,35 @@ def test_the_excitation_runs_once_on_roll_then_pitch_and_is_published(program, g
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
 
 
+def test_yaw_follows_roll_and_pitch_with_its_own_amplitude_longer_pulses_and_name(program, gains):
+    result = excited(program, axis=5, seconds=1.0, steps=1600, settings=["param MIMO_EX_AMPY 0.25"])
+    x, y, code = result.out["excitation"].T
+    stretches = [np.flatnonzero(code == value) for value in (0, 1, 3)]
+    roll, pitch, yaw = stretches
+    assert [len(stretch) for stretch in stretches] == [250] * 3 and np.count_nonzero(code == 2) == 500
+    assert pitch[0] - roll[-1] == yaw[0] - pitch[-1] == 251
+    on_yaw = np.array(result.names) == "MIMO_EXY"
+    assert np.array_equal(np.flatnonzero(on_yaw), np.append(yaw, yaw[-1] + 1))  # and the first sample without
+    assert set(np.abs(x[roll])) == {np.float32(0.1)} and set(np.abs(x[yaw])) == {np.float32(0.25)}
+    assert x[yaw[-1] + 1] == 0 and code[yaw[-1] + 1] == -1
+    short, long = (pulses(np.sign(values)) for values in (x[roll], x[yaw]))
+    assert short.min() >= 2 and short.max() <= 9 and long.min() >= 4 and long.max() <= 18 and long.max() > 9
+    # The core gets it, and the topic says how far the vehicle has turned: it stands still here.
+    injected = np.column_stack([np.where(on_yaw, 0, x), np.where(on_yaw, 0, y), np.where(on_yaw, x, 0)])
+    assert_same_bits(result.out["torque"], native_outputs(gains, level_inputs(len(x), excitation=injected))["moment"])
+    assert not y[on_yaw].any()
+
+
+@pytest.mark.parametrize(("rate", "samples"), [(2.1, 0), (-2.1, 0), (1.9, 105), (-1.2, 166)])
+def test_yaw_stops_when_it_turns_faster_than_2_rad_s_or_by_more_than_0_8_rad(program, rate, samples):
+    setup = ["param MIMO_EX_DUR 10", *AIRBORNE, *[STEP] * 300, "param MIMO_EX_AX 4", *[STEP] * 300]
+    result = drive(program, [*setup, *[f"gyro 4000 0 0 {rate}"] * 300, "status"])
+    running = np.flatnonzero(result.out["excitation"][:, 2] == 3)
+    assert running[-1] - 599 == pytest.approx(samples, abs=1)
+    assert abs(result.out["excitation"][running[-1], 1]) == pytest.approx(abs(rate) * 0.004 * samples, abs=0.01)
+    assert last_end(result).endswith("stop: turned")
+
+
 def test_the_parts_of_the_torque_are_published_fifty_times_a_second(program):
     gains = coupled_gains()
     elements = [f"param MIMO_{code} {text(value)}" for code, value in gains.elements().items() if code != "TS"]
@@ -272,10 +301,11 @@ def test_the_parts_of_the_torque_are_published_fifty_times_a_second(program):
     assert (np.abs(parts[:, [0, 1, 2, 4], :2]).max(axis=0) > 1e-3).all() and not parts[:, 4, 2].any()
 
 
-@pytest.mark.parametrize(("axis", "column"), [(1, 0), (2, 1)])
+@pytest.mark.parametrize(("axis", "column"), [(1, 0), (2, 1), (4, 0)])
 def test_one_axis_alone_can_be_excited(program, axis, column):
     excitation = excited(program, axis=axis).out["excitation"]
     assert np.count_nonzero(excitation[:, column]) == 50
+    assert set(excitation[:, 2]) == {-1.0, {1: 0.0, 2: 1.0, 4: 3.0}[axis]}
     assert not excitation[:, 1 - column].any()
 
 
@@ -324,7 +354,10 @@ def test_an_axis_set_before_the_start_excites_nothing(program):
     assert not active(drive(program, commands)).any()
 
 
-@pytest.mark.parametrize("setting", ["MIMO_EX_AMP nan", "MIMO_EX_AMP 0.9", "MIMO_EX_HMIN 0", "MIMO_EX_HMAX 1"])
+@pytest.mark.parametrize(
+    "setting",
+    ["MIMO_EX_AMP nan", "MIMO_EX_AMPY 0.6", "MIMO_EX_AMPY nan", "MIMO_EX_AMP 0.9", "MIMO_EX_HMIN 0", "MIMO_EX_HMAX 1"],
+)
 def test_invalid_excitation_settings_are_refused(program, setting):
     result = excited(program, settings=[f"param {setting}"])
     assert not active(result).any()

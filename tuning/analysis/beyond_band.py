@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 from scipy.optimize import isotonic_regression
 
 from mimopilot.tuning.analysis import margins
-from mimopilot.tuning.analysis.closed_loop import cascade_loop, singular_values
+from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.law import cascade_response
 from mimopilot.tuning.plant.frequency_response import COHERENT, PlantResponse
+from mimopilot.tuning.small_matrices import singular_values
 
 #: Largest gain of the rate loop above the band: 6 dB below instability, if the plant falls like an integrator there.
 MAX_GAIN_ABOVE_BAND = 0.5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,14 +12,15 @@ from mimopilot.tuning.axes import law_of
 from mimopilot.tuning.certificate import Certificate, Thresholds, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import ReferenceModel
 
 #: Verdicts on a loop, the best first: a set has the worst of its parts.
 ORDER = (Verdict.CERTIFIED, Verdict.THIN, Verdict.NOT_CERTIFIED, Verdict.UNSTABLE)
-#: Figures of yaw in the certificate.
-YAW_FIGURES = ("Ms", "Ms_error")
-YAW_AXIS_FIGURES = (
+#: Figures of a loop, and those of each axis, that the certificate holds of yaw by itself.
+LOOP_FIGURES = ("Ms", "Ms_error")
+AXIS_FIGURES = (
     "phase_margin_deg",
     "phase_margin_error_deg",
     "delay_margin_ms",
@@ -58,6 +59,8 @@ def certify_axes(
         return replace(found, figures={**found.figures, "yaw": {"verdict": NOT_EXAMINED, "reason": unknown}})
     found = _worst(found, yaw.verdict, f"yaw: {yaw.reason}")
     found = replace(found, figures={**found.figures, "yaw": _yaw_table(yaw)})
+    if not yaw.figures:  # unstable by itself
+        return found
     try:
         plant = measured.all_axes.at_period(gains.Ts)
         cross = examine_cross_terms(law_of(gains, 3, measured.yaw_unit), plant, [*inner, inner[0]])
@@ -88,8 +91,8 @@ def yaw_certificate(
 def _yaw_table(yaw: Certificate) -> dict[str, Any]:
     """Figures of yaw as plain values; the verdict first."""
     table: dict[str, Any] = {"verdict": str(yaw.verdict), "reason": yaw.reason, "band": list(yaw.band)}
-    table |= {name: yaw.figures[name] for name in YAW_FIGURES if name in yaw.figures}
-    return table | {name: yaw.figures[name]["yaw"] for name in YAW_AXIS_FIGURES if name in yaw.figures}
+    table |= {name: yaw.figures[name] for name in LOOP_FIGURES if name in yaw.figures}
+    return table | {name: yaw.figures[name]["yaw"] for name in AXIS_FIGURES if name in yaw.figures}
 
 
 def _worst(found: Certificate, verdict: Verdict, reason: str) -> Certificate:
@@ -100,12 +103,11 @@ def _worst(found: Certificate, verdict: Verdict, reason: str) -> Certificate:
 
 
 def _with_cross_terms(found: Certificate, cross: CrossTerms, thresholds: Thresholds) -> Certificate:
-    """The certificate with the cross terms and, where they matter, the figures of all three axes."""
-    table = {"yaw": found.figures["yaw"], "cross_terms": cross.as_table()}
-    if not cross.figures:
-        return replace(found, figures={**found.figures, **table})
-    figures = {**found.figures, **cross.figures, **table}
-    figures["Ms"] = max(found.figures["Ms"], cross.figures["Ms"])
+    """The certificate with the cross terms and, where they matter, the thinnest margins with and without them."""
+    figures = {**found.figures, "cross_terms": cross.as_table()}
+    if cross.figures is None:
+        return replace(found, figures=figures)
+    figures |= _thinnest(found.figures, cross.figures)
     found = _worst(replace(found, figures=figures), cross.verdict, cross.reason)
     for limits, verdict in (
         ((thresholds.thin_Ms, thresholds.thin_phase_deg), Verdict.NOT_CERTIFIED),
@@ -114,4 +116,26 @@ def _with_cross_terms(found: Certificate, cross: CrossTerms, thresholds: Thresho
         missed = missed_thresholds(figures, *limits)
         if missed:
             return _worst(found, verdict, "; ".join(["with the cross terms of yaw", *missed]))
+    return found
+
+
+def _thinnest(alone: Mapping[str, Any], whole: Mapping[str, Any]) -> dict[str, Any]:
+    """The thinner of each margin of the blocks by themselves and of all three axes.
+
+    The blocks are known in wider bands, so a margin of theirs that is exact is not replaced by a bound.
+    """
+    thinner = max((alone, whole), key=lambda one: one["Ms"] + one["Ms_error"])
+    smaller = min((alone, whole), key=lambda one: one["disk_margin"])
+    found: dict[str, Any] = {name: thinner[name] for name in LOOP_FIGURES}
+    found |= {name: smaller[name] for name in ("disk_margin", "simultaneous_gain_db", "simultaneous_phase_deg")}
+    found |= {name: {} for name in AXIS_FIGURES}
+    for axis in AXES:
+        both = [
+            {name: alone["yaw"][name] if axis == "yaw" else alone[name][axis] for name in AXIS_FIGURES},
+            {name: whole[name][axis] for name in AXIS_FIGURES},
+        ]
+        phase = min(both, key=lambda one: one["phase_margin_deg"] - one["phase_margin_error_deg"])
+        gain = min(both[: 2 if both[1]["gain_margin"] == "exact" else 1], key=lambda one: one["gain_margin_db"])
+        for name in AXIS_FIGURES:
+            found[name][axis] = (gain if name.startswith("gain") else phase)[name]
     return found

@@ -20,23 +20,6 @@ Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
 
-def singular_values(matrices: Complex) -> tuple[Signal, Signal]:
-    """Largest and smallest singular value of matrices (..., n, n), each (...).
-
-    Those of 2x2 matrices in closed form: LAPACK's would take half of a tuning's time.
-    """
-    if matrices.shape[-1] == 1:
-        only: Signal = np.abs(matrices[..., 0, 0])
-        return only, only
-    if matrices.shape[-1] > 2:
-        values: Signal = np.linalg.svd(matrices, compute_uv=False).astype(np.float64)
-        return values[..., 0], values[..., -1]
-    size = np.sum(np.abs(matrices) ** 2, axis=(-2, -1))
-    determinant = np.abs(matrices[..., 0, 0] * matrices[..., 1, 1] - matrices[..., 0, 1] * matrices[..., 1, 0])
-    largest = np.sqrt((size + np.sqrt(np.maximum(size**2 - 4 * determinant**2, 0.0))) / 2)
-    return largest, determinant / np.where(largest > 0, largest, 1.0)
-
-
 @dataclass(frozen=True, eq=False)
 class CascadeLoop:
     """Frequency responses of a gain set around a plant, (K, n, n) each.

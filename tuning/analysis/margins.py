@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop
 from mimopilot.tuning.axes import axis_names
+from mimopilot.tuning.small_matrices import inverse, singular_values
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
@@ -16,13 +17,12 @@ Signal = NDArray[np.float64]
 
 def sensitivity(loop: CascadeLoop) -> Complex:
     """S = (I + L_u)^-1 at the plant's input, (K, n, n)."""
-    S: Complex = np.linalg.inv(np.eye(loop.L_u.shape[-1]) + loop.L_u).astype(np.complex128)
-    return S
+    return inverse(np.eye(loop.L_u.shape[-1]) + loop.L_u)
 
 
 def peak(S: Complex) -> float:
     """Ms: the largest singular value of a sensitivity (K, n, n) over all frequencies."""
-    return float(np.linalg.norm(S, ord=2, axis=(1, 2)).max())
+    return float(singular_values(S)[0].max())
 
 
 def disk_margin(S: Complex) -> float:

@@ -12,6 +12,7 @@ from mimopilot.tuning.analysis.closed_loop import CascadeLoop, cascade_loop
 from mimopilot.tuning.axes import Law, axis_names
 from mimopilot.tuning.plant.frequency_response import DRAWS, PlantResponse
 from mimopilot.tuning.reference_model import ReferenceModel
+from mimopilot.tuning.small_matrices import singular_values
 
 #: Largest relative step between neighbouring frequencies. Near instability the sensitivity's peak is narrower than the
 #: measured response's own grid.
@@ -55,7 +56,7 @@ def stability_figures(
 
     def delta(loop: CascadeLoop) -> float:
         # D_M = M - (I - M) G K; G K and K G have the same loop, here cut at u.
-        return float(np.linalg.norm(m - (identity - m) @ loop.L_i, ord=2, axis=(1, 2)).max())
+        return float(singular_values(m - (identity - m) @ loop.L_i)[0].max())
 
     S = margins.sensitivity(nominal)
     loops = margins.axis_loops(S)

@@ -75,9 +75,7 @@ def tune(
     fastest = min(model.bandwidth for model in spec.continuous("outer"))
     yaw = tune_yaw(estimates, spec, tuned, fastest)
     tuned, yaw, certificate = with_yaw(tuned, yaw, lambda gains: _certificate(gains, estimates[0], spec))
-    details = {**tuned.provenance.details, "yaw": yaw.details}
-    provenance = replace(tuned.provenance, details=details, warnings=(*tuned.provenance.warnings, *yaw.warnings))
-    tuned = replace(tuned, provenance=provenance).with_certificate(certificate)
+    tuned = replace(tuned, provenance=yaw.provenance(tuned.provenance)).with_certificate(certificate)
     verdict, reason = tuned.verdict()
     if verdict == Verdict.UNSTABLE:
         raise TuningError(

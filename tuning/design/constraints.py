@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.beyond_band import MAX_GAIN_ABOVE_BAND, falling_gain
-from mimopilot.tuning.analysis.closed_loop import singular_values
 from mimopilot.tuning.design.conic_problem import ConicProblem
 from mimopilot.tuning.design.free_gains import FreeGains
 from mimopilot.tuning.design.loop_gradient import LETTERS, LoopGradient, ProductGradient
@@ -25,6 +24,7 @@ from mimopilot.tuning.law import rate_response
 from mimopilot.tuning.plant.frequency_response import COHERENT
 from mimopilot.tuning.plant.response_shape import shape_response
 from mimopilot.tuning.plant.wide_response import WideResponse
+from mimopilot.tuning.small_matrices import inverse, singular_values
 
 #: Distance to its limit above which a frequency is left out of the next step: the step hardly reaches so far, and the
 #: one after sees it.
@@ -88,7 +88,7 @@ class Distance:
         where, eye = self.where, np.eye(loop.plant.axes)
         if self.cut is Cut.ATTITUDE:
             S = eye - loop.T[where]
-            P = np.linalg.inv(S).astype(np.complex128)
+            P = inverse(S)
             return (
                 P,
                 ProductGradient(loop.dT.left[where] @ P.transpose(0, 2, 1), loop.dT.right[where] @ P),

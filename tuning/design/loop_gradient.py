@@ -29,6 +29,7 @@ from mimopilot.tuning.law import (
     rate_response,
 )
 from mimopilot.tuning.plant.wide_response import WideResponse
+from mimopilot.tuning.small_matrices import inverse
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
@@ -125,7 +126,7 @@ class LoopGradient:
     @cached_property
     def S(self) -> Complex:  # noqa: N802
         """Sensitivity at u, (K, n, n)."""
-        return np.linalg.inv(np.eye(self.plant.axes) + self.L_u).astype(np.complex128)
+        return inverse(np.eye(self.plant.axes) + self.L_u)
 
     @cached_property
     def _model(self) -> tuple[Complex, Complex, Complex]:

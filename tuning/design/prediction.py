@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mimopilot.tuning.analysis.closed_loop import singular_values
 from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, Manoeuvres, manoeuvres
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.reference_model import second_order
+from mimopilot.tuning.small_matrices import singular_values
 from mimopilot.tuning.spec import DesignLimits
 
 #: Time after a doublet that its RMS counts, s.

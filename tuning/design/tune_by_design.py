@@ -89,17 +89,16 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
         inner_model=(inner, inner),
         outer_model=(found.model, found.model),
         standard_deviation={name: value.tolist() for name, value in bench.deviations(found).items()},
-        warnings=(*warnings, *yaw.warnings),
+        warnings=tuple(warnings),
         details={
             "structure": spec.structure,
             "start": origin,
             "limited_by": found.active,
             "design": spec.design.model_dump(),
-            "yaw": yaw.details,
             **comparison(found, measured, bench, spec),
         },
     )
-    return replace(gains, provenance=provenance).with_certificate(final)
+    return replace(gains, provenance=yaw.provenance(provenance)).with_certificate(final)
 
 
 def starting_points(

@@ -7,15 +7,17 @@ heading whose bandwidth is found, within the certificate's margins, the flown no
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
+from mimopilot.tuning.analysis.certify_axes import ORDER
 from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.axes import AxesLaw, Law, flown_law, law_of
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.certified_design import certified_design, rate_model, uncertified
+from mimopilot.tuning.design.descent import INFEASIBLE
 from mimopilot.tuning.design.prediction import Prediction, predict, reasons_to_keep
 from mimopilot.tuning.design.quality_checks import check_saturation
 from mimopilot.tuning.design.response_design import BANDWIDTHS, Design, ResponseDesign
@@ -25,6 +27,7 @@ from mimopilot.tuning.gains import Gains, YawGains
 from mimopilot.tuning.parameters import YAW_GAINS
 from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
+from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import SecondOrder
 from mimopilot.tuning.spec import TuningSpec
 
@@ -45,13 +48,16 @@ class YawTuning:
     gains : YawGains
     details : mapping
         Plain values for the provenance. ``kept``: why the gains are the flown ones, else missing. Where yaw is excited:
-        ``excited_by`` and ``logs``; where it was designed: ``attitude_model``, ``standard_deviation``, ``limited_by``,
-        ``predicted`` by log of the ``tuned`` and the ``flown`` gains, ``flown_bandwidth``, ``better_than_flown``.
+        ``excited_by`` and ``logs``; where it was designed: ``attitude_model``, ``limited_by``, ``predicted`` by log of
+        the ``tuned`` and the ``flown`` gains, ``flown_bandwidth``, ``better_than_flown``.
+    deviations : mapping
+        Gain -> standard deviation in its unit; empty: kept.
     warnings : tuple of str
     """
 
     gains: YawGains
     details: dict[str, Any]
+    deviations: dict[str, float] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
     @property
@@ -59,10 +65,17 @@ class YawTuning:
         """Whether the gains are designed."""
         return "kept" not in self.details
 
-    def kept(self, gains: YawGains, reason: str) -> YawTuning:
-        """The flown gains instead, and why."""
+    def provenance(self, origin: Provenance) -> Provenance:
+        """The origin of a set with these yaw gains."""
+        deviations = {**origin.standard_deviation, **({"yaw": self.deviations} if self.deviations else {})}
+        warnings = tuple(dict.fromkeys([*origin.warnings, *self.warnings]))
+        details = {**origin.details, "yaw": self.details}
+        return replace(origin, standard_deviation=deviations, warnings=warnings, details=details)
+
+    def keep(self, gains: YawGains, reason: str) -> YawTuning:
+        """The gains that flew instead, and why."""
         details = {name: value for name, value in self.details.items() if name in ("excited_by", "logs", "predicted")}
-        return YawTuning(gains, {"kept": reason, **details}, self.warnings)
+        return YawTuning(gains, {"kept": reason, **details}, warnings=self.warnings)
 
 
 def tune_yaw(measured: Sequence[PlantEstimates], spec: TuningSpec, base: Gains, fastest: float) -> YawTuning:
@@ -94,21 +107,21 @@ def tune_yaw(measured: Sequence[PlantEstimates], spec: TuningSpec, base: Gains, 
         inner = rate_model(bench)
         design, certificates = certified_design(bench, excited, spec, _starts(base, bench, inner), inner)
     except TuningError as error:
-        return found.kept(base.yaw, str(error))
+        return found.keep(base.yaw, str(error))
     found = replace(found, warnings=warnings)
     missing = uncertified(certificates)
     if missing:
         limits = f"; the design is limited by {', '.join(design.active)}" if design.active else ""
-        return found.kept(base.yaw, f"no yaw gains of this structure are certified: {missing[0].reason}{limits}")
-    figures, keep = _comparison(design, excited, bench, spec)
+        return found.keep(base.yaw, f"no yaw gains of this structure are certified: {missing[0].reason}{limits}")
+    figures, reasons = _comparison(design, excited, bench, spec)
     details |= {
         "attitude_model": design.model.as_table(),
-        "standard_deviation": {name: value.item() for name, value in bench.deviations(design).items()},
         "limited_by": design.active,
         **figures,
     }
-    found = replace(found, gains=_yaw_gains(design.law), details=details)
-    return found.kept(base.yaw, "; ".join(keep)) if keep else found
+    deviations = {name: value.item() for name, value in bench.deviations(design).items()}
+    found = replace(found, gains=_yaw_gains(design), details=details, deviations=deviations)
+    return found.keep(base.yaw, f"the design is not better: {'; '.join(reasons)}") if reasons else found
 
 
 def _excited(measured: Sequence[PlantEstimates]) -> tuple[list[PlantEstimates], list[str]]:
@@ -138,8 +151,13 @@ def _starts(base: Gains, bench: ResponseDesign, inner: SecondOrder) -> list[Law]
     return [law, replace(law, Kp_o=np.array([[ATTITUDE_SHARE * inner.omega]]), Kp_i=rate, Ki_i=rate)]
 
 
-def _yaw_gains(law: Law) -> YawGains:
-    return YawGains(**{name: getattr(law, name).item() for name in YAW_GAINS})
+def _yaw_gains(design: Design) -> YawGains:
+    """The scalars; a bound at 0 that the design keeps to its tolerance is kept exactly."""
+    units, found = design.task.free.units, {}
+    for name in YAW_GAINS:
+        value = getattr(design.law, name).item()
+        found[name] = 0.0 if abs(value) < INFEASIBLE * units.get(name, 0.0) else value
+    return YawGains(**found)
 
 
 def _comparison(
@@ -167,7 +185,7 @@ def _plain(figures: Prediction) -> dict[str, float]:
 def with_yaw(
     gains: Gains, yaw: YawTuning, certified: Callable[[Gains], Certificate]
 ) -> tuple[Gains, YawTuning, Certificate]:
-    """A set of roll and pitch with tuned yaw gains and its certificate; with the flown ones if it lacks that.
+    """A set of roll and pitch with tuned yaw gains and its certificate; with the flown ones if those are better.
 
     Parameters
     ----------
@@ -178,11 +196,11 @@ def with_yaw(
         Examines a set on all its axes.
     """
     found = replace(gains, yaw=yaw.gains)
-    verdict = certified(found)
-    if not yaw.tuned or verdict.verdict == Verdict.CERTIFIED:
-        return found, yaw, verdict
-    return (
-        gains,
-        yaw.kept(gains.yaw, f"with roll and pitch the tuned ones are {verdict.verdict}: {verdict.reason}"),
-        (certified(gains)),
-    )
+    certificate = certified(found)
+    if not yaw.tuned or certificate.verdict == Verdict.CERTIFIED:
+        return found, yaw, certificate
+    flown = certified(gains)
+    if ORDER.index(certificate.verdict) <= ORDER.index(flown.verdict):
+        return found, yaw, certificate
+    reason = f"with roll and pitch, the tuned ones are {certificate.verdict}: {certificate.reason}"
+    return gains, yaw.keep(gains.yaw, reason), flown

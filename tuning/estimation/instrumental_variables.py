@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +22,7 @@ SAME_EXCITATION = 0.99
 SAME_PERIOD = 1e-6
 
 Signal = NDArray[np.float64]
+Segments = tuple[tuple[int, int], ...]
 Stretches = list[tuple[slice, list[tuple[int, int]]]]
 
 
@@ -147,21 +147,26 @@ def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment
             f"{np.max(likeness) / size:.2f}); give a second flight with the same amplitude, hold times and seed"
         )
     start, stop = max(shift, 0), min(len(one), len(other) + shift)
-    shared = [
-        (max(a, c + shift) - start, min(b, d + shift) - start)
-        for a, b in first.segments
-        for c, d in second.segments
-        if max(a, c + shift) < min(b, d + shift)
-    ]
-    return _cut(first, start, stop, shared), _cut(second, start - shift, stop - shift, shared)
+
+    def shared(segments: Segments, others: Segments) -> Segments:
+        return tuple(
+            (max(a, c + shift) - start, min(b, d + shift) - start)
+            for a, b in segments
+            for c, d in others
+            if max(a, c + shift) < min(b, d + shift)
+        )
+
+    kept = shared(first.segments, second.segments)
+    of_yaw = shared(first.yaw.segments, second.yaw.segments) if first.yaw and second.yaw else ()
+    return _cut(first, start, stop, kept, of_yaw), _cut(second, start - shift, stop - shift, kept, of_yaw)
 
 
-def _cut(experiment: Experiment, start: int, stop: int, segments: Sequence[tuple[int, int]]) -> Experiment:
-    """Rows start..stop of all signals."""
+def _cut(experiment: Experiment, start: int, stop: int, segments: Segments, of_yaw: Segments) -> Experiment:
+    """Rows start..stop of all signals; without yaw where both flights have none of its segments."""
 
     def cut(signals: Experiment | YawSignals) -> dict[str, Any]:
         values = {name: getattr(signals, name) for name in SIGNALS}
         return {name: None if value is None else value[start:stop] for name, value in values.items()}
 
-    yaw = None if experiment.yaw is None else YawSignals(**cut(experiment.yaw))
-    return replace(experiment, **cut(experiment), yaw=yaw, segments=tuple(segments))
+    yaw = YawSignals(**cut(experiment.yaw), segments=of_yaw) if experiment.yaw and of_yaw else None
+    return replace(experiment, **cut(experiment), yaw=yaw, segments=segments)

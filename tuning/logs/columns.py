@@ -24,6 +24,8 @@ SIGNALS = {
     "r_i": ("p_sp", "q_sp"),
     "u_bar": ("u_bar_roll", "u_bar_pitch"),
 }
+#: The same of yaw, all optional.
+YAW_SIGNALS = {"u": "u_yaw", "y_i": "r", "y_o": "yaw", "r_o": "yaw_sp", "r_i": "r_sp", "u_bar": "u_bar_yaw"}
 
 Name = Annotated[str, Field(min_length=1)]
 Sign = Literal[1, -1]
@@ -84,6 +86,8 @@ class Columns(BaseModel):
         Setpoints of the angles and rates; may be absent.
     u_bar_roll, u_bar_pitch
         Injected torque, normalised; may be absent.
+    u_yaw, r, yaw, yaw_sp, r_sp, u_bar_yaw
+        The same of yaw; may be absent. Without torque, rate and heading yaw is left out.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -101,6 +105,12 @@ class Columns(BaseModel):
     q_sp: RateColumn = RateColumn()
     u_bar_roll: TorqueColumn = TorqueColumn()
     u_bar_pitch: TorqueColumn = TorqueColumn()
+    u_yaw: TorqueColumn = TorqueColumn()
+    r: RateColumn = RateColumn()
+    yaw: AngleColumn = AngleColumn()
+    yaw_sp: AngleColumn = AngleColumn()
+    r_sp: RateColumn = RateColumn()
+    u_bar_yaw: TorqueColumn = TorqueColumn()
 
     def name(self, field: str) -> str:
         """Name of a field's column in the file."""

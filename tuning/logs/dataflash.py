@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,14 +29,26 @@ LAYOUTS = {
     "r_o": (("ANG", ("DesRoll", "DesPitch"), DEGREE), ("ATT", ("DesRoll", "DesPitch"), DEGREE)),
     "r_i": (("RATE", ("RDes", "PDes"), DEGREE),),
 }
+#: The same of yaw.
+YAW_LAYOUTS = {
+    "u": (("RATE", ("YOut",), 1.0),),
+    "y_i": (("RATE", ("Y",), DEGREE),),
+    "y_o": (("ANG", ("Yaw",), DEGREE), ("ATT", ("Yaw",), DEGREE)),
+    "r_o": (("ANG", ("DesYaw",), DEGREE), ("ATT", ("DesYaw",), DEGREE)),
+    "r_i": (("RATE", ("YDes",), DEGREE),),
+}
 #: Factors for RATE of ArduCopter 3.3 and older (Log_Write_Rate): motor inputs of +-4500, rates in 0.01 deg/s.
 OLD_FACTORS = {"u": 1 / 4500, "y_i": 0.01, "r_i": 0.01}
 MILLISECOND = 1e-3  # s
 #: Field with the time -> its unit, s. ArduCopter 3.3 and older log TimeMS.
 CLOCKS = {"TimeUS": 1e-6, "TimeMS": MILLISECOND}
 
-#: Axis of the system identification mode (SIDS.Ax) that adds its waveform to the torque -> column of u.
-MIXER_AXES = {10: 0, 11: 1}
+#: Axes of the system identification mode (SIDS.Ax) that add the waveform to the torque, or in deg/s to the rate
+#: setpoint: signal -> (factor to SI, axis -> its column: roll, pitch, yaw).
+INJECTED_AXES = {"u_bar": (1.0, {10: 0, 11: 1, 12: 2}), "r_bar": (DEGREE, {7: 0, 8: 1, 9: 2})}
+#: Those that move the attitude setpoint, and the rest.
+SETPOINT_AXES = {1: "roll", 2: "pitch", 3: "yaw", 4: "roll", 5: "pitch", 6: "yaw"}
+AXIS_NAMES = ("roll", "pitch", "yaw")
 
 #: Event numbers of message EV (AP_Logger, LogEvent).
 EV_DISARMED, EV_LANDED, EV_NOT_LANDED = 11, 18, 28
@@ -76,16 +88,13 @@ def record_dataflash(path: Path) -> Recording:
     if SDLOG2_MESSAGES.issubset(log.file.names()):
         raise TuningError(f"{path}: {SDLOG2}")
     old = log.in_old_units()
-    signals = {}
-    for signal, layouts in LAYOUTS.items():
-        for message, fields, factor in layouts:
-            series = log.series(message, fields, factor * (OLD_FACTORS.get(signal, 1.0) if old else 1.0))
-            if series is not None:
-                signals[signal] = series
-                break
-    excitation = _excitation(log)
-    if excitation is not None:
-        signals["u_bar"] = excitation
+    signals, yaw = _signals(log, LAYOUTS, old), _signals(log, YAW_LAYOUTS, old)
+    for name, excitation in _excitation(log).items():
+        for found, axes in ((signals, slice(0, 2)), (yaw, slice(2, 3))):
+            excited = excitation.values[:, axes].any(axis=0)
+            # A rate injected on one axis only leaves the attitude setpoints as the signal that excites both.
+            if excited.all() or (excited.any() and name == "u_bar"):
+                found[name] = Series(excitation.time, excitation.values[:, axes], excitation.topic)
     wanted = {
         signal: " or ".join(_wanted(log, message, fields) for message, fields, _ in layouts)
         for signal, layouts in LAYOUTS.items()
@@ -110,9 +119,22 @@ def record_dataflash(path: Path) -> Recording:
         changes=changes,
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((damage,) if damage else ()), *vehicle.warnings),
-        notes=(NOTE,),
+        notes=(NOTE, *_identification_notes(log)),
+        yaw=yaw,
         span=_span(log),
     )
+
+
+def _signals(log: _DataflashLog, layouts: Mapping[str, Any], old: bool) -> dict[str, Series]:
+    """The first layout of each signal that the log holds."""
+    signals = {}
+    for signal, places in layouts.items():
+        for message, fields, factor in places:
+            series = log.series(message, fields, factor * (OLD_FACTORS.get(signal, 1.0) if old else 1.0))
+            if series is not None:
+                signals[signal] = series
+                break
+    return signals
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,15 +233,29 @@ def _advice(log: _DataflashLog, parameters: dict[str, float], texts: Sequence[st
     return advice
 
 
-def _excitation(log: _DataflashLog) -> Series | None:
-    """The waveform that the system identification mode added to the torque; zero when that mode was off."""
+def _identification_notes(log: _DataflashLog) -> tuple[str, ...]:
+    """What each run of the system identification mode excited, for `mimopilot inspect`."""
+    runs = log.timed("SIDS", ("Ax",))
+    found = []
+    for axis in [] if runs is None else runs[1].astype(np.int64).tolist():
+        kinds = {"u_bar": "injected torque", "r_bar": "injected rate setpoint"}
+        text = next(
+            (f"{kinds[name]} on {AXIS_NAMES[axes[axis]]}" for name, (_, axes) in INJECTED_AXES.items() if axis in axes),
+            f"attitude setpoint of {SETPOINT_AXES[axis]}" if axis in SETPOINT_AXES else "not used",
+        )
+        found.append(f"SID_AXIS {axis}: {text}")
+    return (f"system identification: {'; '.join(found)}",) if found else ()
+
+
+def _excitation(log: _DataflashLog) -> dict[str, Series]:
+    """The waveforms that the system identification mode injected, roll, pitch, yaw; zero when that mode was off."""
     waveform = log.series("SIDD", ("Targ",), 1.0)
     runs = log.timed("SIDS", ("Ax",))
     if waveform is None or runs is None or not len(runs[0]):
-        return None
+        return {}
     waveform = monotone(waveform)
     if len(waveform.time) < 3:
-        return None
+        return {}
     Ts = sampling_period(waveform.time)
     ends = np.flatnonzero(np.append(np.diff(waveform.time) > MAX_GAP * Ts, True))
     started, axes = runs[0], runs[1].astype(np.int64)
@@ -227,9 +263,6 @@ def _excitation(log: _DataflashLog) -> Series | None:
     begins = np.concatenate([[0], ends[:-1] + 1])
     run = np.searchsorted(begins, np.arange(len(waveform.time)), side="right") - 1
     axis = np.array([axes[np.argmin(np.abs(started - waveform.time[begin]))] for begin in begins])[run]
-    values = np.zeros((len(axis), 2))
-    for code, column in MIXER_AXES.items():
-        values[axis == code, column] = waveform.values[axis == code, 0]
     # Zero between the runs, and before and after them: a response needs the time in which the last run fades.
     zeros = waveform.time[ends] + Ts
     torque = log.series(*LAYOUTS["u"][0])
@@ -237,8 +270,14 @@ def _excitation(log: _DataflashLog) -> Series | None:
         zeros = np.concatenate([zeros, [min(torque.time[0], waveform.time[0] - Ts), max(torque.time[-1], zeros[-1])]])
     time = np.concatenate([waveform.time, zeros])
     order = np.argsort(time, kind="stable")
-    values = np.concatenate([values, np.zeros((len(zeros), 2))])[order]
-    return Series(time[order], values, "SIDD") if values.any() else None
+    found = {}
+    for name, (factor, columns) in INJECTED_AXES.items():
+        values = np.zeros((len(time), len(AXIS_NAMES)))
+        for code, column in columns.items():
+            values[: len(axis)][axis == code, column] = factor * waveform.values[axis == code, 0]
+        if values.any():
+            found[name] = Series(time[order], values[order], "SIDD")
+    return found
 
 
 def _airborne(log: _DataflashLog) -> tuple[Interval, ...] | None:

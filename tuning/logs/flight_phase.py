@@ -22,9 +22,10 @@ SHORT = 0.1  # s on the ground during the excitation that need no warning
 def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str, ...]]:
     """The parts of a log that can be used for tuning.
 
-    An injected excitation marks the experiment: from its first nonzero sample until the response to the last has faded.
-    Without one it is the whole log. Of the experiment the part in flight is used: as the vehicle logged it, else from
-    the first to the last movement. Nothing is used from `BEFORE_TUMBLE` before a tumble on.
+    An excitation of roll or pitch marks the experiment: from its first nonzero sample until the response to the last
+    has faded, or yaw's excitation begins. Without one it is the whole log. Of the experiment the part in flight is
+    used: as the vehicle logged it, else from the first to the last movement. Nothing is used from `BEFORE_TUMBLE`
+    before a tumble on.
 
     Parameters
     ----------
@@ -50,7 +51,9 @@ def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str,
         raise TuningError(
             f"{source}: no flight: according to {recording.evidence} the vehicle never left the ground; record a flight"
         )
-    marked = _marked(recording.signals.get("u_bar") or recording.signals.get("r_bar"))
+    marked = _marked(
+        recording.signals.get("u_bar") or recording.signals.get("r_bar"), _active(_injected_into_yaw(recording))
+    )
     warnings: list[str] = []
     parts: tuple[Interval, ...] = (marked,) if marked else ((-np.inf, np.inf),)
     if airborne:
@@ -83,6 +86,44 @@ def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str,
             f"{source}: no flight: {flew}{still}; a log of a vehicle at rest cannot be used, record a flight{unit}"
         )
     return parts if marked or airborne else intersection(parts, (moving,)), tuple(warnings)
+
+
+def yaw_parts(recording: Recording, parts: tuple[Interval, ...]) -> tuple[Interval, ...]:
+    """The parts of a log that can be used for yaw.
+
+    Where a torque or a rate is injected into yaw: those stretches in flight, each until its response has faded; nothing
+    from `BEFORE_TUMBLE` before a tumble on. Otherwise those of roll and pitch.
+
+    Parameters
+    ----------
+    recording : Recording
+        Holds torque, rates and angles.
+    parts : tuple of (begin, end), s
+        Of roll and pitch, from `flying_parts`.
+    """
+    injected = _injected_into_yaw(recording)
+    time = _active(injected)
+    if injected is None or not len(time):
+        return parts
+    pauses = np.flatnonzero(np.diff(time) > 2 * FADE)
+    begins, ends = time[np.append(0, pauses + 1)], time[np.append(pauses, -1)]
+    last = float(injected.time[-1])
+    marked = tuple((float(a), float(min(b + FADE, last))) for a, b in zip(begins, ends, strict=True))
+    whole = ((min(parts[0][0], marked[0][0]), max(parts[-1][1], marked[-1][1])),)
+    try:
+        kept, _ = _before_tumble(recording, whole)
+    except TuningError:
+        return ()
+    return intersection(intersection(marked, kept), recording.airborne or whole)
+
+
+def _injected_into_yaw(recording: Recording) -> Series | None:
+    return recording.yaw.get("u_bar") or recording.yaw.get("r_bar")
+
+
+def _active(injected: Series | None) -> NDArray[np.float64]:
+    """Times (s) of the samples that are not zero."""
+    return np.empty(0) if injected is None else injected.time[injected.values.any(axis=1)]
 
 
 def _before_tumble(recording: Recording, parts: tuple[Interval, ...]) -> tuple[tuple[Interval, ...], str]:
@@ -160,14 +201,16 @@ def intersection(first: tuple[Interval, ...], second: tuple[Interval, ...]) -> t
     return tuple(sorted((a, b) for a, b in shared if a < b))
 
 
-def _marked(excitation: Series | None) -> Interval | None:
-    if excitation is None:
+def _marked(excitation: Series | None, yaw: NDArray[np.float64]) -> Interval | None:
+    """From the first excitation until the last has faded, or yaw is excited: that would be noise. `yaw`: when, s."""
+    active = _active(excitation)
+    if excitation is None or not len(active):
         return None
-    active = np.flatnonzero(excitation.values.any(axis=1))
-    if not len(active):
-        return None
-    end = min(excitation.time[active[-1]] + FADE, excitation.time[-1])
-    return float(excitation.time[active[0]]), float(end)
+    end = min(active[-1] + FADE, excitation.time[-1])
+    following = yaw[yaw > active[-1]]
+    if len(following) and following[0] <= end:
+        end = excitation.time[np.searchsorted(excitation.time, following[0]) - 1]
+    return float(active[0]), float(end)
 
 
 def _moving(rates: Series, parts: tuple[Interval, ...]) -> Interval | None:

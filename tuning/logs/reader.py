@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from mimopilot.tuning.logs.formats import FORMATS, known_formats, log_format
 from mimopilot.tuning.logs.log_checks import check_angles, check_log
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, on_common_grid
+from mimopilot.tuning.logs.yaw import yaw_intervals, yaw_signals
 from mimopilot.tuning.motors import Motors, fit_motors, saturation_warnings
 
 CHANGED = "parameters changed in the part that is used; the values before the change count as flown: "
@@ -107,25 +109,36 @@ def _experiment(recording: Recording, warnings: list[str]) -> Experiment:
     check_angles(recording)
     parts, cut = flying_parts(recording)
     warnings += cut
-    grid = on_common_grid(recording.signals, parts, str(recording.path), recording.advice)
+    for_yaw, left_out = yaw_intervals(recording, parts)
+    warnings += left_out
+    grid = on_common_grid(
+        recording.signals,
+        parts,
+        str(recording.path),
+        recording.advice,
+        recording.yaw if for_yaw else {},
+        for_yaw,
+    )
     begin = max(parts[0][0], float(recording.signals["u"].time[0]))
     parameters, changed = recording.parameters_during(begin, parts[-1][1])
     warnings += [CHANGED + "; ".join(changed)] if changed else []
     motors = _motors(recording, parts, warnings)
-    return Experiment(
+    experiment = Experiment(
         Ts=grid.Ts,
         segments=grid.segments,
         source=recording.path.name,
         sha256=sha256(recording.path.read_bytes()),
         flown=flown_gains(parameters, grid.Ts),
         motors=motors,
-        amplitude=_amplitude(recording),
+        amplitude=_amplitude(recording, for_yaw),
         warnings=tuple(warnings),
         **grid.signals,  # type: ignore[arg-type]  # of the names in Experiment
     )
+    yaw, left_out = yaw_signals(grid, experiment, recording)
+    return replace(experiment, yaw=yaw, warnings=(*experiment.warnings, *left_out))
 
 
-def _amplitude(recording: Recording) -> float:
+def _amplitude(recording: Recording, for_yaw: tuple[Interval, ...]) -> float:
     """Size (rad) of the manoeuvres in the air: of the angles and of their setpoints, but for rare outliers."""
     sizes = []
     for name in ("y_o", "r_o"):
@@ -133,6 +146,10 @@ def _amplitude(recording: Recording) -> float:
         if series is None:
             continue
         flying = np.isfinite(series.values).all(axis=1)
+        if "u_bar" in recording.yaw or "r_bar" in recording.yaw:
+            # Yaw's excitation is no manoeuvre of these axes.
+            quiet = np.any([(a <= series.time) & (series.time <= b) for a, b in for_yaw], axis=0)
+            flying &= ~quiet if for_yaw and (flying & ~quiet).any() else True
         if recording.airborne:
             flying &= np.any([(a <= series.time) & (series.time <= b) for a, b in recording.airborne], axis=0)
         if flying.any():

@@ -17,6 +17,8 @@ from mimopilot.tuning.logs.resample import REQUIRED, Interval, Series, monotone
 #: Largest plausible magnitude of a signal: torque (normalised), rad/s, rad. Gyros saturate at 35 rad/s (2000 deg/s).
 #: y_o in degrees passes here, so that `check_angles` can name the wrong unit.
 RANGES = {"u": 5.0, "u_bar": 5.0, "y_i": 100.0, "r_i": 100.0, "r_bar": 100.0, "y_o": 400.0, "r_o": 2 * np.pi}
+#: rad, of the heading and its setpoint: they may have turned around often.
+HEADING_RANGES = {"y_o": 400.0, "r_o": 400.0}
 UNITS = dict.fromkeys(("u", "u_bar"), "a torque as a fraction of full torque")
 UNITS |= dict.fromkeys(("y_i", "r_i", "r_bar"), "rad/s")
 UNITS |= dict.fromkeys(("y_o", "r_o"), "rad")
@@ -75,6 +77,8 @@ class Recording:
         What is wrong with a log that can still be used, such as damage.
     notes : sequence of str
         Remarks for `mimopilot inspect`.
+    yaw : mapping
+        The same as `signals` of the yaw axis, values (N, 1); headings may jump by 2 pi when given and do not after.
     commands : Series or None
         Motor commands, 0 to 1, one column per motor. None: not logged.
     published : mapping
@@ -98,6 +102,7 @@ class Recording:
     faults: Sequence[str] = ()
     warnings: Sequence[str] = ()
     notes: Sequence[str] = ()
+    yaw: Mapping[str, Series] = field(default_factory=dict)
     commands: Series | None = None
     published: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     span: Interval | None = None
@@ -106,13 +111,16 @@ class Recording:
     def __post_init__(self) -> None:
         signals, warnings = {}, [*self.warnings]
         for name, signal in self.signals.items():
-            cleaned, dropped = _without_outliers(name, signal, str(self.path))
+            cleaned, dropped = _without_outliers(name, signal, str(self.path), RANGES[name])
             if len(cleaned.time) > 1:
                 signals[name] = cleaned
             if dropped:
                 warnings.append(
                     f"{signal.topic}: {dropped} samples of {name} are out of range or out of order and ignored"
                 )
+        yaw, faults = _clean_yaw(self.yaw, str(self.path))
+        warnings += faults
+        object.__setattr__(self, "yaw", yaw)
         object.__setattr__(self, "signals", signals)
         object.__setattr__(self, "warnings", tuple(warnings))
 
@@ -156,15 +164,30 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(names[:MAX_LISTED]) + more or "nothing"
 
 
-def _without_outliers(name: str, signal: Series, source: str) -> tuple[Series, int]:
+def _clean_yaw(signals: Mapping[str, Series], source: str) -> tuple[dict[str, Series], list[str]]:
+    """Signals of yaw without outliers, headings without jumps of 2 pi; and what cannot be used."""
+    kept, faults = {}, []
+    for name, signal in signals.items():
+        try:
+            cleaned, _ = _without_outliers(name, signal, source, HEADING_RANGES.get(name, RANGES[name]))
+        except TuningError as error:
+            faults.append(f"yaw is left out: {str(error).removeprefix(f'{source}: ')}")
+            continue
+        if len(cleaned.time) > 1:
+            unwrapped = np.unwrap(cleaned.values, axis=0) if name in HEADING_RANGES else cleaned.values
+            kept[name] = Series(cleaned.time, unwrapped, cleaned.topic)
+    return kept, faults
+
+
+def _without_outliers(name: str, signal: Series, source: str, largest: float) -> tuple[Series, int]:
     """The signal without samples that are not finite, out of range or out of order; and the count of the latter two."""
     given = np.isfinite(signal.time) & np.isfinite(signal.values).all(axis=1)
     time, values = signal.time[given], signal.values[given]
-    in_range: NDArray[np.bool_] = np.abs(values).max(axis=1, initial=0) <= RANGES[name]
+    in_range: NDArray[np.bool_] = np.abs(values).max(axis=1, initial=0) <= largest
     outliers = len(time) - int(np.count_nonzero(in_range))
     if outliers > MAX_OUTLIERS * len(time):
         raise TuningError(
-            f"{source}: {signal.topic}: {100 * outliers / len(time):.0f} % of {name} are outside +-{RANGES[name]:.3g}, "
+            f"{source}: {signal.topic}: {100 * outliers / len(time):.0f} % of {name} are outside +-{largest:.3g}, "
             f"the largest is {np.abs(values).max():.4g}; expected {UNITS[name]}: correct the unit"
         )
     time, values = time[in_range], values[in_range]

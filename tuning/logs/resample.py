@@ -38,14 +38,33 @@ class Series:
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Signals on one grid: period (s), name -> (N, 2) array, and the segments without a gap (samples)."""
+    """Signals on one grid.
+
+    Attributes
+    ----------
+    Ts : float, s
+        Period.
+    signals, yaw : dict
+        Name -> (N, 2) array of roll and pitch; name -> (N, 1) array of yaw.
+    segments, yaw_segments : tuple of (start, stop)
+        Stretches without a gap, in samples: those of roll and pitch, and those of yaw.
+    """
 
     Ts: float
     signals: dict[str, NDArray[np.float64]]
     segments: tuple[tuple[int, int], ...]
+    yaw: dict[str, NDArray[np.float64]]
+    yaw_segments: tuple[tuple[int, int], ...]
 
 
-def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], source: str, advice: str) -> Grid:
+def on_common_grid(
+    series: Mapping[str, Series],
+    parts: Sequence[Interval],
+    source: str,
+    advice: str,
+    yaw: Mapping[str, Series] | None = None,
+    yaw_parts: Sequence[Interval] = (),
+) -> Grid:
     """All signals on the time grid of the torque.
 
     Setpoints, torque and excitation are held; measurements are interpolated. A pause of more than five periods
@@ -62,6 +81,10 @@ def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], sour
         Name of the log, for messages.
     advice : str
         What to change on the vehicle when a signal is slow, for messages.
+    yaw : mapping, optional
+        The signals of yaw; must hold `REQUIRED`. They change nothing in the rows of `parts`.
+    yaw_parts : sequence of (begin, end), s
+        Parts of the log to use for yaw, in order.
 
     Returns
     -------
@@ -73,7 +96,7 @@ def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], sour
         When torque, rates or angles are slower than 100 Hz, or less than 5 s are left.
     """
     begin, end = parts[0][0], parts[-1][1]
-    rates = {name: _rate_of(name, series[name], begin, end, source) for name in REQUIRED}
+    rates = {name: rate_of(name, series[name], begin, end, source) for name in REQUIRED}
     slow = dict.fromkeys(complaint for _, complaint in rates.values() if complaint)
     if slow:
         raise TuningError(f"{source}: too slow: {'; '.join(slow)}; tuning needs {MIN_RATE:g} Hz or more; {advice}")
@@ -91,24 +114,33 @@ def on_common_grid(series: Mapping[str, Series], parts: Sequence[Interval], sour
             f"{source}: damaged time stamps: {len(time)} samples in {stop - start:.3g} s; download it again"
         )
     count = max(0, int(np.floor((stop - start) / Ts + 0.5)) + 1)
-    grid = start + Ts * np.arange(count)
-    usable = np.zeros(count, bool)
-    for a, b in parts:
-        usable |= (grid >= a - 1e-9) & (grid <= b + 1e-9)
+    before, after = _rows_for_yaw(series, yaw_parts, (start, start + Ts * (count - 1)), Ts)
+    grid = start + Ts * np.arange(-before, count + after)
+    usable, usable_for_yaw = _within(grid, parts), _within(grid, yaw_parts)
+    usable[:before] = usable[before + count :] = False
     signals = {}
     for name, signal in series.items():
         signals[name] = _place(signal, grid, Ts, name in HELD)
         if name in REQUIRED:
-            usable &= _covered(signal.time, grid, max(Ts, periods[name]))
-    segments = _runs(usable)
+            covered = _covered(signal.time, grid, max(Ts, periods[name]))
+            usable &= covered
+            usable_for_yaw &= covered
+    of_yaw = {name: _place(signal, grid, Ts, name in HELD) for name, signal in (yaw or {}).items()}
+    for name in REQUIRED if of_yaw else ():
+        time = yaw[name].time if yaw else grid
+        usable_for_yaw &= _covered(time, grid, max(Ts, sampling_period(time)))
+    segments, yaw_segments = _runs(usable), _runs(usable_for_yaw)
     if filtered:
-        Ts, signals, segments = _decimate(Ts, signals, segments, slowest)
+        slow_Ts, signals, of_yaw, segments, yaw_segments = _decimate_all(
+            Ts, signals, of_yaw, segments, yaw_segments, slowest
+        )
+        Ts = slow_Ts
     seconds = sum(b - a for a, b in segments) * Ts
     if seconds < MIN_SECONDS:
         raise TuningError(
             f"{source}: too short: {seconds:.1f} s of flight without a gap, tuning needs {MIN_SECONDS:g} s or more"
         )
-    return Grid(Ts, signals, segments)
+    return Grid(Ts, signals, segments, of_yaw, yaw_segments)
 
 
 def monotone(signal: Series) -> Series:
@@ -143,7 +175,7 @@ def held_samples(values: NDArray[np.float64]) -> int:
     return hold if np.percentile(runs, 10) > hold / 2 else 1
 
 
-def _rate_of(name: str, signal: Series, begin: float, end: float, source: str) -> tuple[float, str]:
+def rate_of(name: str, signal: Series, begin: float, end: float, source: str) -> tuple[float, str]:
     """Period (s) at which the values of a signal change, and a complaint when it is too long."""
     inside = (signal.time >= begin - 1e-9) & (signal.time <= end + 1e-9)
     if np.count_nonzero(inside) < 3:
@@ -160,6 +192,28 @@ def _rate_of(name: str, signal: Series, begin: float, end: float, source: str) -
     if hold > 1:
         logged += f" but each value is held for {hold} samples: its rate is {1 / (period * hold):.1f} Hz"
     return period * hold, logged
+
+
+def _within(grid: NDArray[np.float64], parts: Sequence[Interval]) -> NDArray[np.bool_]:
+    """Whether each grid point is in one of the parts, (N,)."""
+    inside = np.zeros(len(grid), bool)
+    for a, b in parts:
+        inside |= (grid >= a - 1e-9) & (grid <= b + 1e-9)
+    return inside
+
+
+def _rows_for_yaw(
+    series: Mapping[str, Series], parts: Sequence[Interval], used: Interval, Ts: float
+) -> tuple[int, int]:
+    """Grid points to add before and after the used part (s) so that yaw's parts are on the grid, too."""
+    if not parts:
+        return 0, 0
+    begin = max(parts[0][0], *(series[name].time[0] for name in REQUIRED))
+    end = min(parts[-1][1], *(series[name].time[-1] for name in REQUIRED))
+    before, after = max(0, int((used[0] - begin) / Ts)), max(0, int((end - used[1]) / Ts + 0.5))
+    if before + after > MAX_EMPTY * (len(series["u"].time) + 1000):  # damaged time stamps
+        return 0, 0
+    return before, after
 
 
 def _inside(time: NDArray[np.float64], begin: float, end: float) -> NDArray[np.float64]:
@@ -210,20 +264,50 @@ def _runs(mask: NDArray[np.bool_]) -> tuple[tuple[int, int], ...]:
     return tuple((int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True))
 
 
+def _decimate_all(
+    Ts: float,
+    signals: Mapping[str, NDArray[np.float64]],
+    yaw: Mapping[str, NDArray[np.float64]],
+    segments: Sequence[tuple[int, int]],
+    yaw_segments: Sequence[tuple[int, int]],
+    slow: float,
+) -> tuple[
+    float,
+    dict[str, NDArray[np.float64]],
+    dict[str, NDArray[np.float64]],
+    tuple[tuple[int, int], ...],
+    tuple[tuple[int, int], ...],
+]:
+    """Decimate the segments, then yaw's segments, whose rows follow: each keeps its own ends."""
+    together = {("", name): signal for name, signal in signals.items()}
+    together |= {("yaw", name): signal for name, signal in yaw.items()}
+    period, first, kept = _decimate(Ts, together, segments, slow)
+    _, second, of_yaw = _decimate(Ts, together, yaw_segments, slow)
+    rows = len(first["", "u"])
+    joined = {key: np.concatenate([first[key], second[key]]) for key in together}
+    return (
+        period,
+        {name: joined["", name] for name in signals},
+        {name: joined["yaw", name] for name in yaw},
+        kept,
+        tuple((a + rows, b + rows) for a, b in of_yaw),
+    )
+
+
 def _decimate(
-    Ts: float, signals: Mapping[str, NDArray[np.float64]], segments: Sequence[tuple[int, int]], slow: float
-) -> tuple[float, dict[str, NDArray[np.float64]], tuple[tuple[int, int], ...]]:
+    Ts: float, signals: Mapping[tuple[str, str], NDArray[np.float64]], segments: Sequence[tuple[int, int]], slow: float
+) -> tuple[float, dict[tuple[str, str], NDArray[np.float64]], tuple[tuple[int, int], ...]]:
     """Every signal at the period `slow` (s). Each segment is filtered by itself: no filter crosses a gap."""
     from scipy.signal import resample_poly
 
     ratio = Fraction(Ts / slow).limit_denominator(16)
     up, down = ratio.numerator, ratio.denominator
     long_enough = [(a, b) for a, b in segments if b - a > 2 * down]
-    pieces: dict[str, list[NDArray[np.float64]]] = {name: [np.empty((0, 2))] for name in signals}
+    pieces: dict[tuple[str, str], list[NDArray[np.float64]]] = {name: [signal[:0]] for name, signal in signals.items()}
     stops = [0]
     for a, b in long_enough:
         for name, signal in signals.items():
             pieces[name].append(resample_poly(signal[a:b], up, down, axis=0, padtype="line"))
-        stops.append(stops[-1] + len(pieces["u"][-1]))
+        stops.append(stops[-1] + len(pieces["", "u"][-1]))
     joined = {name: np.concatenate(rows) for name, rows in pieces.items()}
     return Ts * down / up, joined, tuple(itertools.pairwise(stops))

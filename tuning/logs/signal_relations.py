@@ -53,7 +53,7 @@ class Kinematics:
 
 
 def measure_kinematics(experiment: Experiment) -> Kinematics:
-    """Least squares of the changes of the angles over `INTEGRATION` on the integrals of the rates."""
+    """Least squares of the changes of the angles over `INTEGRATION` on the integrals of the rates, where they move."""
     step, window = max(1, round(INTEGRATION / experiment.Ts)), max(1, round(WINDOW / experiment.Ts))
     outer, inner, moved = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
     energy = []
@@ -69,35 +69,38 @@ def measure_kinematics(experiment: Experiment) -> Kinematics:
             size, response = float(np.sum(x**2)), float(np.sum(y**2))
             if size <= 0 or response <= 0:
                 continue
+            moves = np.maximum(np.mean(x**2, axis=0), np.mean(y**2, axis=0) / NOISE**2)
+            if np.sqrt(moves.max()) <= STILL:
+                continue  # the noise of a calm hover, as in the pauses of an experiment and while yaw is excited
             # Normalise each window by its own movement.
             scale = math.sqrt(size * response)
             outer += y.T @ x / scale
             inner += x.T @ x / scale
             moved += np.sum(y**2, axis=0) / scale
-            energy.append(np.maximum(np.mean(x**2, axis=0), np.mean(y**2, axis=0) / NOISE**2))
+            energy.append(moves)
     if not energy:
         return Kinematics(np.eye(2), np.ones(2), np.zeros(2, bool))
-    moves = np.sqrt(np.median(energy, axis=0)) > STILL
-    if not moves.all():
-        return Kinematics(np.eye(2), np.ones(2), moves)
+    moving = np.sqrt(np.median(energy, axis=0)) > STILL
+    if not moving.all():
+        return Kinematics(np.eye(2), np.ones(2), moving)
     matrix = outer @ np.linalg.pinv(inner)
     explained = np.einsum("ij,ij->i", matrix, outer) / np.maximum(moved, 1e-300)
-    return Kinematics(matrix, explained, moves)
+    return Kinematics(matrix, explained, moving)
 
 
 def injected_in(total: Signal, injected: Signal, segments: tuple[tuple[int, int], ...]) -> Matrix:
-    """Gain from steps of what is injected to steps of the whole, (2, 2): the identity in a correct log.
+    """Gain from steps of what is injected to steps of the whole, (n, n): the identity in a correct log.
 
     Parameters
     ----------
-    total, injected : (N, 2) arrays
+    total, injected : (N, n) arrays
         Torque and the injected torque, or the same of the rate setpoint.
     segments : tuple of (start, stop)
         Stretches without a gap.
     """
     found = []
     for lag in range(-MAX_LAG, MAX_LAG + 1):
-        outer, inner = np.zeros((2, 2)), np.zeros((2, 2))
+        outer, inner = np.zeros((2, total.shape[1], total.shape[1]))
         for start, stop in segments:
             u, w = np.diff(total[start:stop], axis=0), np.diff(injected[start:stop], axis=0)
             u, w = (u[lag:], w[: len(w) - lag]) if lag >= 0 else (u[:lag], w[-lag:])

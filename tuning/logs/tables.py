@@ -6,7 +6,7 @@ import csv
 import itertools
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.logs.columns import SIGNALS, TIME_UNITS, Columns
+from mimopilot.tuning.logs.columns import SIGNALS, TIME_UNITS, YAW_SIGNALS, Columns
 from mimopilot.tuning.logs.matlab_sizes import check_sizes
 from mimopilot.tuning.logs.recording import Recording, listed
 from mimopilot.tuning.logs.resample import MIN_RATE, MIN_SECONDS, REQUIRED, Series
@@ -55,8 +55,11 @@ def record_csv(path: Path, columns: Columns) -> Recording:
             first = stream.readline()
             delimiter = max(",;\t", key=first.count)
             header = [name.strip().lstrip("#").strip() for name in next(csv.reader([first], delimiter=delimiter))]
+            optional = _optional(columns)
             used = {columns.name(field) for field in Columns.model_fields}
-            twice = sorted(name for name, count in Counter(header).items() if count > 1 and name in used)
+            count = Counter(header)
+            used -= {name for name in optional if count[name] > 1}
+            twice = sorted(name for name in used if count[name] > 1)
             if twice:
                 raise TuningError(f"{path}: column {', '.join(twice)} appears twice; rename one")
             if all(_is_number(name) for name in header):
@@ -81,7 +84,9 @@ def record_csv(path: Path, columns: Columns) -> Recording:
             rows = np.empty((0, 0))
             if places:
                 lines = itertools.chain([row], filled)
-                rows = np.loadtxt(lines, delimiter=delimiter, usecols=places, ndmin=2, converters=_cell, quotechar='"')
+                cell: dict[int | str, Callable[[str], Any]] = {}
+                cell |= {place: _number_or_nan if header[place] in optional else _cell for place in places}
+                rows = np.loadtxt(lines, delimiter=delimiter, usecols=places, ndmin=2, converters=cell, quotechar='"')
     except TuningError:
         raise
     except (ValueError, UnicodeDecodeError, csv.Error, OverflowError, IndexError) as error:
@@ -126,12 +131,20 @@ def record_matlab(path: Path, columns: Columns) -> Recording:
     return _record(path, "MATLAB", table, sorted(found), columns)
 
 
+def _optional(columns: Columns) -> set[str]:
+    """Names of yaw's columns that the column file does not name: they may be something else."""
+    used = {columns.name(field) for field in Columns.model_fields if field not in YAW_SIGNALS.values()}
+    return {field for field in YAW_SIGNALS.values() if getattr(columns, field).column is None} - used
+
+
 def _vector(path: Path, found: Mapping[str, Any], field: str, columns: Columns) -> NDArray[np.float64] | None:
     """Values of a field in a MATLAB file; None when it is not there. Of a matrix, the column that `index` picks."""
     name, index = columns.name(field), getattr(columns, field).index
     if name not in found:
         return None
     values = np.squeeze(np.asarray(found[name]))
+    if name in _optional(columns) and (values.dtype.kind not in "fiu" or values.ndim != 1):
+        return None
     got = f"{path}: {name}: got {values.dtype} of shape {values.shape}"
     if values.dtype.kind not in "fiu" or values.ndim not in (1, 2):
         raise TuningError(f"{got}, expected a vector of real numbers")
@@ -159,6 +172,14 @@ def _is_number(text: str) -> bool:
 
 def _cell(text: str) -> float:
     return float(text.replace(",", ".")) if text.strip() else float("nan")
+
+
+def _number_or_nan(text: str) -> float:
+    """A cell of a column that may hold something else."""
+    try:
+        return _cell(text)
+    except ValueError:
+        return float("nan")
 
 
 def _flat(variables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -202,8 +223,18 @@ def _record(
                 )
         rows = np.column_stack([values * getattr(columns, field).factor for field, values in pair])
         signals[signal] = Series(time, rows, ", ".join(columns.name(field) for field in fields))
+    yaw = {}
+    for signal, field in YAW_SIGNALS.items():
+        heading = table[field]
+        name = columns.name(field)
+        if heading is not None and len(heading) != len(time) and name not in _optional(columns):
+            raise TuningError(f"{path}: {name} has {len(heading)} values, {columns.name('t')} has {len(time)}")
+        if heading is not None and len(heading) == len(time):
+            yaw[signal] = Series(time, heading[:, None] * getattr(columns, field).factor, name)
     faults = _clock_faults(path, given, columns)
-    return Recording(path, kind, signals, wanted, contents, ADVICE, faults=faults, notes=(NOTE,), columns=columns)
+    return Recording(
+        path, kind, signals, wanted, contents, ADVICE, faults=faults, notes=(NOTE,), yaw=yaw, columns=columns
+    )
 
 
 def _clock_faults(path: Path, given: NDArray[np.float64], columns: Columns) -> tuple[str, ...]:

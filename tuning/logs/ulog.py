@@ -29,9 +29,20 @@ LAYOUTS = {
     "r_i": (("vehicle_rates_setpoint", ("roll", "pitch")),),
     "r_bar": (("autotune_attitude_control_status", ("rate_sp[0]", "rate_sp[1]")),),
 }
-EXCITATION_TOPIC, EXCITATION_NAME = "debug_vect", "MIMO_EXC"
+#: The same of yaw.
+YAW_LAYOUTS = {
+    "u": (("vehicle_torque_setpoint", ("xyz[2]",)), ("actuator_controls_0", ("control[2]",))),
+    "y_i": (("vehicle_angular_velocity", ("xyz[2]",)), ("vehicle_attitude", ("yawspeed",))),
+    "y_o": LAYOUTS["y_o"],
+    "r_o": (LAYOUTS["r_o"][0], ("vehicle_attitude_setpoint", ("yaw_body",))),
+    "r_i": (("vehicle_rates_setpoint", ("yaw",)),),
+    "r_bar": (("autotune_attitude_control_status", ("rate_sp[2]",)),),
+}
+#: Topic and names of the injected torque: x, y are roll and pitch; x is yaw. Our module publishes one of them a cycle.
+EXCITATION_TOPIC, EXCITATION_NAME, YAW_EXCITATION_NAME = "debug_vect", "MIMO_EXC", "MIMO_EXY"
 #: Upward thrust, newest PX4 first: (topic, field, sign).
 THRUSTS = (("vehicle_thrust_setpoint", "xyz[2]", -1.0), ("actuator_controls_0", "control[3]", 1.0))
+QUATERNION = 4  # fields of a quaternion
 MIN_THRUST = 0.1  # normalised; above it the vehicle counts as flying when no land detector was logged
 MOTORS_TOPIC, MOTORS = "actuator_motors", tuple(f"control[{i}]" for i in range(12))
 #: (topic, field, value when armed).
@@ -58,25 +69,21 @@ def record_ulog(path: Path) -> Recording:
         When the file cannot be read at all.
     """
     log = _UlogLog(open_ulog(path))
-    signals: dict[str, Series] = {}
-    for signal, layouts in LAYOUTS.items():
-        for topic, fields in layouts:
-            series = log.series(topic, fields)
-            if series is not None:
-                series = _angles(series) if signal in ("y_o", "r_o") else series
-                if np.count_nonzero(np.isfinite(series.values).all(axis=1)) > 1:
-                    signals[signal] = series
-                    break
+    signals, yaw = _signals(log, LAYOUTS, slice(0, 2)), _signals(log, YAW_LAYOUTS, slice(2, 3))
     excitation = _excitation(log)
     if excitation is not None:
         if "u" in signals:
             excitation = _zero_when_silent(excitation, log.published(signals["u"].topic)[0])
-        signals["u_bar"] = excitation
-    published = {}
+        for found, axes in ((signals, slice(0, 2)), (yaw, slice(2, 3))):
+            if excitation.values[:, axes].any():
+                found["u_bar"] = Series(excitation.time, excitation.values[:, axes], excitation.topic)
+    published: dict[str, NDArray[np.float64]] = {}
     for signal in ("r_o", "r_i", "r_bar", "u_bar"):
-        if signal in signals and not log.is_sampled(signals[signal].topic) and "u" in signals:
-            published[signal] = signals[signal].time
-            signals[signal] = _at_cycle(signals[signal], log.published(signals["u"].topic))
+        for found in (signals, yaw):
+            if signal in found and not log.is_sampled(found[signal].topic) and "u" in signals:
+                if found is signals:
+                    published[signal] = found[signal].time
+                found[signal] = _at_cycle(found[signal], log.published(signals["u"].topic))
     file = log.file
     airborne, evidence = _airborne(log)
     now = file.parameters | {name: value for _, name, value in file.changes}
@@ -99,6 +106,7 @@ def record_ulog(path: Path) -> Recording:
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((file.damage,) if file.damage else ()), *vehicle.warnings),
         notes=_notes(log),
+        yaw=yaw,
         commands=_commands(log),
         published=published,
         span=_span(file),
@@ -134,6 +142,20 @@ class _UlogLog:
         return Series(self.published(topic)[1], values, topic)
 
 
+def _signals(log: _UlogLog, layouts: Mapping[str, Any], axes: slice) -> dict[str, Series]:
+    """The first layout of each signal that the log holds; `axes`: which of roll, pitch, yaw."""
+    signals = {}
+    for signal, places in layouts.items():
+        for topic, fields in places:
+            series = log.series(topic, fields)
+            if series is not None:
+                series = _angles(series, axes) if len(fields) == QUATERNION else series
+                if np.count_nonzero(np.isfinite(series.values).all(axis=1)) > 1:
+                    signals[signal] = series
+                    break
+    return signals
+
+
 def _notes(log: _UlogLog) -> tuple[str, ...]:
     """What our module says about its torque, for `mimopilot inspect`."""
     parts = torque_parts(log.fields(PARTS_TOPIC))
@@ -151,26 +173,30 @@ def _advice(profile: float | None) -> str:
     )
 
 
-def _angles(series: Series) -> Series:
-    """Roll and pitch (rad) from quaternions w, x, y, z; a series of angles is returned unchanged."""
-    if series.values.shape[1] == 2:
-        return series
+def _angles(series: Series, axes: slice) -> Series:
+    """Some of roll, pitch and yaw (rad) from quaternions w, x, y, z."""
     w, x, y, z = series.values.T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
     # PX4 fills an unused setpoint with zeros.
     unit = np.abs(w**2 + x**2 + y**2 + z**2 - 1) < 0.1
-    return Series(series.time, np.where(unit[:, None], np.column_stack([roll, pitch]), np.nan), series.topic)
+    angles = np.column_stack([roll, pitch, yaw])[:, axes]
+    return Series(series.time, np.where(unit[:, None], angles, np.nan), series.topic)
 
 
 def _excitation(log: _UlogLog) -> Series | None:
-    """The injected torque; None when not logged."""
+    """The injected torque on roll, pitch and yaw, (N, 3); None when not logged."""
     series = log.series(EXCITATION_TOPIC, ("x", "y", *(f"name[{i}]" for i in range(len(EXCITATION_NAME)))))
     if series is None:
         return None
-    ours = (series.values[:, 2:] == np.frombuffer(EXCITATION_NAME.encode(), np.uint8)).all(axis=1)
-    values = series.values[ours, :2]
-    return Series(series.time[ours], values, series.topic) if values.any() else None
+    named, yaw = (
+        (series.values[:, 2:] == np.frombuffer(name.encode(), np.uint8)).all(axis=1)
+        for name in (EXCITATION_NAME, YAW_EXCITATION_NAME)
+    )
+    x, y = series.values[:, :2].T
+    values = np.column_stack([np.where(named, x, 0.0), np.where(named, y, 0.0), np.where(yaw, x, 0.0)])[named | yaw]
+    return Series(series.time[named | yaw], values, series.topic) if values.any() else None
 
 
 def _zero_when_silent(excitation: Series, cycles: NDArray[np.float64]) -> Series:
@@ -182,7 +208,7 @@ def _zero_when_silent(excitation: Series, cycles: NDArray[np.float64]) -> Series
     zero = (last < 0) | ~excitation.values[np.maximum(last, 0)].any(axis=1)
     silent = cycles[zero & ((last < 0) | (np.abs(excitation.time[np.maximum(last, 0)] - cycles) > near))]
     time = np.concatenate([excitation.time, silent])
-    values = np.concatenate([excitation.values, np.zeros((len(silent), 2))])
+    values = np.concatenate([excitation.values, np.zeros((len(silent), excitation.values.shape[1]))])
     order = np.argsort(time, kind="stable")
     return Series(time[order], values[order], excitation.topic)
 

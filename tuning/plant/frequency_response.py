@@ -13,6 +13,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.plant.local_polynomial import local_response
 from mimopilot.tuning.plant.response_shape import SHAPE_ERROR, fit_shape, shape_response
+from mimopilot.tuning.small_matrices import inverse
 
 #: Least multiple coherence of a rate with the excitation at a coherent frequency.
 COHERENT = 0.7
@@ -186,15 +187,16 @@ class PlantResponse:
         of the nearest frequency.
         """
         counts = np.ceil(np.diff(self.omega) / (share * self.omega[:-1])).astype(int)
-        place = np.concatenate([*(k + np.arange(n) / n for k, n in enumerate(counts)), [len(counts)]])
+        begin = np.repeat(np.cumsum(counts) - counts, counts)
+        inner = np.repeat(np.arange(len(counts)), counts) + (np.arange(len(begin)) - begin) / np.repeat(counts, counts)
+        place = np.append(inner, len(counts))
         omega = np.interp(place, np.arange(len(self.omega)), self.omega)
         low = np.minimum(place.astype(int), len(counts) - 1)
         part, new, old = (place - low)[:, None, None], omega[:, None, None], self.omega[:, None, None]
 
         def between(G: Complex) -> Complex:
-            inverse = np.linalg.inv(G)
-            value: Complex = np.linalg.inv((1 - part) * inverse[low] + part * inverse[low + 1])
-            return value
+            inverted = inverse(G)
+            return inverse((1 - part) * inverted[low] + part * inverted[low + 1])
 
         dense = self.at(np.rint(place).astype(int))
         return replace(dense, omega=omega, G_i=between(self.G_i), G_o=between(old * self.G_o) / new)
@@ -239,13 +241,13 @@ def plant_response(experiment: Experiment, instrument: Signal, upper: float = np
                 f"{experiment.source}: {' and '.join(axis_names(n))} {name} are the same signal, or constant; check "
                 f"the source of {axis_names(n)[-1]}"
             )
-    inverse = np.linalg.inv(T_u)
+    T_u_inverse = np.linalg.inv(T_u)
     plant = PlantResponse(
         omega=found.omega,
-        G_i=T_i @ inverse,
-        G_o=T_o @ inverse,
+        G_i=T_i @ T_u_inverse,
+        G_o=T_o @ T_u_inverse,
         root=hermitian_root(found.noise),
-        reach=hermitian_root(found.error).transpose(0, 2, 1) @ inverse,
+        reach=hermitian_root(found.error).transpose(0, 2, 1) @ T_u_inverse,
         coherence=found.explained[:, n : 2 * n],
         Ts=experiment.Ts,
     )
@@ -292,15 +294,14 @@ def _smoothed(plant: PlantResponse) -> PlantResponse:
             continue
         line = np.column_stack([np.ones(len(near)), places[near] - place])
         certainty = 1 / np.mean(spread[near] ** 2, axis=(1, 2))
-        inverse = np.linalg.inv(line.T @ (certainty[:, None] * line))
+        covariance = np.linalg.inv(line.T @ (certainty[:, None] * line))
         values = ratio[near].reshape(len(near), -1)
-        found = inverse @ (line.T @ (certainty[:, None] * values))
+        found = covariance @ (line.T @ (certainty[:, None] * values))
         # Windows overlap by half, so only half of them are independent.
         misfit = float(np.sum(certainty[:, None] * np.abs(values - line @ found) ** 2)) / (
             plant.axes**2 * (len(near) - 2)
         )
-        misfit /= plant.axes**2
-        share = np.sqrt(2 * inverse[0, 0] * max(1.0, misfit) * certainty[near == k][0])
+        share = np.sqrt(2 * covariance[0, 0] * max(1.0, misfit) * certainty[near == k][0])
         if misfit < EXPLAINED and share < 1:
             G_i[k] = shape[k] * found[0].reshape(plant.axes, plant.axes)
             reach[k] *= share

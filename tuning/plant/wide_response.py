@@ -79,13 +79,16 @@ class WideResponse:
         return weight
 
     def draw(self, generator: np.random.Generator) -> WideResponse:
-        """A plant drawn from the errors of the response and of the noise."""
+        """A plant drawn from the errors of the response, of the fitted body below its band, and of the noise."""
         shape = (len(self.omega), 3 * self.axes, self.axes)
         X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
+        change = self.body.deviation * generator.spawn(1)[0].standard_normal(self.body.B.shape)
+        factor = np.tile(np.eye(self.axes), (len(self.omega), 1, 1))
+        factor[: self.band.start] += np.linalg.solve(self.body.B, change)
         return replace(
             self,
-            G_i=self.G_i + self.error_i @ X @ self.reach,
-            G_o=self.G_o + self.error_o @ X @ self.reach,
+            G_i=self.G_i @ factor + self.error_i @ X @ self.reach,
+            G_o=self.G_o @ factor + self.error_o @ X @ self.reach,
             noise=self.noise * _column(1 + self.noise_deviation * generator.standard_normal(len(self.omega))),
         )
 

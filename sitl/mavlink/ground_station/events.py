@@ -10,16 +10,18 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from typing import NamedTuple, Protocol, TypeVar
 
-from mimopilot.sitl.mavlink.wire.float32 import REAL32
+from mimopilot.sitl.mavlink.wire.float32 import INT32, REAL32
 from mimopilot.sitl.mavlink.wire.ftp import FtpPacket
 
 #: MAV_PARAM_TYPE. PX4 sends the bits of an INT32. ArduPilot's whole numbers are INT8, INT16 or INT32, sent as floats.
-INT8, INT16, INT32 = 2, 4, 6
+INT8, INT16 = 2, 4
 WHOLE = (INT8, INT16, INT32)
 #: MAV_COMP_ID_AUTOPILOT1.
 AUTOPILOT = 1
 #: MAV_CMD_PREFLIGHT_STORAGE.
 STORAGE_COMMAND = 245
+#: PARAM_VALUE.param_index of a parameter that is in no list. PX4: of a module that was not started since boot.
+UNKNOWN_INDEX = 65535
 #: MAV_RESULT.
 ACCEPTED, DENIED, FAILED, IN_PROGRESS = 0, 2, 4, 5
 #: Message number of HEARTBEAT.
@@ -43,7 +45,7 @@ REASONS = {
 
 
 class Heartbeat(NamedTuple):
-    """HEARTBEAT of an autopilot."""
+    """HEARTBEAT of an autopilot; `simulated`: it says that no real motors turn (MAV_MODE_FLAG_HIL_ENABLED)."""
 
     system: int
     component: int
@@ -51,16 +53,18 @@ class Heartbeat(NamedTuple):
     armed: bool
     mode: int = 0
     type: int = GENERIC
+    simulated: bool = False
 
 
 class ParameterValue(NamedTuple):
-    """PARAM_VALUE; `kind` is its param_type. The value of an INT32 is the integer that its bits encode."""
+    """PARAM_VALUE; `kind` is its param_type, `place` its param_index."""
 
     system: int
     component: int
     name: str
     value: float
     kind: int = REAL32
+    place: int = UNKNOWN_INDEX
 
 
 class ParameterRefusal(NamedTuple):
@@ -79,15 +83,19 @@ class CommandAck(NamedTuple):
     component: int
     command: int
     result: int
+    progress: int = 0
 
 
 class AttitudeReport(NamedTuple):
-    """ATTITUDE: roll and pitch, rad."""
+    """ATTITUDE: roll and pitch, rad; time since boot, s; body rates, rad/s; yaw, rad."""
 
     system: int
     component: int
     roll: float
     pitch: float
+    time: float = 0.0
+    rates: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    yaw: float = 0.0
 
 
 class LandedState(NamedTuple):
@@ -96,6 +104,40 @@ class LandedState(NamedTuple):
     system: int
     component: int
     state: int
+
+
+class PowerReport(NamedTuple):
+    """SYS_STATUS: charge left (%; -1: unknown), and whether logging works (None: not reported)."""
+
+    system: int
+    component: int
+    charge: int
+    logging: bool | None = None
+
+
+class AltitudeReport(NamedTuple):
+    """VFR_HUD: altitude, m; climb, m/s."""
+
+    system: int
+    component: int
+    altitude: float
+    climb: float = 0.0
+
+
+class ThrustReport(NamedTuple):
+    """ATTITUDE_TARGET: collective (0 to 1) that the vehicle flies with."""
+
+    system: int
+    component: int
+    thrust: float
+
+
+class StorageReport(NamedTuple):
+    """STORAGE_INFORMATION of a usable card: free space, MiB."""
+
+    system: int
+    component: int
+    free: float
 
 
 class InjectorState(NamedTuple):
@@ -190,6 +232,26 @@ class RequestMessage(NamedTuple):
     message: int
 
 
+class SendCommand(NamedTuple):
+    """COMMAND_LONG: a MAV_CMD and its first parameters; the others are 0."""
+
+    system: int
+    component: int
+    command: int
+    params: tuple[float, ...] = ()
+
+
+class AttitudeTarget(NamedTuple):
+    """SET_ATTITUDE_TARGET: roll, pitch and yaw (rad), and collective (0 to 1); body rates are ignored."""
+
+    system: int
+    component: int
+    roll: float
+    pitch: float
+    yaw: float
+    thrust: float
+
+
 class FileRequest(NamedTuple):
     """FILE_TRANSFER_PROTOCOL."""
 
@@ -227,7 +289,16 @@ class EndLogs(NamedTuple):
 #: Pieces of a vehicle's files and logs.
 TransferReport = FileReply | LogEntry | LogData
 #: Flight state that a vehicle streams.
-FlightReport = AttitudeReport | LandedState | InjectorState | StatusText
+FlightReport = (
+    AttitudeReport
+    | LandedState
+    | PowerReport
+    | AltitudeReport
+    | ThrustReport
+    | StorageReport
+    | InjectorState
+    | StatusText
+)
 Incoming = Heartbeat | ParameterValue | ParameterRefusal | CommandAck | FlightReport | TransferReport
 Outgoing = (
     GroundHeartbeat
@@ -236,6 +307,8 @@ Outgoing = (
     | StoreParameters
     | SetMessageInterval
     | RequestMessage
+    | SendCommand
+    | AttitudeTarget
     | FileRequest
     | RequestLogs
     | RequestLogData

@@ -48,6 +48,8 @@ class UploadPlan:
         Other differences of the vehicle's controller.
     profile : str
         Key of `PROFILES` that the vehicle must fit; empty: any vehicle.
+    integers : frozenset of str
+        Parameters that may be whole numbers on the vehicle.
     """
 
     settings: tuple[ParameterWrite, ...]
@@ -55,6 +57,7 @@ class UploadPlan:
     scale: tuple[str, ...]
     notes: tuple[str, ...] = ()
     profile: str = ""
+    integers: frozenset[str] = frozenset()
 
     @property
     def values(self) -> dict[str, float]:
@@ -175,7 +178,7 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.
 _OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
 TABLE = {p.name: p for p in _OURS}
-PREFIXES = {MIMO: PREFIX, PX4_STOCK: "MC_", ARDUPILOT_STOCK: "ATC_"}
+PREFIXES = {MIMO: (PREFIX,), PX4_STOCK: ("MC_",), ARDUPILOT_STOCK: ("ATC_", "SID_")}
 
 
 def violated_range(name: str, value: float) -> str:
@@ -222,4 +225,5 @@ def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
         if name not in fixed
     )
     profile = next((p for p, prefix in PREFIXES.items() if any(name.startswith(prefix) for name in values)), "")
-    return UploadPlan(settings, {name: values[name] for name in values if name in fixed}, (), profile=profile)
+    held = {name: values[name] for name in values if name in fixed}
+    return UploadPlan(settings, held, (), profile=profile, integers=frozenset(values))

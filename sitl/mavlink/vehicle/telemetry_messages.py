@@ -9,8 +9,9 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.sitl.autopilot.excitation_injector import ExcitationPhase
 from mimopilot.sitl.autopilot.flight_modes import Mode
-from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, setpoint_quaternions
+from mimopilot.sitl.flight.flight_log import EXCITATION_NAME, YAW_EXCITATION_NAME, setpoint_quaternions
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
@@ -46,16 +47,17 @@ MODE_FLAGS = {
 
 
 def heartbeat(s: VehicleState) -> Any:
-    """HEARTBEAT."""
+    """HEARTBEAT; it says that the vehicle is simulated."""
     vehicle = s.vehicle
     base = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED | mavlink.MAV_MODE_FLAG_STABILIZE_ENABLED
+    base |= mavlink.MAV_MODE_FLAG_HIL_ENABLED
     base |= MODE_FLAGS[vehicle.mode] | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if vehicle.armed else 0)
     status = mavlink.MAV_STATE_ACTIVE if vehicle.armed else mavlink.MAV_STATE_STANDBY
     if "plant" in vehicle.arming_blockers:
         status = mavlink.MAV_STATE_BOOT
     elif vehicle.armed and vehicle.in_failsafe:
         status = mavlink.MAV_STATE_CRITICAL
-    kind, mode = (mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_GENERIC), custom_mode(vehicle.mode)
+    kind, mode = (mavlink.MAV_TYPE_QUADROTOR, s.autopilot), custom_mode(vehicle.mode)
     return mavlink.MAVLink_heartbeat_message(*kind, base, mode, status, MAVLINK_VERSION)
 
 
@@ -165,9 +167,12 @@ def _home_position(s: VehicleState) -> Any:
 
 
 def _excitation(s: VehicleState) -> Any:
-    """Injected torque, as the firmware's module publishes it."""
-    roll, pitch, _ = _floats(s.record["excitation"])
-    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, max(s.stamp, 0), roll, pitch, float(s.excitation_phase))
+    """Injected torque, as the firmware's module publishes it: of roll and pitch, or of yaw while that is excited."""
+    roll, pitch, yaw = _floats(s.record["excitation"])
+    phase, stamp = s.excitation_phase, max(s.stamp, 0)
+    if phase == ExcitationPhase.YAW.value:
+        return mavlink.MAVLink_debug_vect_message(YAW_EXCITATION_NAME, stamp, yaw, s.excitation_turn, float(phase))
+    return mavlink.MAVLink_debug_vect_message(EXCITATION_NAME, stamp, roll, pitch, float(phase))
 
 
 def _autopilot_version(s: VehicleState) -> Any:

@@ -34,10 +34,11 @@ class TorqueInjection:
                 mode=NAV_STATES[vehicle.mode],
                 attitude=(estimate.roll, estimate.pitch),
                 sticks=vehicle.sticks.value if vehicle.sticks.fresh(now) else NO_STICKS,
+                yaw_rate=float(self.state.record["rates"][2]),
             )
         )
         for text in injector.said:
             vehicle.say(Severity.INFO, text)
         injector.said.clear()
-        self.state.excitation_phase = injector.phase.published
+        self.state.excitation_phase, self.state.excitation_turn = injector.phase.published, injector.turned
         return moment

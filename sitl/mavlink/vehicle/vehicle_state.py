@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.autopilot.autopilot import RECORD
 from mimopilot.sitl.autopilot.flight_modes import Commander
@@ -37,7 +38,11 @@ class VehicleState:
     load : float
         Share of the last second in which the control loop did not sleep.
     excitation_phase : int
-        0 roll, 1 pitch, 2 between them, -1 off.
+        0 roll, 1 pitch, 2 between two axes, 3 yaw, -1 off.
+    excitation_turn : float, rad
+        Since yaw's excitation began.
+    autopilot : int
+        MAV_AUTOPILOT that the vehicle reports.
     """
 
     vehicle: Commander
@@ -49,6 +54,8 @@ class VehicleState:
     home: tuple[int, ...] = ()
     load: float = 0.0
     excitation_phase: int = -1
+    autopilot: int = mavlink.MAV_AUTOPILOT_GENERIC
+    excitation_turn: float = 0.0
 
     @property
     def milliseconds(self) -> int:

@@ -40,7 +40,26 @@ def test_both_axes_get_the_prbs_of_the_tuner_one_after_the_other_once():
     assert injector.said[-1] == "excitation finished"
 
 
-@pytest.mark.parametrize(("axis", "column"), [(1, 0), (2, 1)])
+def test_yaw_is_the_last_of_all_axes_with_its_own_amplitude_and_longer_pulses():
+    moment = flown(requested(5, MIMO_EX_AMPY=0.3), 2000)
+    start = 2 * (SAMPLES + round(1 / TS))
+    yaw = prbs(SAMPLES, 0.3, 20, 120, np.random.default_rng(12))
+    assert np.array_equal(moment[start : start + SAMPLES, 2], yaw)
+    moment[start : start + SAMPLES, 2] = 0
+    assert np.array_equal(moment, flown(requested(3), 2000))
+
+
+@pytest.mark.parametrize(("rate", "samples"), [(2.1, 0), (-2.1, 0), (1.9, 105), (-1.2, 166), (float("nan"), 0)])
+def test_yaw_stops_when_it_turns_too_fast_or_too_far_and_roll_does_not(rate, samples):
+    injector = requested(4, MIMO_EX_DUR=10.0)
+    assert flown(injector, 100)[:, 2].all()
+    turning = HOVER._replace(yaw_rate=rate)
+    assert np.count_nonzero(flown(injector, 400, turning)) == pytest.approx(samples, abs=1)
+    assert injector.said[-1] == "excitation stopped: turned too fast or too far"
+    assert np.count_nonzero(flown(requested(1), 400, turning)) == SAMPLES
+
+
+@pytest.mark.parametrize(("axis", "column"), [(1, 0), (2, 1), (4, 2)])
 def test_one_axis_can_be_excited_alone(axis, column):
     moment = flown(requested(axis), 2 * SAMPLES)
     assert np.abs(moment[:SAMPLES, column]).min() > 0
@@ -120,6 +139,6 @@ def test_the_torque_never_exceeds_its_amplitude_and_is_zero_outside_of_flight(se
     injector.configure(settings)
     for conditions in flight:
         moment = injector.step(conditions)
-        assert max(map(abs, moment)) <= settings["MIMO_EX_AMP"]
+        assert max(map(abs, moment[:2])) <= settings["MIMO_EX_AMP"] and abs(moment[2]) <= settings["MIMO_EX_AMPY"]
         if conditions is not HOVER:
             assert moment == NO_MOMENT

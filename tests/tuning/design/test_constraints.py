@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.analysis.closed_loop import singular_values
 from mimopilot.tuning.design.conic_problem import ConicProblem
 from mimopilot.tuning.design.constraints import (
     Cut,
@@ -24,6 +23,7 @@ from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import wide_response
+from mimopilot.tuning.small_matrices import singular_values
 from tests.tuning.analysis.test_certify import experiment
 
 

@@ -93,7 +93,9 @@ def test_the_noise_of_the_torque_is_the_integral_of_its_spectrum(plant, gains):
         G_o=0 * plant.G_o,
         noise=np.diag([0.01, 0.01, 0, 0]) * np.ones((len(plant.omega), 1, 1)),
     )
-    plain = dataclasses.replace(gains.for_our_law(), Kp_i=0.15 * np.eye(2), Ki_i=np.zeros((2, 2)), Kd_i=np.zeros((2, 2)))
+    plain = dataclasses.replace(
+        gains.for_our_law(), Kp_i=0.15 * np.eye(2), Ki_i=np.zeros((2, 2)), Kd_i=np.zeros((2, 2))
+    )
     free = free_of(plain, plant)
     # The grid begins at 0.1 rad/s and ends just below the Nyquist frequency.
     assert LoopGradient(silent, free, free.vector(plain)).noise_rms() == pytest.approx(0.15 * 0.01, rel=1e-3)

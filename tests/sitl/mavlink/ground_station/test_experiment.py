@@ -2,6 +2,7 @@
 
 import re
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ import pytest
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SetParameter, run_exchange
-from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions, settings
+from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
+from mimopilot.sitl.mavlink.ground_station.experiments.module_injector import INTEGERS, excite, start_monitor
+from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import injector_settings
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
-from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import INTEGERS, excite, start_monitor
 from mimopilot.tuning.logs.reader import read_log
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
@@ -19,18 +21,18 @@ from tests.sitl.mavlink.running import PATIENCE_S, Pilot, running_sitl, start
 from tests.sitl.mavlink.scripted_vehicle import SimulatedLink
 
 CHOICE = ExcitationOptions("both", 8.0, 0.2, 50.0, 3, "hold", 25.0)
-WANTED = settings(CHOICE, 0.004)
+WANTED = injector_settings(CHOICE, 0.004)
 PLANNED = 2 * 8.0 + 1.0
 
 
-def experiment(vehicle, interrupt_at=None, **link):
+def experiment(vehicle, interrupt_at=None, wanted=WANTED, **link):
     carrier = SimulatedLink(vehicle, **link)
     client = ParameterClient(carrier.now(), integers=INTEGERS, force_armed=True)
     if interrupt_at is not None:
         vehicle.then[interrupt_at] = lambda _: setattr(client, "interrupted", True)
     run_exchange(client.await_heartbeat(), carrier)
     monitor = run_exchange(start_monitor(client, 4), carrier)
-    return run_exchange(excite(client, monitor, WANTED), carrier), carrier
+    return run_exchange(excite(client, monitor, wanted), carrier), carrier
 
 
 def end_of_injection(vehicle):
@@ -52,6 +54,18 @@ def test_a_complete_experiment_restores_all_settings(integers, loss):
     assert [np.count_nonzero(moments[:, axis]) for axis in (0, 1)] == [400, 400]
     assert (vehicle.settings, vehicle.values[AXIS]) == (before, 0.0)
     assert vehicle.stored == 0  # the settings are for this flight only
+
+
+def test_all_three_axes_are_excited_one_after_the_other():
+    vehicle = FlyingVehicle()
+    wanted = injector_settings(replace(CHOICE, axis="all", yaw_amplitude=0.3), 0.004)
+    result, _ = experiment(vehicle, wanted=wanted)
+    assert (result.complete, result.restored) == (True, True)
+    assert result.seconds == pytest.approx(3 * 8.0 + 2 * 1.0, abs=0.3)  # messages at 10 Hz
+    moments = np.array(vehicle.moments)
+    assert np.abs(moments).max(axis=0) == pytest.approx([0.2, 0.2, 0.3])
+    assert np.count_nonzero(moments, axis=0).tolist() == [400, 400, 400]
+    assert (np.count_nonzero(moments, axis=1) <= 1).all()
 
 
 def change(**attributes):
@@ -149,7 +163,8 @@ def test_the_injection_is_not_started_if_a_setting_is_refused():
 @pytest.mark.parametrize(
     ("change", "parts"),
     [
-        ({"axis": "yaw"}, "--axis: got 'yaw'"),
+        ({"axis": "x"}, "--axis: got 'x'"),
+        ({"yaw_amplitude": 0.6}, "MIMO_EX_AMPY: got 0.6"),
         ({"mode": "acro"}, "--mode: got 'acro'"),
         ({"amplitude": 0.6}, "MIMO_EX_AMP: got 0.6"),
         ({"amplitude": float("nan")}, "finite"),
@@ -159,7 +174,7 @@ def test_the_injection_is_not_started_if_a_setting_is_refused():
 )
 def test_settings_out_of_range_are_refused_before_sending(change, parts):
     with pytest.raises(SitlError, match=parts):
-        settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
+        injector_settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
 
 
 # The commands, against `mimopilot sitl`.
@@ -179,7 +194,7 @@ def test_an_experiment_over_mavlink_produces_a_log_for_tuning(tmp_path, mimopilo
     with running_sitl("--speed", "4", "--log", log) as sitl:
         pilot = hovering_pilot(sitl)
         link = ("--connect", f"tcp:127.0.0.1:{sitl.tcp}", "--yes")
-        done = mimopilot("experiment", *link, "--seconds-per-axis", 12)
+        done = mimopilot("experiment", *link, "--seconds-per-axis", 9)
         assert done.returncode == 0, done.stderr
         assert "mimopilot tune LOG" in done.stdout
         wrong = mimopilot("experiment", *link, "--mode", "position")
@@ -191,8 +206,10 @@ def test_an_experiment_over_mavlink_produces_a_log_for_tuning(tmp_path, mimopilo
         assert (tmp_path / "logs" / "flight.ulg").read_bytes() == log.read_bytes()
         pilot.close()
     flown = read_log(log)
-    excited = [np.flatnonzero(flown.u_bar[:, axis]) for axis in (0, 1)]
-    assert [len(samples) * flown.Ts for samples in excited] == pytest.approx([12.0, 12.0])
+    excited = [np.flatnonzero(signal) for signal in (*flown.u_bar.T, flown.yaw.u_bar)]
+    assert [len(samples) * flown.Ts for samples in excited] == pytest.approx([9.0, 9.0, 9.0])
+    assert excited[2][0] - excited[1][-1] == 251  # 1 s pause
+    assert flown.yaw.segments == ((excited[2][0], len(flown.u)),)
     assert flown.Ts == 0.004
     tuned = mimopilot("tune", log, "--inner", "30,0.7,0", "--outer", "10,0.7,0", "--out", tmp_path / "g.gains.toml")
     assert tuned.returncode == 0, tuned.stderr
@@ -211,7 +228,7 @@ def test_ctrl_c_in_the_client_restores_the_settings_and_the_vehicle_hovers_on():
         client.end()
         pilot.link.mav.param_request_list_send(1, 1)
         values = {}
-        while len(values) < 47:
+        while len(values) < 48:
             message = pilot.asks("PARAM_VALUE")
             values[message.param_id] = message.param_value
         assert values["MIMO_EX_AMP"] == pytest.approx(0.1)

@@ -9,18 +9,23 @@ namespace
 constexpr float kStickMove = 0.1F;       // of -1 to 1
 constexpr float kMaxAmplitude = 0.5F;
 constexpr float kMaxTilt = 1.0F;         // rad
+constexpr float kMaxTurn = 0.8F;         // rad, on yaw; PX4's own autotune turns as far
+constexpr float kMaxYawRate = 2.0F;      // rad/s, on yaw
 constexpr int32_t kMaxSamples = 1000000;
+constexpr int32_t kYawHold = 2;          // a unit of torque accelerates yaw 10 to 20 times less than roll
+constexpr int32_t kYaw = 2;
 
 // A range test rejects NaN too; optimisation flags may remove isfinite.
-bool between(float value, float low, float high) { return value >= low && value <= high; }
+bool within(float value, float limit) { return __builtin_fabsf(value) <= limit; }
 bool between(int32_t value, int32_t low, int32_t high) { return value >= low && value <= high; }
 
 bool acceptable(const ExcitationSettings &settings)
 {
-	return between(settings.axis, 1, 3) && between(settings.amplitude, 0.0F, kMaxAmplitude)
-	       && between(settings.hold_min, 1, kMaxSamples) && between(settings.hold_max, settings.hold_min, kMaxSamples)
-	       && between(settings.duration, 1, kMaxSamples) && between(settings.pause, 0, kMaxSamples)
-	       && between(settings.tilt_max, 0.0F, kMaxTilt);
+	return between(settings.axis, 1, 5) && within(settings.amplitude[0], kMaxAmplitude)
+	       && within(settings.amplitude[kYaw], kMaxAmplitude)
+	       && between(settings.hold_min, 1, settings.hold_max) && settings.hold_max <= kMaxSamples
+	       && between(settings.duration, 1, kMaxSamples)
+	       && within(settings.tilt_max, kMaxTilt);
 }
 
 }  // namespace
@@ -88,12 +93,12 @@ void Excitation::step(const ExcitationConditions &conditions, float (&moment)[3]
 	if (_phase == Phase::Waiting && conditions.ready) {
 		for (int i = 0; i < 4; i++) { _sticks[i] = conditions.sticks[i]; }
 
-		if (fault(conditions) == End::None) {
-			begin(_settings.axis == 2 ? Phase::Pitch : Phase::Roll);
-		}
+		if (fault(conditions) == End::None) { begin((_settings.axis & 1) != 0 ? 0 : last()); }
 	}
 
 	if (!running()) { return; }
+
+	if (_phase == Phase::Yaw) { _turned += conditions.yaw_rate * _settings.period; }
 
 	const End reason = fault(conditions);
 
@@ -104,9 +109,7 @@ void Excitation::step(const ExcitationConditions &conditions, float (&moment)[3]
 
 	if (_left == 0) { advance(); }
 
-	if (_phase == Phase::Roll) { moment[0] = _settings.amplitude * _prbs.next(); }
-
-	if (_phase == Phase::Pitch) { moment[1] = _settings.amplitude * _prbs.next(); }
+	if (running() && _phase != Phase::Pause) { moment[_axis] = _settings.amplitude[_axis] * _prbs.next(); }
 
 	_left--;
 }
@@ -115,10 +118,14 @@ Excitation::End Excitation::fault(const ExcitationConditions &conditions) const
 {
 	if (!conditions.ready) { return End::NotReady; }
 
-	if (!between(conditions.tilt, 0.0F, _settings.tilt_max)) { return End::Tilt; }
+	if (!within(conditions.tilt, _settings.tilt_max)) { return End::Tilt; }
+
+	if (_phase == Phase::Yaw && !(within(_turned, kMaxTurn) && within(conditions.yaw_rate, kMaxYawRate))) {
+		return End::Turn;
+	}
 
 	for (int i = 0; i < 4; i++) {
-		if (!between(conditions.sticks[i] - _sticks[i], -kStickMove, kStickMove)) { return End::Sticks; }
+		if (!within(conditions.sticks[i] - _sticks[i], kStickMove)) { return End::Sticks; }
 	}
 
 	return End::None;
@@ -126,25 +133,29 @@ Excitation::End Excitation::fault(const ExcitationConditions &conditions) const
 
 void Excitation::advance()
 {
-	if (_phase == Phase::Roll && _settings.axis == 3) {
-		begin(_settings.pause > 0 ? Phase::Pause : Phase::Pitch);
+	if (_phase == Phase::Pause) {
+		begin(_axis + 1);
 
-	} else if (_phase == Phase::Pause) {
-		begin(Phase::Pitch);
+	} else if (_axis < last()) {
+		_phase = Phase::Pause;
+		_left = _settings.pause;
 
 	} else {
 		stop(End::Finished);
 	}
 }
 
-void Excitation::begin(Phase phase)
+void Excitation::begin(int32_t axis)
 {
-	_phase = phase;
-	_left = phase == Phase::Pause ? _settings.pause : _settings.duration;
+	_axis = axis;
+	_phase = axis == kYaw ? Phase::Yaw : static_cast<Phase>(axis);
+	_left = _settings.duration;
+	_turned = 0.0F;
 
 	// Each axis has its own sequence, starting with a whole pulse.
-	const uint32_t seed = 2U * static_cast<uint32_t>(_settings.seed) + (phase == Phase::Pitch ? 1U : 0U);
-	_prbs.restart(seed, _settings.hold_min, _settings.hold_max);
+	const int32_t longer = axis == kYaw ? kYawHold : 1;
+	const uint32_t seed = 2U * static_cast<uint32_t>(_settings.seed) + static_cast<uint32_t>(axis);
+	_prbs.restart(seed, longer * _settings.hold_min, longer * _settings.hold_max);
 }
 
 void Excitation::stop(End reason)

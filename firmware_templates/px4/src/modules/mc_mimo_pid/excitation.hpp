@@ -1,5 +1,5 @@
-// The excitation: a pseudo-random binary torque, added to the controller output on roll, on pitch, or on roll and
-// then pitch. Needs no PX4, so that any machine can compile and test it.
+// The excitation: a pseudo-random binary torque, added to the controller output on one axis, or on one after the
+// other. Needs no PX4, so that any machine can compile and test it.
 #pragma once
 
 #include <stdint.h>
@@ -25,30 +25,33 @@ private:
 };
 
 struct ExcitationSettings {
-	int32_t axis;       // 0 none, 1 roll, 2 pitch, 3 roll then pitch
-	float amplitude;    // normalised torque
-	int32_t hold_min;   // samples
+	int32_t axis;       // 0 none; 1 roll, 2 pitch, 4 yaw; 3 roll then pitch, 5 roll, pitch, then yaw
+	float amplitude[3]; // normalised torque on each axis
+	int32_t hold_min;   // samples; yaw's pulses are kYawHold times longer
 	int32_t hold_max;   // samples
 	int32_t duration;   // samples on each axis
 	int32_t pause;      // samples between the axes
 	int32_t seed;
 	float tilt_max;     // rad
+	float period;       // s, of a sample
 };
 
 struct ExcitationConditions {
 	bool ready;             // armed, in the air, in the chosen mode, measurements valid
 	float tilt;             // rad
+	float yaw_rate;         // rad/s
 	float sticks[4];        // -1 to 1; all 0 without a remote control
 };
 
 // An axis chosen after 0 requests one run. It starts when the vehicle is ready. It stops early if the vehicle is no
-// longer ready, tilts too far, or a stick moves. An axis already set at the first configure(), such as a parameter left
-// from an earlier flight, requests nothing.
+// longer ready, tilts too far, or a stick moves; on yaw also if it turns too fast or too far. An axis already set at the
+// first configure(), such as a parameter left from an earlier flight, requests nothing.
 class Excitation
 {
 public:
-	enum class Phase : int8_t { Off = -1, Roll = 0, Pitch = 1, Pause = 2, Waiting = 3 };
-	enum class End : uint8_t { None, Finished, Cancelled, NotReady, Tilt, Sticks, Settings };
+	// Numbered as in logs, where waiting is off.
+	enum class Phase : int8_t { Waiting = -2, Off = -1, Roll = 0, Pitch = 1, Pause = 2, Yaw = 3 };
+	enum class End : uint8_t { None, Finished, Cancelled, NotReady, Tilt, Sticks, Settings, Turn };
 
 	void configure(const ExcitationSettings &settings);
 
@@ -62,12 +65,19 @@ public:
 
 	Phase phase() const { return _phase; }
 	End end() const { return _end; }
-	bool running() const { return _phase == Phase::Roll || _phase == Phase::Pitch || _phase == Phase::Pause; }
+	bool running() const { return _phase >= Phase::Roll; }
+
+	// Whether yaw is excited, or was last.
+	bool on_yaw() const { return _axis == 2; }
+
+	// By the yaw rate since yaw's excitation began, rad: an estimator's heading reset is no turn.
+	float turned() const { return _turned; }
 
 private:
 	void stop(End reason);
-	void begin(Phase phase);
+	void begin(int32_t axis);
 	void advance();
+	int32_t last() const { return _settings.axis >> 1; }  // axis to excite
 	End fault(const ExcitationConditions &conditions) const;
 
 	ExcitationSettings _settings{};
@@ -77,6 +87,8 @@ private:
 	bool _configured{false};
 	int32_t _chosen{0};  // axis of the last configure()
 	int32_t _left{0};    // samples, this phase
+	int32_t _axis{0};    // 0 roll, 1 pitch, 2 yaw: this one, or the last before the pause
+	float _turned{0.0F}; // rad
 	float _sticks[4] {}; // at the start
 };
 

@@ -34,6 +34,8 @@ const char *describe(Excitation::Phase phase)
 
 	case Excitation::Phase::Pause: return "pause";
 
+	case Excitation::Phase::Yaw: return "yaw";
+
 	case Excitation::Phase::Waiting: return "waiting";
 
 	default: return "off";
@@ -47,13 +49,15 @@ const char *describe(Excitation::End end)
 
 	case Excitation::End::Cancelled: return "cancelled";
 
-	case Excitation::End::NotReady: return "stopped: mode, ground or disarmed";
+	case Excitation::End::NotReady: return "stop: mode, ground or disarmed";
 
-	case Excitation::End::Tilt: return "stopped: MIMO_EX_TILT";
+	case Excitation::End::Tilt: return "stop: MIMO_EX_TILT";
 
-	case Excitation::End::Sticks: return "stopped: a stick moved";
+	case Excitation::End::Turn: return "stop: turned";
 
-	case Excitation::End::Settings: return "refused: a MIMO_EX_ out of range";
+	case Excitation::End::Sticks: return "stop: a stick moved";
+
+	case Excitation::End::Settings: return "refused: MIMO_EX_ out of range";
 
 	default: return "none yet";
 	}
@@ -281,12 +285,12 @@ void McMimoPid::excite(float (&moment)[3])
 	conditions.ready = _control_mode.flag_armed && !_on_ground && _output.fault == 0
 			   && static_cast<int32_t>(_status.nav_state) == _parameters.excitation_mode();
 	conditions.tilt = tilt(_input.attitude);
+	conditions.yaw_rate = _input.rates[2];
 
 	if (_manual.valid) {
-		conditions.sticks[0] = optional(_manual.roll);
-		conditions.sticks[1] = optional(_manual.pitch);
-		conditions.sticks[2] = optional(_manual.yaw);
-		conditions.sticks[3] = optional(_manual.throttle);
+		const float sticks[] {_manual.roll, _manual.pitch, _manual.yaw, _manual.throttle};
+
+		for (int i = 0; i < 4; i++) { conditions.sticks[i] = optional(sticks[i]); }
 	}
 
 	const Excitation::Phase before = _excitation.phase();
@@ -298,7 +302,9 @@ void McMimoPid::excite(float (&moment)[3])
 	}
 }
 
-// For the log: the excitation from the request to the first sample without, and what the controller thinks.
+// For the log: the excitation from the request to the first sample without, and what the controller thinks. Roll and
+// pitch are x and y of MIMO_EXC; yaw, and how far it has turned, are those of MIMO_EXY. A sample has one of them, because
+// the topic holds only the last message.
 void McMimoPid::log()
 {
 	if (_excitation.phase() != Excitation::Phase::Off || _excitation_logged) {
@@ -306,7 +312,14 @@ void McMimoPid::log()
 		memcpy(excitation.name, kExcitationName, sizeof(kExcitationName));
 		excitation.x = _excited[0];
 		excitation.y = _excited[1];
-		excitation.z = _excitation.running() ? static_cast<float>(static_cast<int>(_excitation.phase())) : -1.0F;
+
+		if (_excitation.on_yaw()) {
+			excitation.name[sizeof(kExcitationName) - 2] = 'Y';  // MIMO_EXY
+			excitation.x = _excited[2];
+			excitation.y = _excitation.turned();
+		}
+
+		excitation.z = static_cast<float>(_excitation.running() ? static_cast<int>(_excitation.phase()) : -1);
 		excitation.timestamp = hrt_absolute_time();
 		_debug_vect_pub.publish(excitation);
 		_excitation_logged = _excitation.phase() != Excitation::Phase::Off;

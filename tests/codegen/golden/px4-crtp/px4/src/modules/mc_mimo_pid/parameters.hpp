@@ -29,6 +29,7 @@ private:
 	enum Setting {
 		MIMO_EX_AX,
 		MIMO_EX_AMP,
+		MIMO_EX_AMPY,
 		MIMO_EX_HMIN,
 		MIMO_EX_HMAX,
 		MIMO_EX_DUR,

@@ -66,6 +66,7 @@ constexpr px4::params kNames[] = {
 	px4::params::MIMO_M_OMEGA,
 	px4::params::MIMO_EX_AX,
 	px4::params::MIMO_EX_AMP,
+	px4::params::MIMO_EX_AMPY,
 	px4::params::MIMO_EX_HMIN,
 	px4::params::MIMO_EX_HMAX,
 	px4::params::MIMO_EX_DUR,
@@ -140,15 +141,17 @@ const char *Parameters::read(Gains &gains)
 
 ExcitationSettings Parameters::excitation() const
 {
-	ExcitationSettings settings{};
+	ExcitationSettings settings;
 	settings.axis = integer(MIMO_EX_AX);
-	settings.amplitude = _settings[MIMO_EX_AMP];
+	settings.amplitude[0] = settings.amplitude[1] = _settings[MIMO_EX_AMP];
+	settings.amplitude[2] = _settings[MIMO_EX_AMPY];
 	settings.hold_min = integer(MIMO_EX_HMIN);
 	settings.hold_max = integer(MIMO_EX_HMAX);
 	settings.duration = samples(_settings[MIMO_EX_DUR]);
 	settings.pause = samples(1.0F);
 	settings.seed = integer(MIMO_EX_SEED);
 	settings.tilt_max = _settings[MIMO_EX_TILT];
+	settings.period = kGains.period;
 	return settings;
 }
 

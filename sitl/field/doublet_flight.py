@@ -1,0 +1,146 @@
+"""The check flight's manoeuvre: doublets of the attitude setpoint on one axis after the other, sent to the vehicle.
+
+The setpoints are timed by the vehicle's clock, and the collective holds the altitude: that of the hover, and a
+correction from the height that the vehicle reports. See `sitl.mavlink.ground_station.events` for how an exchange is
+run.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from mimopilot.sitl.field.flight_watch import FlightWatch
+from mimopilot.sitl.mavlink.ground_station.events import (
+    ARDUPILOT,
+    AttitudeTarget,
+    Exchange,
+    Outgoing,
+    SendCommand,
+)
+from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
+from mimopilot.sitl.physics.rigid_body import GRAVITY
+
+# All chosen, unless a source is given:
+#: Whole length of a doublet (one of `tuning.analysis.manoeuvres.PERIODS`), their number on each axis, and level flight
+#: after each, s.
+DOUBLET_S, DOUBLETS, LEVEL_S = 1.2, 2, 1.8
+#: Level flight before the first doublet, s: the torque of hover is measured in it.
+BEFORE_S = 4.0
+#: Largest amplitude (rad), that of the predictions; and the least, which noise and gusts do not hide.
+LARGEST, LEAST = math.radians(10.0), math.radians(3.0)
+#: Setpoints before the mode is asked for, s: PX4 wants them for longer than a second.
+FIRST_S = 1.2
+#: Interval between two setpoints, s.
+SETPOINT_S = 0.02
+#: Until the vehicle is in the mode, s.
+MODE_TIMEOUT_S = 10.0
+#: Silence of the vehicle's clock after which the setpoint is level, s.
+CLOCK_S = 0.5
+#: Bandwidth (rad/s) of the altitude hold: slow against the delay of a radio; and its largest share of the hover thrust.
+HEIGHT_RATE, HEIGHT_SHARE = 0.8, 0.25
+#: Mode of attitude setpoints, main and sub mode and custom_mode: PX4's Offboard; ArduCopter's Guided_NoGPS.
+OFFBOARD, GUIDED_NOGPS = (6.0, 0.0, 6 << 16), (20.0, 0.0, 20)
+#: ArduCopter takes the collective as a climb rate: this one is level (GUID_OPTIONS, its default).
+NO_CLIMB = 0.5
+
+
+@dataclass(frozen=True)
+class DoubletPlan:
+    """Doublets on roll, then on pitch.
+
+    Attributes
+    ----------
+    amplitude : float, rad
+    axes : tuple of int
+        0 roll, 1 pitch.
+    """
+
+    amplitude: float
+    axes: tuple[int, ...] = (0, 1)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the flight, s."""
+        return BEFORE_S + len(self.axes) * DOUBLETS * (DOUBLET_S + LEVEL_S)
+
+    def setpoint(self, time: float) -> tuple[float, float]:
+        """Roll and pitch (rad) at a time (s) since the beginning."""
+        number, within = divmod(time - BEFORE_S, DOUBLET_S + LEVEL_S)
+        angles = [0.0, 0.0]
+        if time >= BEFORE_S and number < len(self.axes) * DOUBLETS and within < DOUBLET_S:
+            sign = 1.0 if within < DOUBLET_S / 2 else -1.0
+            angles[self.axes[int(number) // DOUBLETS]] = sign * self.amplitude
+        return angles[0], angles[1]
+
+
+def doublet_plan(flown: float | None) -> DoubletPlan:
+    """Doublets within what an experiment has flown.
+
+    Parameters
+    ----------
+    flown : float or None, rad
+        Size of its manoeuvres; None: not known.
+    """
+    return DoubletPlan(min(LARGEST, max(LEAST, flown or LEAST)))
+
+
+def fly_doublets(watch: FlightWatch, plan: DoubletPlan) -> Exchange[tuple[str, bool]]:
+    """Fly the doublets from hover. The vehicle is left in the mode of setpoints: the caller lands it or hands it back.
+
+    Returns
+    -------
+    reason : str
+        Why they were ended early; empty: they were not.
+    tripped : bool
+        Because of what the vehicle did under these gains.
+    """
+    client = watch.client
+    assert client.vehicle is not None
+    address = client.vehicle.system, client.vehicle.component
+    guided = client.vehicle.autopilot == ARDUPILOT
+    *mode, number = GUIDED_NOGPS if guided else OFFBOARD
+    hover, height, yaw = watch.thrust, watch.altitude, watch.yaw
+    begin, ask_at, send_at = client.now, client.now + FIRST_S, client.now
+    started: float | None = None
+    while True:
+        late = client.now - watch.seen["ATTITUDE"] > CLOCK_S
+        time = 0.0 if started is None else watch.time - started
+        send: list[Outgoing] = []
+        if client.now >= send_at:
+            send_at = client.now + SETPOINT_S
+            roll, pitch = (0.0, 0.0) if late or started is None else plan.setpoint(time)
+            thrust = NO_CLIMB if guided else _collective(watch, hover, height)
+            send.append(AttitudeTarget(*address, roll, pitch, yaw, thrust))
+        if started is None and client.now >= ask_at:
+            ask_at = client.now + TRY_S
+            parameters = (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *mode)
+            send.append(SendCommand(*address, mavlink.MAV_CMD_DO_SET_MODE, parameters))
+        yield from client.send_and_wait(send, send_at)
+        reason = watch.trip(height)
+        if reason:
+            return reason, True
+        reason = "interrupted" if client.interrupted else watch.link_problem()
+        if not reason and not client.vehicle.armed:
+            reason = "the vehicle was disarmed"
+        elif not reason and started is not None and client.vehicle.mode != number:
+            reason = "the vehicle left its mode"
+        elif not reason and started is None and client.now > begin + FIRST_S + MODE_TIMEOUT_S:
+            said = f": {watch.text}" if watch.text else ""
+            reason = f"the vehicle does not take attitude setpoints{said}"
+        if reason:
+            return reason, False
+        if started is None and client.vehicle.mode == number:
+            started = watch.time
+        if time > plan.seconds:
+            return "", False
+        client.progress("check flight", round(time), round(plan.seconds))
+
+
+def _collective(watch: FlightWatch, hover: float, height: float) -> float:
+    """Collective that holds a height (m) from the vehicle's own: a critically damped second-order loop."""
+    acceleration = HEIGHT_RATE**2 * (height - watch.altitude) - 2 * HEIGHT_RATE * watch.climb
+    share = min(max(acceleration / GRAVITY, -HEIGHT_SHARE), HEIGHT_SHARE)
+    return min(max(hover * (1 + share), 0.0), 1.0)

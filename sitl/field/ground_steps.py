@@ -1,0 +1,255 @@
+"""The steps on the ground: check the vehicle, save its gains, fetch a log, tune, upload, judge, keep."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+from mimopilot.common.blas import reproducible
+from mimopilot.common.files import sha256
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.field.autotune_report import write_autotune_report
+from mimopilot.sitl.field.autotune_run import ANSWER_S, CHECK, FLIGHT, GAINS, SNAPSHOT, AutotuneRun, Decided
+from mimopilot.sitl.field.check_flight import check_flight
+from mimopilot.sitl.field.flight_watch import start_watch
+from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, save_snapshot, set_names, write_set
+from mimopilot.sitl.mavlink.log_transfer.log_session import LogSession
+from mimopilot.sitl.mavlink.log_transfer.vehicle_logs import VehicleLog
+from mimopilot.sitl.physics.moment_scale import check_moment_scale
+from mimopilot.tuning.acceptance import check_verdict
+from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains_file import load_gains
+from mimopilot.tuning.logs.inspection import inspect_log
+from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.parameters import IDENTITY
+
+# All chosen:
+#: Charge (%) below which nothing is flown: an autotune is two flights of some minutes.
+MIN_CHARGE = 40
+#: Time (s) in which a vehicle closes its log after disarming, and the pause between two looks.
+LOG_TIMEOUT_S, LOG_PAUSE_S = 30.0, 1.0
+#: Folder of a download that is not finished.
+DOWNLOADS = "download"
+
+Found = dict[str, Any]
+
+
+def check_vehicle(run: AutotuneRun) -> Found:
+    """Check vehicle, battery, gains and logs before anything is flown."""
+    options = run.options
+    with run.vehicle() as session:
+        session.read(set_names(options.profile), options.profile)
+        watch = session.run(start_watch(session.client))
+        if not watch.flying and options.take_off is None:
+            raise SitlError(
+                "the vehicle does not hover: take off and hover first, or give --take-off METRES", exit_code=1
+            )
+        if options.take_off is not None and not (run.may_arm(session.vehicle) or run.dialogue.interactive):
+            raise SitlError(
+                "--take-off: nobody can be asked whether to arm the vehicle, and --yes is no answer to that unless the "
+                "vehicle says that it is simulated: give --arm"
+            )
+        if 0 <= watch.charge < MIN_CHARGE:
+            raise SitlError(
+                f"the battery is at {watch.charge} %, expected {MIN_CHARGE} % or more: charge it", exit_code=1
+            )
+        if watch.logging is False:
+            raise SitlError("the vehicle reports that it cannot log: check its card", exit_code=1)
+        if watch.charge < 0:
+            run.dialogue.tell("the vehicle does not report its battery's charge: watch it yourself")
+        vehicle = session.vehicle
+    list_logs(run)
+    return {"system": vehicle.system, "autopilot": vehicle.autopilot, "simulated": vehicle.simulated}
+
+
+def snapshot(run: AutotuneRun) -> Found:
+    """Save the gains that the vehicle flies with."""
+    held = save_snapshot(run)
+    return {"file": SNAPSHOT, "parameters": len(held), "sha256": sha256(run.file(SNAPSHOT).read_bytes())}
+
+
+def list_logs(run: AutotuneRun) -> list[list[Any]]:
+    """Name, size and time of the logs on the vehicle.
+
+    Raises
+    ------
+    SitlError
+        If it does not list logs.
+    """
+    with run.vehicle_logs() as session:
+        return [_identity(log) for log in session.run(session.logs.find())]
+
+
+def fetch_flight(run: AutotuneRun) -> Found:
+    """Fetch the log of the experiment."""
+    return _fetch(run, FLIGHT, run.decisions.steps["experiment"]["logs_before"])
+
+
+def fetch_check(run: AutotuneRun) -> Found:
+    """Fetch the log of the check flight."""
+    return _fetch(run, CHECK, run.decisions.steps["check flight"]["logs_before"])
+
+
+def _fetch(run: AutotuneRun, name: str, before: list[list[Any]]) -> Found:
+    """Fetch the one log that is new, and give it its name."""
+    folder = run.file(DOWNLOADS)
+    with run.vehicle_logs() as session:
+        log = _new_log(session, before)
+        done = session.run(session.logs.download(log, folder))
+    target = run.file(name + done.path.suffix)
+    done.path.replace(target)
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+    return {"file": target.name, "bytes": done.log.size, "verified": done.verified, "log": done.log.name}
+
+
+def _new_log(session: LogSession, before: list[list[Any]]) -> VehicleLog:
+    """The last log of the vehicle, which must be new; waits until it is there and no longer grows."""
+    begin, size = session.link.now(), -1
+    while True:
+        found = session.run(session.logs.find())
+        new = [log for log in found if _identity(log) not in before]
+        last = session.run(session.logs.choose(None)) if len(new) > 1 else None
+        log = last if last in new else new[0] if len(new) == 1 else None
+        if log is not None and log.size == size > 0:
+            return log
+        size = -1 if log is None else log.size
+        if session.link.now() > begin + LOG_TIMEOUT_S:
+            if log is None:
+                reason = "the vehicle has no log of this flight: is logging on, is its card full?"
+            else:
+                reason = f"{log.name}: the log of this flight has {log.size} bytes and is not closed: card full?"
+            raise SitlError(reason, exit_code=1)
+        session.run(_pause(session))
+
+
+def _pause(session: LogSession) -> Any:
+    until = session.client.now + LOG_PAUSE_S
+    while session.client.now < until:
+        yield from session.client.receive([], until)
+
+
+def _identity(log: VehicleLog) -> list[Any]:
+    return [log.name, log.size, log.time]
+
+
+def inspect_flight(run: AutotuneRun) -> Found:
+    """Look whether gains can be tuned from the log; if not, the experiment is flown again next time."""
+    path = run.log(FLIGHT)
+    found = inspect_log(path)
+    reason = found.reason
+    if reason is None and not any(name.startswith(("u_bar", "r_bar")) for name in found.excitation):
+        reason = "it does not contain the experiment: no injected torque or rate setpoint is logged"
+    if reason is not None:
+        run.decisions.forget_from("experiment")
+        raise SitlError(f"{path}: {reason}", exit_code=1)
+    for warning in found.warnings:
+        run.dialogue.tell(f"{path.name}: {warning}")
+    return {"seconds": found.seconds, "warnings": list(found.warnings)}
+
+
+@reproducible
+def tune_gains(run: AutotuneRun) -> Found:
+    """Tune, certify, and compare with the gains that flew.
+
+    Raises
+    ------
+    SitlError
+        If no gains come out of the log; the experiment is flown again next time.
+    Decided
+        If the flown gains are better.
+    """
+    path = run.log(FLIGHT)
+    try:
+        gains = tune([read_log(path)])
+        warning = check_verdict(gains, allow=False)
+    except TuningError as error:
+        run.decisions.forget_from("experiment")
+        raise SitlError(f"{error}", exit_code=1) from error
+    if warning:
+        run.dialogue.tell(warning)
+    gains.save(run.file(GAINS))
+    run.dialogue.show_gains(gains)
+    reasons = gains.provenance.details.get("keep_flown", ())
+    if reasons:
+        raise Decided(f"the gains that flew are better: {'; '.join(reasons)}")
+    return {"file": GAINS, "sha256": sha256(run.file(GAINS).read_bytes()), "verdict": str(gains.verdict()[0])}
+
+
+def upload_gains(run: AutotuneRun) -> Found:
+    """Ask, write the new gains to the disarmed vehicle, and verify them.
+
+    Raises
+    ------
+    Decided
+        If the answer is no.
+    SitlError
+        If they could not be written and verified; the old ones are back, or `begun` stays set.
+    """
+    gains, plan = load_gains(run.file(GAINS)), new_plan(run)
+    if held_set(run) != OLD:
+        raise SitlError("the vehicle's gains are no longer those of the snapshot: somebody changed them", exit_code=1)
+    with run.vehicle() as session:
+        fixed = session.read([*plan.fixed, *(p.name for p in IDENTITY)], run.options.profile)
+        check_moment_scale(gains, [fixed[p.name] for p in IDENTITY], "the vehicle")
+    for name, value in plan.fixed.items():
+        if fixed[name] != value:
+            raise SitlError(f"{name}: the vehicle has {fixed[name]:.6g}, the gains are for {value:.6g}", exit_code=1)
+    if not run.confirm("Upload the new gains, and try them in a check flight?"):
+        raise Decided("the new gains were not wanted")
+    run.decisions.begun = True
+    run.decisions.save()
+    write_set(run, plan)
+    return {"parameters": len(plan.values)}
+
+
+def judge(run: AutotuneRun) -> Found:
+    """Compare the check flight with its prediction.
+
+    Raises
+    ------
+    Decided
+        If it is worse than predicted by more than a share.
+    SitlError
+        If the log does not tell.
+    """
+    flight, gains = read_log(run.log(CHECK)), load_gains(run.file(GAINS))
+    _check_flown(flight, gains)
+    result = check_flight(flight, read_log(run.log(FLIGHT)), gains)
+    run.dialogue.show_check(result)
+    write_autotune_report(run, gains, result)
+    if result.worse:
+        raise Decided(f"the check flight is worse than predicted: {'; '.join(result.worse)}")
+    return result.as_table()
+
+
+def _check_flown(flight: Experiment, gains: Gains) -> None:
+    if flight.flown is None:
+        raise SitlError(f"{flight.source}: does not say which gains flew", exit_code=1)
+    flown, wanted = flight.flown.elements(), gains.elements()
+    other = [code for code in wanted if code != "TS" and flown[code] != wanted[code]]
+    if other:
+        raise SitlError(f"{flight.source}: was flown with other gains ({other[0]}, ...)", exit_code=1)
+
+
+def keep(run: AutotuneRun) -> Found:
+    """Ask whether the new gains stay.
+
+    Raises
+    ------
+    Decided
+        If the answer is no, or there is none in time.
+    SitlError
+        If the vehicle does not hold them.
+    """
+    answer = run.confirm(f"Keep the new gains? Without an answer in {ANSWER_S:.0f} s the old ones go back", ANSWER_S)
+    if answer is None:
+        raise Decided(f"no answer in {ANSWER_S:.0f} s")
+    if not answer:
+        raise Decided("the new gains were not kept: the answer was no")
+    if held_set(run) != NEW:
+        raise SitlError("the vehicle does not hold the new gains any more", exit_code=1)
+    return {}
