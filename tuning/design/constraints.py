@@ -322,7 +322,7 @@ class ParameterRange:
     Attributes
     ----------
     matrix : str
-    largest : (2,) array
+    largest : (n,) array
         In the unit of the matrix.
     """
 
@@ -340,7 +340,7 @@ class ParameterRange:
 
     def add(self, problem: ConicProblem, loop: LoopGradient) -> None:
         """See `Constraint`."""
-        slope = np.zeros((2, problem.size))
+        slope = np.zeros((len(self.largest), problem.size))
         for place, (name, row, column) in enumerate(loop.free.places()):
             if name == self.matrix and row == column:
                 slope[row, place] = -loop.free.units[name] / self.largest[row]
