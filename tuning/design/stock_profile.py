@@ -84,7 +84,8 @@ def in_digits(law: AnyLaw) -> AnyLaw:
     def rounded(name: str) -> Matrix:
         values = np.diag(getattr(law, name))
         tops = largest[name][-1:] if len(values) == 1 else largest[name][: len(values)]
-        return np.diag([min(float(f"{v:.{DIGITS}g}"), top) for v, top in zip(values, tops, strict=True)])
+        digits = [float(f"{value:.{DIGITS}g}") for value in values]
+        return np.diag([min(max(v, 0.0), top) for v, top in zip(digits, tops, strict=True)])
 
     changed: dict[str, Any] = {name: rounded(name) for name in largest}
     return replace(law, **changed)
