@@ -8,6 +8,7 @@ import pytest
 from mimopilot.common.errors import Error
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.tuning.analysis.certify import certify
+from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
@@ -122,6 +123,8 @@ def test_a_log_of_another_controller_is_refused(log):
     ):
         with pytest.raises(TuningError, match=message):
             tune(dataclasses.replace(log, flown=flown), TuningSpec(profile=profile))
+    with pytest.raises(TuningError, match="profile: got px4-stock, expected mimo"):
+        advise(log, TuningSpec(profile="px4-stock"))
     lacking = dataclasses.replace(defaults(VEHICLE).provenance, details={"lacking_parameters": ["IMU_DGYRO_CUTOFF"]})
     flown = dataclasses.replace(defaults(VEHICLE), provenance=lacking)
     with pytest.raises(TuningError, match="lacks IMU_DGYRO_CUTOFF, filters of the px4-stock controller"):
