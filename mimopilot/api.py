@@ -117,13 +117,14 @@ def tune(
     columns : str or Path, optional
         As in `read_log`.
     **options
-        Further entries of `tuning.spec.TuningSpec`: ``method``, ``structure``, ``instrument``, ``window``...
+        Further entries of `tuning.spec.TuningSpec`: ``profile``, ``method``, ``structure``, ``instrument``...
 
     Returns
     -------
     Gains
         With their certificate, standard deviations and warnings. `provenance.details` holds the predicted figures of
-        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``.
+        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``; for a stock controller also
+        what our module's would do, ``worth_of_off_diagonals``.
 
     Raises
     ------
@@ -292,6 +293,7 @@ def import_params(
     connect: str | None = None,
     defaults: str | None = None,
     rate: float | None = None,
+    profile: str = "mimo",
     airframe: PathLike | Airframe | None = None,
     timeout: float = 12.0,
     signing_key: PathLike | None = None,
@@ -309,6 +311,8 @@ def import_params(
         ``px4-v1.16``: that PX4's defaults for what the source lacks. None: then it is refused.
     rate : float, optional, Hz
         Control rate; by default that of the parameters.
+    profile : str
+        ``mimo``: gains for our module. ``px4-stock``, ``ardupilot-stock``: the set of that controller itself.
     airframe : str, Path or Airframe, optional
         Vehicle whose unit of torque the gains have. None: what the vehicle publishes, else not known.
     timeout, signing_key, system
@@ -340,7 +344,7 @@ def import_params(
         found = read_stock_parameters(LinkOptions(str(connect), system, timeout, key))
     body = load_airframe(airframe) if isinstance(airframe, str | Path) else airframe
     scale = body.moment_scale() if body else None
-    return import_gains(found, defaults=defaults, rate=rate, moment_scale=scale)
+    return import_gains(found, defaults=defaults, rate=rate, moment_scale=scale, profile=profile)
 
 
 class GeneratedTree(NamedTuple):
@@ -593,7 +597,6 @@ def upload(
     dry_run: bool = False,
     force_armed: bool = False,
     uncertified: bool = False,
-    drop_off_diagonals: bool = False,
     timeout: float = 12.0,
     snapshot: PathLike | None = None,
     signing_key: PathLike | None = None,
@@ -607,10 +610,10 @@ def upload(
     connect : str
         ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
     profile : str
-        ``mimo``: our module. ``px4-stock``, ``ardupilot-stock``: the diagonal, in their controllers.
+        Controller that the gains are for: ``mimo``, our module, ``px4-stock`` or ``ardupilot-stock``.
     moment_scale : tuple of 3 float (N m), or ``flown``, optional
         Unit of torque of a vehicle that does not publish it.
-    dry_run, force_armed, uncertified, drop_off_diagonals : bool
+    dry_run, force_armed, uncertified : bool
         As the command's options.
     timeout : float, s
         Abort after this many seconds without a message.
@@ -638,7 +641,6 @@ def upload(
         connect,
         profile=profile,
         uncertified=uncertified,
-        drop_off_diagonals=drop_off_diagonals,
         system=system,
         timeout=timeout,
         signing_key=Path(signing_key) if signing_key else None,
@@ -787,7 +789,7 @@ def download_log(
 
 
 def prepare_upload(
-    gains: GainSet, connect: str, *, profile: str, uncertified: bool, drop_off_diagonals: bool, **link: Any
+    gains: GainSet, connect: str, *, profile: str, uncertified: bool, **link: Any
 ) -> tuple[UploadPlan, LinkOptions, Gains, str]:
     """Plan of an upload, the options of its link, the gains, and a warning about their stability; see `upload`."""
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
@@ -798,7 +800,7 @@ def prepare_upload(
     warning = check_verdict(loaded, allow=uncertified)
     source = Path(gains) if isinstance(gains, str | Path) else Path("gains")
     stem = source.with_name(source.name.removesuffix(".toml").removesuffix(".gains"))
-    plan = make_plan(loaded, profile, drop_off_diagonals)
+    plan = make_plan(loaded, profile)
     return plan, LinkOptions(connect, stem=stem, **link), loaded, warning
 
 
