@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 # As the command line does, before numpy is loaded: results are compared with printed ones.
@@ -16,8 +19,9 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
+import mimopilot.cli.main as front_door
 from mimopilot.tuning.gains import Gains, Limits, YawGains
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_terms import Filters, StockFilters
 
 #: No deadlines: tests must not depend on the machine's speed.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -57,15 +61,54 @@ def following_gains() -> Gains:
     )
 
 
+def stock_gains(controller: str = "px4-stock") -> Gains:
+    """A set for a stock controller, every term and filter in use, each axis with its own."""
+    filters = {
+        "px4-stock": StockFilters("px4-stock", (30.0, 30.0, 30.0), torque_hz=(0.0, 0.0, 2.0)),
+        "ardupilot-stock": StockFilters(
+            "ardupilot-stock",
+            derivative_hz=(20.0, 25.0, 10.0),
+            setpoint_hz=(20.0, 22.0, 15.0),
+            error_hz=(0.0, 30.0, 2.5),
+            derivative_feedforward=(0.001, 0.002, 0.003),
+        ),
+    }
+    diagonal = {
+        name: np.diag(np.diag(getattr(coupled_gains(), name))) for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i")
+    }
+    base = replace(coupled_gains(), limits=Limits((5.0, 4.0, 3.0), integral_max=(0.3, 0.25, 0.2)))
+    return replace(base, filters=Filters(0.0025, stock=filters[controller]), **diagonal)
+
+
 @pytest.fixture
 def gains() -> Gains:
     """See `coupled_gains`."""
     return coupled_gains()
 
 
+def run_here(folder: Path, *arguments: object) -> subprocess.CompletedProcess[str]:
+    """Run the command line from a folder in this process, which saves a start; returns what a process would."""
+    output, errors, code = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(output), redirect_stderr(errors):
+        patch.chdir(folder)
+        patch.setattr(sys, "argv", ["mimopilot", *map(str, arguments)])
+        patch.setattr(sys, "stdin", io.StringIO())
+        try:
+            front_door.main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return subprocess.CompletedProcess(arguments, code, output.getvalue(), errors.getvalue())
+
+
 @pytest.fixture
 def mimopilot(tmp_path: Path) -> Run:
-    """Run the command line as a user would; returns the finished process."""
+    """`run_here` from the test's folder."""
+    return partial(run_here, tmp_path)
+
+
+@pytest.fixture
+def mimopilot_process(tmp_path: Path) -> Run:
+    """Run the command line as a user would, in a process of its own; returns the finished process."""
 
     def run(*arguments: object, **keywords: object) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, "-m", "mimopilot", *map(str, arguments)]

@@ -29,6 +29,7 @@ LAYERS = (
     "mimopilot.sitl.mavlink.simulator_api",
     "mimopilot.sitl.mavlink.vehicle",
     "mimopilot.sitl.mavlink.ground_station",
+    "mimopilot.sitl.mavlink.ground_station.experiments",
     "mimopilot.sitl.mavlink.log_transfer",
     "mimopilot.sitl.campaign",
     "mimopilot.sitl.field.report.analysis",

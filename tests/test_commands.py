@@ -17,13 +17,13 @@ from mimopilot.sitl.physics.airframe import FOLDER, known_airframes
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.ulog_file import open_ulog
 from mimopilot.tuning.reference_model import SecondOrder
-from tests.conftest import assert_one_clear_line
+from tests.conftest import assert_one_clear_line, run_here
 from tests.paths import PACKAGES, TOP
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
     *("fly", "faults", "campaign", "replay", "sitl", "plant", "convert", "upload", "restore", "params"),
-    *("import-params", "logs"),
+    *("import-params", "logs", "doctor"),
 ]
 
 
@@ -31,8 +31,7 @@ COMMANDS = [
 def log(tmp_path_factory):
     """A short experiment, flown by the command."""
     path = tmp_path_factory.mktemp("log") / "flight.ulg"
-    command = [sys.executable, "-m", "mimopilot", "experiment", "adam0", "--seconds-per-axis", "10", "--out", str(path)]
-    subprocess.run(command, check=True, capture_output=True)
+    assert run_here(path.parent, "experiment", "adam0", "--seconds-per-axis", "10", "--out", path).returncode == 0
     return path
 
 
@@ -183,9 +182,9 @@ def test_a_gains_file_with_a_matrix_that_is_not_finite_is_refused(mimopilot, log
     assert not (tmp_path / "cpp").exists()
 
 
-def test_without_a_compiler_the_package_is_named(mimopilot, tmp_path):
+def test_without_a_compiler_the_package_is_named(mimopilot_process, tmp_path):
     environment = {**os.environ, "PATH": "/nowhere", "XDG_CACHE_HOME": str(tmp_path)}
-    assert_one_clear_line(mimopilot("fly", "adam0", env=environment), "no C++ compiler", "apt-get install g++")
+    assert_one_clear_line(mimopilot_process("fly", "adam0", env=environment), "no C++ compiler", "apt-get install g++")
 
 
 def test_a_log_without_the_topics_names_them_and_its_own(mimopilot, tmp_path):

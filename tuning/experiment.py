@@ -19,7 +19,11 @@ SIGNALS = ("u", "y_i", "y_o", "u_bar", "r_bar", "r_o", "r_i")
 #: rad, peak to peak: attitude setpoints of a hover move less; chosen, as an estimator's attitude wanders by 1 to 3 deg.
 MOVES = np.radians(5.0)
 #: External signal -> what it is.
-EXTERNAL = {"u_bar": "injected torque", "r_bar": "injected rate setpoint", "r_o": "attitude setpoint"}
+EXTERNAL = {
+    "u_bar": "injected torque (u_bar)",
+    "r_bar": "injected rate setpoint (r_bar)",
+    "r_o": "attitude setpoint of a pilot or an off-board computer (r_o)",
+}
 #: Share of the samples that are within the size of a flight's manoeuvres.
 NEARLY_ALL = 0.999
 

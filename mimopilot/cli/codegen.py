@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from mimopilot.cli.options import GainsArgument, JsonOption, UncertifiedOption, warn
+from mimopilot.cli.options import GainsArgument, JsonOption, UncertifiedOption
+from mimopilot.common.verbosity import warn
 
 
 def register(app: typer.Typer) -> None:

@@ -30,7 +30,9 @@ def autotune(
     ] = False,
     arm: Annotated[bool, typer.Option("--arm", help="Arm without a question.")] = False,
     seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation of an axis, s.")] = 20.0,
-    amplitude: Annotated[float, typer.Option(help="Of the injected torque (normalised).")] = 0.1,
+    amplitude: Annotated[
+        float | None, typer.Option(help="Of the excitation, as in experiment; by default the profile's own.")
+    ] = None,
     timeout: TimeoutOption = 12.0,
     signing_key: KeyOption = None,
     system: SystemOption = 0,

@@ -11,8 +11,9 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = os.environ[
 
 import typer
 
-from mimopilot.cli import campaign, codegen, field, report, simulation, sitl, studies, tuning, vehicle
+from mimopilot.cli import campaign, codegen, doctor, field, report, simulation, sitl, studies, tuning, vehicle
 from mimopilot.common.errors import Error
+from mimopilot.common.verbosity import Verbosity, set_verbosity
 
 app = typer.Typer(
     name="mimopilot",
@@ -21,7 +22,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (studies, simulation, sitl, campaign, tuning, report, codegen, vehicle, field):
+for group in (studies, simulation, sitl, campaign, tuning, report, codegen, vehicle, field, doctor):
     group.register(app)
 
 
@@ -38,18 +39,45 @@ def options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
     ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", help="Only results and errors: no warnings, no progress. Anywhere on the line.")
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Show each step and its time on standard error. Anywhere on the line.")
+    ] = False,
 ) -> None:
     """Options of the command itself."""
+    if quiet and verbose:
+        raise Error("--quiet and --verbose exclude each other; leave one out")
+    set_verbosity(Verbosity.QUIET if quiet else Verbosity.VERBOSE if verbose else Verbosity.NORMAL)
 
 
 def main() -> None:
     """Run the command line; a user's mistake is one clear message and exit code 2, never a traceback."""
+    output, code = sys.stdout, 0
     try:
-        app()
+        app(_global_options_first(sys.argv[1:]), prog_name="mimopilot")
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else 0
     except Error as error:
         print(f"mimopilot: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        code = error.exit_code
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         print(f"mimopilot: {where}{error.strerror or error}", file=sys.stderr)
-        sys.exit(2)
+        code = 2
+    if sys.stdout is not output:  # typer replaces it when the reader of a pipe left, as head does: no failure
+        sys.stdout, code = output, 0
+    try:
+        output.flush()
+    except BrokenPipeError:
+        # Python flushes once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), output.fileno())
+    sys.exit(code)
+
+
+def _global_options_first(arguments: list[str]) -> list[str]:
+    """The arguments with ``--quiet`` and ``--verbose`` moved before the command's name."""
+    end = arguments.index("--") if "--" in arguments else len(arguments)
+    moved = [text for text in arguments[:end] if text in ("--quiet", "--verbose")]
+    return [*moved, *(text for text in arguments[:end] if text not in moved), *arguments[end:]]

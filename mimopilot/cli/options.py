@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -43,6 +41,12 @@ ReportOption = Annotated[
     Path | None, typer.Option(help="Also write a page with figures of the log and of these gains (HTML).")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Controller: mimo (our module), px4-stock or ardupilot-stock (the autopilot's own).", show_default="mimo"
+    ),
+]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 TimeoutOption = Annotated[
     float, typer.Option(min=0.5, max=600, help="Abort after this many seconds without a message from the vehicle.")
@@ -51,9 +55,3 @@ KeyOption = Annotated[Path | None, typer.Option(help="Sign with this key: 32 byt
 SystemOption = Annotated[
     int, typer.Option(min=0, max=255, help="The vehicle's system number; 0: the only one there is.")
 ]
-
-
-def warn(where: Path | str, warnings: Iterable[str]) -> None:
-    """Warnings about a file, a line each, on standard error."""
-    for warning in warnings:
-        print(f"mimopilot: warning: {where}: {warning}", file=sys.stderr)

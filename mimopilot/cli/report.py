@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mimopilot.cli.options import ColumnsOption, JsonOption, warn
+from mimopilot.cli.options import ColumnsOption, JsonOption
 from mimopilot.common.console import print_json
+from mimopilot.common.verbosity import warn
 
 if TYPE_CHECKING:
     from mimopilot.tuning.gains import Gains

@@ -31,13 +31,17 @@ from mimopilot.common.errors import check_not_given
 if TYPE_CHECKING:
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan
     from mimopilot.sitl.flight.simulator import Flight
-    from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions
+    from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
     from mimopilot.sitl.physics.airframe import Airframe
     from mimopilot.tuning.gains import Gains
 
 #: Tilt beyond which the experiment on a vehicle stops, degrees: that of the injector's own parameter, MIMO_EX_TILT.
 TILT_DEG = 28.0
+#: Of the excitation, chosen: length on each axis (s), bandwidth (rad/s).
+SECONDS, BANDWIDTH = 20.0, 50.0
+#: Profiles whose vehicle has an exciter of its own.
+STOCK = ("px4-stock", "ardupilot-stock")
 #: Vehicles that are named when several were lost.
 NAMED = 5
 
@@ -71,24 +75,44 @@ def experiment(
     connect: Annotated[
         str | None, typer.Option(help="Link to a vehicle that hovers under our controller; see upload.")
     ] = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            help="With --connect: mimo (our module's injector, the default), px4-stock (PX4's autotune) or "
+            "ardupilot-stock (its mode SystemID)."
+        ),
+    ] = None,
     gains: GainsOption = None,
     axis: Annotated[
-        str, typer.Option(help="One after the other: all (roll, pitch, yaw), both (roll, pitch), roll, pitch, or yaw.")
-    ] = "all",
-    seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
+        str | None,
+        typer.Option(
+            help="One after the other: all (roll, pitch, yaw), both (roll, pitch), roll, pitch, or yaw.",
+            show_default="all",
+        ),
+    ] = None,
+    seconds_per_axis: Annotated[
+        float | None, typer.Option(help="Length of the excitation on each axis, s.", show_default="20")
+    ] = None,
     amplitude: Annotated[
         float | None,
-        typer.Option(help="Of the torque on roll and pitch (normalised); 0.15, or less if the motors would saturate."),
+        typer.Option(
+            help="Of the torque on roll and pitch (normalised); 0.15, or less if the motors would saturate. With "
+            "--profile px4-stock: of the rate setpoint, rad/s (1.5)."
+        ),
     ] = None,
     yaw_amplitude: Annotated[
         float | None,
         typer.Option(help="Of the torque on yaw; 0.3 (a vehicle: 0.2), or less if the motors would saturate."),
     ] = None,
-    bandwidth: Annotated[float, typer.Option(help="Of the injected torque, rad/s.")] = 50.0,
+    bandwidth: Annotated[float | None, typer.Option(help="Of the injected torque, rad/s.", show_default="50")] = None,
     seed: SeedOption = 0,
     runs: Annotated[
         int | None,
-        typer.Option(min=1, help="Number of flights, with consecutive seeds: flight-SEED.ulg, for tune --campaign."),
+        typer.Option(
+            min=1,
+            help="Number of flights, with consecutive seeds: flight-SEED.ulg, for tune --campaign. With --profile "
+            "px4-stock: runs of the autotune in the flight (4).",
+        ),
     ] = None,
     excitation_seed: Annotated[
         int | None, typer.Option(min=0, help="Inject the same torque in every run; by default each has its own.")
@@ -105,6 +129,9 @@ def experiment(
     tilt_deg: Annotated[
         float | None, typer.Option(help="With --connect: stop beyond this roll or pitch, degrees (28).")
     ] = None,
+    snapshot: Annotated[
+        Path | None, typer.Option(help="With --connect: where the old parameters go; by default a new file.")
+    ] = None,
     yes: YesOption = False,
     timeout: TimeoutOption = 12.0,
     signing_key: KeyOption = None,
@@ -114,49 +141,67 @@ def experiment(
     """Fly with a PRBS added to the torque on roll, then pitch, then yaw (--both-axes: roll and pitch at once); log it.
 
     Simulated in process; or with --connect on a vehicle in the air, by its own injector. The flight is then monitored:
-    tilt, flight mode, a lost link and Ctrl-C end the excitation, and the vehicle's parameters are restored.
+    tilt, flight mode, a lost link and Ctrl-C end the excitation, and the vehicle's parameters are restored. With a
+    stock --profile, begin with the disarmed vehicle on the ground: it is prepared, and excited once it hovers.
     """
     from mimopilot.sitl.errors import SitlError
 
     if (airframe is None) == (connect is None):
         raise SitlError("give either an airframe to simulate, or --connect to a vehicle")
     if connect is not None:
-        from mimopilot.sitl.flight.excitation_flight import AMPLITUDE, VEHICLE_YAW_AMPLITUDE
-        from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions
+        from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
         from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
 
         check_not_given(
             "for a simulated flight only; a vehicle has its gains and writes its own log",
             out=out,
             gains=gains,
-            runs=runs,
+            runs=runs if profile != "px4-stock" else None,
             excitation_seed=excitation_seed,
             both_axes=both_axes or None,
         )
+        own: dict[str, object] = {"seed": seed or None, "yaw_amplitude": yaw_amplitude}
+        if profile == "px4-stock":
+            own |= {"seconds_per_axis": seconds_per_axis, "bandwidth": bandwidth}
+        elif profile == "ardupilot-stock":
+            own |= {"mode": mode}
+        check_not_given(f"not with --profile {profile}, whose excitation has none", **own if profile in STOCK else {})
         excite_vehicle(
-            LinkOptions(connect, system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json),
+            LinkOptions(
+                connect, system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json, snapshot=snapshot
+            ),
+            profile or "mimo",
             ExcitationOptions(
                 axis=axis,
-                seconds_per_axis=seconds_per_axis,
-                amplitude=AMPLITUDE if amplitude is None else amplitude,
-                yaw_amplitude=VEHICLE_YAW_AMPLITUDE if yaw_amplitude is None else yaw_amplitude,
-                bandwidth=bandwidth,
+                seconds_per_axis=SECONDS if seconds_per_axis is None else seconds_per_axis,
+                amplitude=amplitude,
+                bandwidth=BANDWIDTH if bandwidth is None else bandwidth,
                 seed=seed,
                 mode=mode or "hold",
                 tilt_deg=TILT_DEG if tilt_deg is None else tilt_deg,
+                runs=runs,
+                yaw_amplitude=yaw_amplitude,
             ),
         )
         return
     from mimopilot.api import vehicle
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, default_amplitude
 
-    check_not_given("belong to --connect", mode=mode, tilt_deg=tilt_deg)
+    check_not_given("belong to --connect", mode=mode, tilt_deg=tilt_deg, profile=profile, snapshot=snapshot)
     if out is None:
         raise SitlError("--out: name the log to write, FILE.ulg")
     body, controller = vehicle(airframe or "", gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
     plan = ExperimentPlan(
-        body, controller, seconds_per_axis, strength, bandwidth, excitation_seed, both_axes, axis, yaw_amplitude
+        body,
+        controller,
+        SECONDS if seconds_per_axis is None else seconds_per_axis,
+        strength,
+        BANDWIDTH if bandwidth is None else bandwidth,
+        excitation_seed,
+        both_axes,
+        axis or "all",
+        yaw_amplitude,
     )
     if runs is None:
         simulate_experiment(plan, out, seed)
@@ -164,11 +209,11 @@ def experiment(
         simulate_experiments(plan, out, range(seed, seed + runs))
 
 
-def excite_vehicle(link: LinkOptions, excitation: ExcitationOptions) -> None:
-    """`experiment --connect`: the injector of a vehicle in the air."""
-    from mimopilot.sitl.mavlink.ground_station.experiment_console import experiment as excite
+def excite_vehicle(link: LinkOptions, profile: str, excitation: ExcitationOptions) -> None:
+    """`experiment --connect`: the exciter of a vehicle in the air."""
+    from mimopilot.sitl.mavlink.ground_station.experiments.experiment_console import experiment as excite
 
-    excite(link, excitation)
+    excite(link, profile, excitation)
 
 
 def simulate_experiment(plan: ExperimentPlan, out: Path, seed: int) -> None:

@@ -32,6 +32,9 @@ def register(app: typer.Typer) -> None:
 def sitl(
     airframe: AirframeArgument,
     gains: GainsOption = None,
+    autopilot: Annotated[
+        str, typer.Option(help="mimo: the generated controller. px4-stock: a stock PX4's, with the gains' diagonal.")
+    ] = "mimo",
     plant: Annotated[str | None, typer.Option(help="HOST:PORT of a running plant; by default one is started.")] = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the started plant; 0: any.")] = 0,
     ground_port: Annotated[
@@ -69,10 +72,13 @@ def sitl(
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
     from mimopilot.api import vehicle
+    from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.faults.kinds import parse_fault
     from mimopilot.sitl.flight.scenario import scenario_of
     from mimopilot.sitl.mavlink.vehicle.sitl_console import SitlOptions, run
 
+    if autopilot not in ("mimo", "px4-stock"):
+        raise SitlError(f"--autopilot: got {autopilot!r}, expected mimo or px4-stock")
     body, controller = vehicle(airframe, gains)
     task, faults = None, tuple(map(parse_fault, fault or ()))
     if scenario is not None:
@@ -105,6 +111,7 @@ def sitl(
             log=log,
             scenario=task,
             faults=faults,
+            stock=autopilot == "px4-stock",
         )
     )
 

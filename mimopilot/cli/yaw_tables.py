@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from mimopilot.common.console import print_table
+from mimopilot.common.text_table import with_deviation
 
 if TYPE_CHECKING:
     from mimopilot.tuning.gains import Gains
@@ -31,7 +32,7 @@ def yaw_cell(gains: Gains, name: str, deviations: Mapping[str, Any]) -> str:
     value, deviation = getattr(gains.yaw, name, None), deviations.get("yaw", {}).get(name)
     if value is None:
         return ""
-    return f"{value:.4f}" if deviation is None else f"{value:.4f} ({deviation:.4f})"
+    return with_deviation(value, deviation)
 
 
 def print_yaw(gains: Gains) -> None:
@@ -92,7 +93,7 @@ def print_cross_terms(figures: Mapping[str, Any]) -> None:
         print(f"cross terms of yaw: not known: {cross['reason']}")
         return
     size = (
-        f"at most {cross['share']:.0%} +- {cross['share_error']:.0%} of a {cross['from']} torque's effect goes to "
+        f"at most {cross['share']:.1%} +- {cross['share_error']:.1%} of a {cross['from']} torque's effect goes to "
         f"{cross['to']} (at {cross['omega']:.1f} rad/s)"
         if cross["measured"]
         else "none above its error"

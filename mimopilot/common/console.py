@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
+import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-#: Columns of a table that is not printed on a terminal; chosen so that no table of ours is cut.
-WIDTH = 160
+from mimopilot.common.text_table import RULE, text_table
+from mimopilot.common.verbosity import Verbosity, verbosity
 
 
 def print_json(value: Mapping[str, Any]) -> None:
@@ -32,30 +36,24 @@ def _finite(value: Any) -> Any:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table on standard output: first column left-aligned, the others right-aligned."""
-    from rich.box import SIMPLE_HEAD
-    from rich.console import Console
-    from rich.table import Table
+    """Print a table on standard output, folded to the terminal's width; piped, each row is one line."""
+    width = _width()
+    lines = [part for line in title.splitlines() for part in textwrap.wrap(line, width or len(line) + 1)]
+    text = "\n".join([*lines, "", *text_table(columns, rows, width), ""])
+    # A terminal of another encoding has no line to draw.
+    encoding = sys.stdout.encoding or "utf-8"
+    print(text if encoding.lower().replace("-", "") == "utf8" else text.replace(RULE, "-"))
 
-    print(title)
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*row)
-    Console(width=None if _is_terminal() else WIDTH, highlight=False, markup=False).print(table)
+
+def _width() -> int | None:
+    """Columns of the terminal; None if standard output is none and COLUMNS does not say."""
+    if not (sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdecimal()):
+        return None
+    return max(shutil.get_terminal_size().columns, 20)
 
 
 def progress_console() -> Any:
-    """Console for progress bars: standard error, silent unless it is a terminal."""
-    import sys
-
+    """Console for progress bars: standard error, silent unless it is a terminal, and with ``--quiet``."""
     from rich.console import Console
 
-    return Console(stderr=True, quiet=not sys.stderr.isatty())
-
-
-def _is_terminal() -> bool:
-    import sys
-
-    return sys.stdout.isatty()
+    return Console(stderr=True, quiet=not sys.stderr.isatty() or verbosity() is Verbosity.QUIET)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from pathlib import Path
 
 from mimopilot.common.errors import Error
 from mimopilot.common.files import inside, unseal, write_atomically
+from mimopilot.common.verbosity import warn
 
 SHOWN = 3  # parts named in one message
 RESUME = "give the same command again to resume"
@@ -85,11 +85,7 @@ class PartFolder:
         if unusable:
             more = f" and {len(unusable) - SHOWN} more" if len(unusable) > SHOWN else ""
             named = "; ".join(unusable[:SHOWN])
-            print(
-                f"mimopilot: warning: {self.folder}: unusable parts are computed again: {named}{more}",
-                file=sys.stderr,
-                flush=True,
-            )
+            warn(self.folder, [f"unusable parts are computed again: {named}{more}"])
         return missing
 
 

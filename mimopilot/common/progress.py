@@ -1,4 +1,8 @@
-"""Progress of long work on standard error: a bar on a terminal, else a line at once and every minute."""
+"""Progress on standard error.
+
+Long work: a bar on a terminal, else a line at once and every minute. A step without a known length: a sign on a
+terminal while it lasts; with ``--verbose`` a line with its time.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +11,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+
+from mimopilot.common.verbosity import Verbosity, verbosity
 
 #: s between two lines when standard error is not a terminal.
 INTERVAL_S = 60.0
@@ -28,6 +34,9 @@ def progress(what: str, total: int, done: int = 0) -> Iterator[Callable[[], None
     callable
         To be called after each task.
     """
+    if verbosity() is Verbosity.QUIET:
+        yield lambda: None
+        return
     if sys.stderr.isatty():
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -57,3 +66,25 @@ def progress(what: str, total: int, done: int = 0) -> Iterator[Callable[[], None
         yield advance
     finally:
         ended.set()
+
+
+@contextmanager
+def step(what: str) -> Iterator[None]:
+    """Show what is being done while it lasts; steps do not nest.
+
+    Parameters
+    ----------
+    what : str
+        The work, as "reading flight.ulg".
+    """
+    begin = time.monotonic()
+    if verbosity() is Verbosity.NORMAL and sys.stderr.isatty():
+        from rich.console import Console
+        from rich.markup import escape
+
+        with Console(stderr=True).status(escape(what)):
+            yield
+    else:
+        yield
+    if verbosity() is Verbosity.VERBOSE:
+        print(f"mimopilot: {what}: {time.monotonic() - begin:.2f} s", file=sys.stderr, flush=True)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mimopilot.codegen.cortex_m4 import EmulatedController
 from mimopilot.codegen.layout import INPUT, OUTPUT
 from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.sitl.autopilot.px4_law import Px4Controller
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.sitl.physics.compiled_step import call_step, compiled, inlined
 from mimopilot.sitl.physics.mixer import Allocation, allocate
@@ -21,6 +22,7 @@ from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS
 from mimopilot.sitl.physics.state_estimate import euler_angles, quaternion_of
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameters import PARAMETERS
 
 MIN_THRUST_RATIO, MAX_THRUST_RATIO = 0.5, 1.5  # of hover; chosen: altitude hold accelerates by at most half of g
 MIN_TILT_COSINE = 0.5  # 60 degrees, the largest tilt of a setpoint: beyond it thrust is not increased further
@@ -51,15 +53,15 @@ class ControlLoop(NamedTuple):
 
     Attributes
     ----------
-    step_address : int
-        Address of the step function of the controller.
-    state, inputs, outputs : one-row arrays
-        State, inputs and outputs of the controller; the saturation of the last period stays in `inputs`.
+    step_address, state_address : int
+        Addresses of the step function and of the state of the controller.
+    inputs, outputs : one-row arrays
+        Inputs and outputs of the controller; the saturation of the last period stays in `inputs`.
     allocation : Allocation
     """
 
     step_address: int
-    state: NDArray[Any]
+    state_address: int
     inputs: NDArray[Any]
     outputs: NDArray[Any]
     allocation: Allocation
@@ -73,7 +75,9 @@ def altitude_hold(altitude, climb, target, hover, tilt):  # type: ignore[no-unty
 
 
 @compiled
-def tick_unpacked(step_address, state, input_rows, output_rows, allocation, collective, altitude, measurement, row):  # type: ignore[no-untyped-def]
+def tick_unpacked(  # type: ignore[no-untyped-def]
+    step_address, state_address, input_rows, output_rows, allocation, collective, altitude, measurement, row
+):
     """`tick` for compiled loops: with a tuple, numba counts the references of its arrays in each call."""
     roll, pitch, yaw = euler_angles(measurement[0], measurement[1], measurement[2], measurement[3])
     inputs = input_rows[0]
@@ -89,7 +93,7 @@ def tick_unpacked(step_address, state, input_rows, output_rows, allocation, coll
         inputs.rates_setpoint[i] = row.setpoint[i]
         inputs.excitation[i] = row.excitation[i]
         row.rates[i] = inputs.rates[i]
-    call_step(step_address, state.ctypes.data, input_rows.ctypes.data, output_rows.ctypes.data)
+    call_step(step_address, state_address, input_rows.ctypes.data, output_rows.ctypes.data)
     outputs = output_rows[0]
     for i in range(3):
         row.moment[i] = outputs.moment[i]
@@ -119,8 +123,8 @@ def tick(loop, collective, altitude, measurement, row):  # type: ignore[no-untyp
     `altitude` is the one to hold (m) and `collective` then the thrust fraction of hover. When `altitude` is NaN, the
     collective is given. Motor commands are 0 while the vehicle is disarmed.
     """
-    step_address, state, inputs, outputs, allocation = loop
-    tick_unpacked(step_address, state, inputs, outputs, allocation, collective, altitude, measurement, row)
+    step_address, state_address, inputs, outputs, allocation = loop
+    tick_unpacked(step_address, state_address, inputs, outputs, allocation, collective, altitude, measurement, row)
 
 
 class Autopilot:
@@ -132,8 +136,8 @@ class Autopilot:
         The vehicle.
     gains : Gains
         Initial gains of the controller.
-    controller : NativeController or EmulatedController, optional
-        A loaded controller; by default one is generated from the gains and compiled for this machine.
+    controller : NativeController, EmulatedController or Px4Controller, optional
+        A controller; by default one is generated from the gains and compiled for this machine.
     altitude : float, m
         Altitude to hold.
 
@@ -154,7 +158,7 @@ class Autopilot:
         self,
         airframe: Airframe,
         gains: Gains,
-        controller: NativeController | EmulatedController | None = None,
+        controller: NativeController | EmulatedController | Px4Controller | None = None,
         altitude: float = 10.0,
     ) -> None:
         check_moment_scale(gains, airframe.moment_scale(), airframe.name)
@@ -166,9 +170,26 @@ class Autopilot:
         self.controls["armed"] = 1
         outputs: NDArray[Any] = np.zeros(1, OUTPUT)
         self.loop = ControlLoop(
-            self.controller.step_address, self.controller.state, self.controls, outputs, airframe.allocation()
+            self.controller.step_address,
+            self.controller.state.ctypes.data,
+            self.controls,
+            outputs,
+            airframe.allocation(),
         )
         self._initial_state = self.controller.state.copy()
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Name -> value of the parameters in flight."""
+        gains = self.controller.state["gains"][0].tolist()
+        return {parameter.name: value for parameter, value in zip(PARAMETERS, gains, strict=True)}
+
+    def parameter_problem(self) -> str:
+        """Parameter that is outside its range, in words; empty: none."""
+        for parameter, value in zip(PARAMETERS, self.parameters.values(), strict=True):
+            if not parameter.minimum <= value <= parameter.maximum:
+                return f"{parameter.name} is {value:g}, outside its range"
+        return ""
 
     def restart(self) -> None:
         """Return to the initial state, for another flight."""

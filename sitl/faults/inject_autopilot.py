@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.sitl.autopilot.autopilot import Autopilot
+from mimopilot.sitl.autopilot.px4_law import Px4Controller
 from mimopilot.sitl.autopilot.setpoints import STALE_SECONDS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.kinds import Fault
@@ -52,6 +53,7 @@ class AutopilotFaults:
         if self.autopilot is None or not self._gains:
             return
         controller = self.autopilot.controller
+        assert not isinstance(controller, Px4Controller)  # refused at the start
         factors = np.ones(len(PARAMETERS), np.float32)
         for fault, begin, end in self._gains:
             if begin <= k < end:
@@ -85,6 +87,8 @@ class AutopilotFaults:
         """Refuse gains outside the ranges of the parameters."""
         if self.autopilot is None:
             raise SitlError(f"fault {str(fault)!r}: there is no controller in this process; give it to the autopilot")
+        if isinstance(self.autopilot.controller, Px4Controller):
+            raise SitlError(f"fault {str(fault)!r}: is for the generated controller; a stock PX4 has other gains")
         values = self.autopilot.controller.state["gains"][0] * np.float32(fault.magnitude)
         for i in _elements(fault):
             parameter = PARAMETERS[i]

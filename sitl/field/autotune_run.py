@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -15,7 +15,9 @@ from mimopilot.sitl.field.decisions import Decisions
 from mimopilot.sitl.mavlink.ground_station.events import Heartbeat
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, LinkSession, Session, open_session
 from mimopilot.sitl.mavlink.log_transfer.log_session import LogSession, open_logs
+from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.logs.reader import read_log
 
 #: Files in the folder; the logs have the suffix of the vehicle's.
 SNAPSHOT, GAINS, REPORT = "before.params", "new.gains.toml", "report.html"
@@ -41,7 +43,7 @@ class AutotuneOptions:
     yes: bool = False
     arm: bool = False
     seconds_per_axis: float = 20.0
-    amplitude: float = 0.1
+    amplitude: float | None = None
     system: int = 0
     timeout: float = 12.0
     signing_key: Path | None = None
@@ -95,6 +97,7 @@ class AutotuneRun:
     dialogue: AutotuneDialogue
     took_off: bool = False
     ending: bool = False
+    _read: dict[str, Experiment] = field(default_factory=dict)
 
     def file(self, name: str) -> Path:
         """A file in the folder."""
@@ -104,6 +107,12 @@ class AutotuneRun:
         """A downloaded log, `FLIGHT` or `CHECK`."""
         step = self.decisions.steps[f"{name} log"]
         return self.file(str(step["file"]))
+
+    def experiment(self, name: str) -> Experiment:
+        """A downloaded log, read once."""
+        if name not in self._read:
+            self._read[name] = read_log(self.log(name))
+        return self._read[name]
 
     @contextmanager
     def vehicle(self, armed: bool = True, integers: Collection[str] = ()) -> Iterator[Session]:

@@ -26,18 +26,19 @@ AXES = ("roll", "pitch")
 #: Share by which a figure may be worse than predicted.
 SHARE = 0.5
 #: And in addition: RMS of the angles (deg), which gusts move, and of the torque (normalised).
-ANGLE_FLOOR_DEG, TORQUE_FLOOR = 0.35, 0.01
+ANGLE_FLOOR_DEG, TORQUE_FLOOR = 0.2, 0.005
 #: Level flight before the first doublet, and after each, that belongs to it, s.
 LEAD_S, TAIL_S = 2.0, 1.0
 #: Time after the last motion of the setpoint from which on the vehicle rests, s.
 REST_S = 1.0
 #: Least size of a doublet, rad (1 degree).
 SMALLEST = np.radians(1.0)
-#: Periods without a setpoint that are added behind the flight, s: its response has come to rest by then.
+#: Time without a setpoint that is added behind the flight, s: its response has come to rest by then.
 SILENCE_S = 8.0
 
 Signal = NDArray[np.float64]
 Complex = NDArray[np.complex128]
+NOISELESS: Signal = np.zeros(2)
 
 
 @dataclass(frozen=True)
@@ -119,15 +120,14 @@ def check_flight(flight: Experiment, experiment: Experiment, gains: Gains) -> Ch
     """
     plant = wide_response(PlantEstimates(experiment))
     setpoint, angles, torque = _doublets(flight)
-    T, U, noise = _closed_loop(gains, plant)
+    T, U, *noise = _closed_loop(gains, plant)
     expected = _respond(T, setpoint, plant, flight.Ts)
     expected_torque = _respond(U, setpoint, plant, flight.Ts)
     model = _respond(_attitude_model(gains, plant), setpoint, plant, flight.Ts)
     parts = [_parts(setpoint[:, axis], flight.Ts) for axis in range(2)]
     rest = _rest(setpoint, flight.Ts)
-    none = np.zeros(2)
-    predicted = _figures(expected, expected_torque, model, parts, rest, noise)
-    flown = _figures(angles, torque, model, parts, rest, none)
+    predicted = _figures(expected, expected_torque, model, parts, rest, *noise)
+    flown = _figures(angles, torque, model, parts, rest, NOISELESS, NOISELESS)
     times = np.arange(len(setpoint), dtype=np.float64) * flight.Ts
     return CheckResult(predicted, flown, _worse(predicted, flown), times, setpoint, angles, expected)
 
@@ -152,14 +152,16 @@ def _doublets(flight: Experiment) -> tuple[Signal, Signal, Signal]:
     return setpoint[used], angles, torque
 
 
-def _closed_loop(gains: Gains, plant: WideResponse) -> tuple[Complex, Complex, Signal]:
-    """T and U, (K, 2, 2), and the RMS of the torque at hover that noise causes, (2,)."""
+def _closed_loop(gains: Gains, plant: WideResponse) -> tuple[Complex, Complex, Signal, Signal]:
+    """T and U, (K, 2, 2), and the RMS of angles and of the torque at hover that noise and gusts cause, (2,) each."""
     C_ref, C_o, C_y = law.cascade_response(gains, plant.omega)
     S = np.linalg.inv(np.eye(2) + C_y @ plant.G_i + C_o @ plant.G_o)
     U = S @ C_ref
-    noise = S @ (C_y @ plant.noise[:, :2] + C_o @ plant.noise[:, 2:])
-    rms: Signal = np.sqrt(plant.noise_weight @ np.sum(np.abs(noise) ** 2, axis=2))
-    return (plant.G_o @ U).astype(np.complex128), U.astype(np.complex128), rms
+    N = plant.noise
+    torque = S @ (C_y @ N[:, :2] + C_o @ N[:, 2:])
+    angles = N[:, 2:] - plant.G_o @ torque
+    rms = [np.sqrt(plant.noise_weight @ np.sum(np.abs(one) ** 2, axis=2)) for one in (angles, torque)]
+    return (plant.G_o @ U).astype(np.complex128), U.astype(np.complex128), rms[0], rms[1]
 
 
 def _attitude_model(gains: Gains, plant: WideResponse) -> Complex:
@@ -206,15 +208,17 @@ def _figures(
     model: Signal,
     parts: list[NDArray[np.bool_]],
     rest: NDArray[np.bool_],
-    noise: Signal,
+    angle_noise: Signal,
+    torque_noise: Signal,
 ) -> CheckFigures:
-    """Figures of angles and torque; `noise` (2,) is added to the torque of a prediction, which has none."""
+    """Figures of angles and torque; noise (2,) is added to those of a prediction, which has none."""
     follow, offaxis, effort, still = [], [], [], []
     for axis, part in enumerate(parts):
-        follow.append(float(np.degrees(_rms(angles[part, axis] - model[part, axis]))))
-        offaxis.append(float(np.degrees(_rms(angles[part, 1 - axis] - model[part, 1 - axis]))))
-        effort.append(float(np.hypot(_rms(torque[part, axis]), noise[axis])))
-        still.append(float(np.hypot(np.std(torque[rest, axis]), noise[axis])))
+        other = 1 - axis
+        follow.append(_degrees(np.hypot(_rms(angles[part, axis] - model[part, axis]), angle_noise[axis])))
+        offaxis.append(_degrees(np.hypot(_rms(angles[part, other] - model[part, other]), angle_noise[other])))
+        effort.append(float(np.hypot(_rms(torque[part, axis]), torque_noise[axis])))
+        still.append(float(np.hypot(np.std(torque[rest, axis]), torque_noise[axis])))
     return CheckFigures((follow[0], follow[1]), (offaxis[0], offaxis[1]), (effort[0], effort[1]), (still[0], still[1]))
 
 
@@ -228,6 +232,10 @@ def _worse(predicted: CheckFigures, flight: CheckFigures) -> tuple[str, ...]:
                     f"{axis}: {text} {got:.3g} {unit}".rstrip() + f", predicted {expected:.3g}, limit {limit:.3g}"
                 )
     return tuple(found)
+
+
+def _degrees(angle: float) -> float:
+    return float(np.degrees(angle))
 
 
 def _rms(values: Signal) -> float:

@@ -9,18 +9,19 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.autopilot.flight_modes import Mode
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.field.autotune_run import FLIGHT, AutotuneRun, Decided
+from mimopilot.sitl.field.autotune_run import FLIGHT, AutotuneOptions, AutotuneRun, Decided
 from mimopilot.sitl.field.doublet_flight import doublet_plan, fly_doublets
 from mimopilot.sitl.field.flight_commands import land, send_command, take_off, wait_until_disarmed, wait_until_hovering
 from mimopilot.sitl.field.flight_watch import POLL_S, FlightWatch, start_watch
 from mimopilot.sitl.field.ground_steps import Found, list_logs
 from mimopilot.sitl.field.vehicle_set import NEW, compare_set
 from mimopilot.sitl.mavlink.ground_station.events import Exchange
-from mimopilot.sitl.mavlink.ground_station.experiment_console import PX4, ExcitationOptions, check_log, settings
+from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
+from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import experiment_profile
+from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
 from mimopilot.sitl.mavlink.ground_station.session import Session
-from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import INTEGERS, excite, start_monitor
+from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
-from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import ENABLE
 
 # All chosen:
@@ -39,31 +40,47 @@ def fly_experiment(run: AutotuneRun) -> Found:
     SitlError
         If it was not complete, or the vehicle did not land.
     """
-    options = run.options
     before = list_logs(run)
-    with run.vehicle(integers=INTEGERS | {"SDLOG_PROFILE"}) as session:
-        Ts = session.read(["MIMO_TS"], options.profile)["MIMO_TS"]
-        excitation = ExcitationOptions(
-            "both", options.seconds_per_axis, options.amplitude, BANDWIDTH, SEED, "hold", TILT_DEG
-        )
-        wanted = settings(excitation, Ts)
-        check_log(session)
-        watch = _hover(run, session, "experiment")
-        session.run(_check_wind(watch))
-        if not run.took_off and not run.confirm("Excite the vehicle?"):
-            raise SitlError("the experiment was not wanted", exit_code=1)
-        monitor = session.run(start_monitor(session.client, round(wanted["MIMO_EX_MODE"])))
-        result = session.run(excite(session.client, monitor, wanted))
-        problems = [] if result.complete else [result.reason]
-        if not result.stopped:
-            problems.append("the excitation may still be running")
-        if not result.restored:
-            problems.append("not all MIMO_EX_ parameters were read back as before")
-        if problems:
-            raise SitlError("; ".join(problems), exit_code=1)
-        run.dialogue.tell(f"excited for {result.seconds:.1f} s")
-        _come_down(run, session)
+    saved: dict[str, float] = {}
+    profile = experiment_profile(run.options.profile, _excitation(run.options), saved.update)
+    with run.vehicle(integers=profile.integers) as session:
+        vehicle = session.run(session.client.await_heartbeat())
+        try:
+            if not vehicle.armed:
+                done = profile.prepare(session)
+                for note in done.notes:
+                    run.dialogue.tell(note)
+            watch = _hover(run, session, "experiment")
+            session.run(_check_wind(watch))
+            if not run.took_off and not run.confirm("Excite the vehicle?"):
+                raise SitlError("the experiment was not wanted", exit_code=1)
+            monitor = profile.check(session)
+            result = profile.excite(session, monitor)
+            problems = [] if result.complete else [result.reason]
+            problems += [] if result.stopped else ["the excitation may still be running"]
+            problems += [] if result.restored else ["not all parameters of the excitation were read back as before"]
+            if problems:
+                raise SitlError("; ".join(problems), exit_code=1)
+            run.dialogue.tell(f"excited for {result.seconds:.1f} s")
+            _come_down(run, session)
+        finally:
+            left = profile.restore(session).left
+            if left:
+                values = ", ".join(f"{name} {shortest(value)}" for name, value in left.items())
+                run.dialogue.tell(f"not read back as before the experiment; set again: {values}")
     return {"logs_before": before, "seconds": result.seconds}
+
+
+def _excitation(options: AutotuneOptions) -> ExcitationOptions:
+    return ExcitationOptions(
+        axis="all" if options.profile == "mimo" else None,
+        seconds_per_axis=options.seconds_per_axis,
+        amplitude=options.amplitude,
+        bandwidth=BANDWIDTH,
+        seed=SEED,
+        mode="hold",
+        tilt_deg=TILT_DEG,
+    )
 
 
 def fly_check(run: AutotuneRun) -> Found:
@@ -77,7 +94,7 @@ def fly_check(run: AutotuneRun) -> Found:
         If the flight was ended for another reason.
     """
     before = list_logs(run)
-    plan = doublet_plan(read_log(run.log(FLIGHT)).amplitude)
+    plan = doublet_plan(run.experiment(FLIGHT).amplitude)
     with run.vehicle(integers={ENABLE.name}) as session:
         if compare_set(run, session) != NEW:
             raise SitlError("the vehicle does not hold the new gains", exit_code=1)
@@ -89,9 +106,10 @@ def fly_check(run: AutotuneRun) -> Found:
             run.dialogue.tell(f"{reason}: landing")
             reason = f"the check flight was ended: {reason}"
             run.decisions.note(reason)
-            session.run(_hand_over(session))
+            ours = session.run(_hand_over(session))
             session.run(land(watch))
             run.took_off = False
+            session.run(session.client.write(ours, "restoring", keep_going=True))
             raise Decided(reason)
         if reason and session.vehicle.mode == custom_mode(Mode.OFFBOARD) and not run.took_off:
             session.run(_enter_mode(session, mode))
@@ -179,13 +197,23 @@ def _check_wind(watch: FlightWatch) -> Exchange[None]:
         )
 
 
-def _hand_over(session: Session) -> Exchange[None]:
-    """Hand over to PX4's own controllers by the one parameter of our module; other vehicles have no such switch."""
+def _hand_over(session: Session) -> Exchange[dict[str, float]]:
+    """Hand over to PX4's own controllers by the one parameter of our module; other vehicles have no such switch.
+
+    Returns
+    -------
+    dict
+        The parameter and its value before; empty: nothing was switched.
+    """
     client = session.client
     assert client.vehicle is not None
     if client.vehicle.autopilot != PX4:
-        return
+        return {}
+    answer = (yield from client.read([ENABLE.name], "reading", keep_going=True))[ENABLE.name]
+    if not answer.value:
+        return {}
     yield from client.write({ENABLE.name: 0.0}, "handing over", keep_going=True)
+    return {ENABLE.name: answer.value}
 
 
 def _enter_mode(session: Session, mode: int) -> Any:

@@ -13,7 +13,6 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     Exchange,
     FlightReport,
     LandedState,
-    PowerReport,
     SetMessageInterval,
     StatusText,
     ThrustReport,
@@ -30,7 +29,6 @@ STREAMS = {
     "EXTENDED_SYS_STATE": (245, 200_000),
     "VFR_HUD": (74, 100_000),
     "ATTITUDE_TARGET": (83, 100_000),
-    "SYS_STATUS": (1, 500_000),
 }
 FIRST_STREAM_TIMEOUT_S, REPEAT_REQUEST_S, POLL_S = 6.0, 1.0, 0.1
 #: Silence (s) of the attitude, and of HEARTBEAT, after which the link counts as lost.
@@ -60,10 +58,6 @@ class FlightWatch:
     altitude, climb : float, m, m/s
     thrust : float
         Collective, 0 to 1, mean of the last second.
-    charge : int, %
-        Of the battery; -1: unknown.
-    logging : bool or None
-        Whether the vehicle can log; None: not reported.
     text : str
         Last text of the vehicle.
     seen : dict
@@ -80,8 +74,6 @@ class FlightWatch:
     altitude: float = 0.0
     climb: float = 0.0
     thrust: float = 0.0
-    charge: int = -1
-    logging: bool | None = None
     text: str = ""
     seen: dict[str, float] = field(default_factory=dict)
 
@@ -101,9 +93,6 @@ class FlightWatch:
             first = "ATTITUDE_TARGET" not in self.seen
             self.thrust += (1.0 if first else THRUST_SHARE) * (report.thrust - self.thrust)
             self._note("ATTITUDE_TARGET")
-        elif isinstance(report, PowerReport):
-            self.charge, self.logging = report.charge, report.logging
-            self._note("SYS_STATUS")
         elif isinstance(report, StatusText):
             self.text = report.text
 

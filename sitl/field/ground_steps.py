@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from typing import Any
 
 from mimopilot.common.blas import reproducible
@@ -13,6 +14,13 @@ from mimopilot.sitl.field.autotune_run import ANSWER_S, CHECK, FLIGHT, GAINS, SN
 from mimopilot.sitl.field.check_flight import check_flight
 from mimopilot.sitl.field.flight_watch import start_watch
 from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, save_snapshot, set_names, write_set
+from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+    FLIGHT_STREAMS,
+    request_status,
+    request_streams,
+    supplies_problem,
+)
+from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.log_transfer.log_session import LogSession
 from mimopilot.sitl.mavlink.log_transfer.vehicle_logs import VehicleLog
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
@@ -20,17 +28,15 @@ from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
-from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.inspection import inspect_log
-from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.parameters import IDENTITY
 
 # All chosen:
-#: Charge (%) below which nothing is flown: an autotune is two flights of some minutes.
-MIN_CHARGE = 40
 #: Time (s) in which a vehicle closes its log after disarming, and the pause between two looks.
 LOG_TIMEOUT_S, LOG_PAUSE_S = 30.0, 1.0
+#: Relative difference of values that are the same but for rounding to single precision.
+SAME = 1e-6
 #: Folder of a download that is not finished.
 DOWNLOADS = "download"
 
@@ -52,13 +58,12 @@ def check_vehicle(run: AutotuneRun) -> Found:
                 "--take-off: nobody can be asked whether to arm the vehicle, and --yes is no answer to that unless the "
                 "vehicle says that it is simulated: give --arm"
             )
-        if 0 <= watch.charge < MIN_CHARGE:
-            raise SitlError(
-                f"the battery is at {watch.charge} %, expected {MIN_CHARGE} % or more: charge it", exit_code=1
-            )
-        if watch.logging is False:
-            raise SitlError("the vehicle reports that it cannot log: check its card", exit_code=1)
-        if watch.charge < 0:
+        monitor = session.run(request_streams(session.client, FLIGHT_STREAMS))
+        session.run(request_status(session.client, monitor))
+        problem = supplies_problem(monitor)
+        if problem:
+            raise SitlError(problem, exit_code=1)
+        if monitor.charge < 0:
             run.dialogue.tell("the vehicle does not report its battery's charge: watch it yourself")
         vehicle = session.vehicle
     list_logs(run)
@@ -85,19 +90,22 @@ def list_logs(run: AutotuneRun) -> list[list[Any]]:
 
 def fetch_flight(run: AutotuneRun) -> Found:
     """Fetch the log of the experiment."""
-    return _fetch(run, FLIGHT, run.decisions.steps["experiment"]["logs_before"])
+    return _fetch(run, FLIGHT, "experiment")
 
 
 def fetch_check(run: AutotuneRun) -> Found:
     """Fetch the log of the check flight."""
-    return _fetch(run, CHECK, run.decisions.steps["check flight"]["logs_before"])
+    return _fetch(run, CHECK, "check flight")
 
 
-def _fetch(run: AutotuneRun, name: str, before: list[list[Any]]) -> Found:
-    """Fetch the one log that is new, and give it its name."""
+def _fetch(run: AutotuneRun, name: str, flight: str) -> Found:
+    """Fetch the one log that is new since a flight began, and give it its name; without one, fly again next time."""
     folder = run.file(DOWNLOADS)
     with run.vehicle_logs() as session:
-        log = _new_log(session, before)
+        log, problem = _new_log(session, run.decisions.steps[flight]["logs_before"])
+        if log is None:
+            run.decisions.forget_from(flight)
+            raise SitlError(problem, exit_code=1)
         done = session.run(session.logs.download(log, folder))
     target = run.file(name + done.path.suffix)
     done.path.replace(target)
@@ -106,8 +114,8 @@ def _fetch(run: AutotuneRun, name: str, before: list[list[Any]]) -> Found:
     return {"file": target.name, "bytes": done.log.size, "verified": done.verified, "log": done.log.name}
 
 
-def _new_log(session: LogSession, before: list[list[Any]]) -> VehicleLog:
-    """The last log of the vehicle, which must be new; waits until it is there and no longer grows."""
+def _new_log(session: LogSession, before: list[list[Any]]) -> tuple[VehicleLog | None, str]:
+    """The new log of the vehicle, once it no longer grows, or why there is none."""
     begin, size = session.link.now(), -1
     while True:
         found = session.run(session.logs.find())
@@ -115,14 +123,12 @@ def _new_log(session: LogSession, before: list[list[Any]]) -> VehicleLog:
         last = session.run(session.logs.choose(None)) if len(new) > 1 else None
         log = last if last in new else new[0] if len(new) == 1 else None
         if log is not None and log.size == size > 0:
-            return log
+            return log, ""
         size = -1 if log is None else log.size
         if session.link.now() > begin + LOG_TIMEOUT_S:
             if log is None:
-                reason = "the vehicle has no log of this flight: is logging on, is its card full?"
-            else:
-                reason = f"{log.name}: the log of this flight has {log.size} bytes and is not closed: card full?"
-            raise SitlError(reason, exit_code=1)
+                return None, "the vehicle has no log of this flight: is logging on, is its card full?"
+            return None, f"{log.name}: the log of this flight has {log.size} bytes and is not closed: card full?"
         session.run(_pause(session))
 
 
@@ -162,9 +168,8 @@ def tune_gains(run: AutotuneRun) -> Found:
     Decided
         If the flown gains are better.
     """
-    path = run.log(FLIGHT)
     try:
-        gains = tune([read_log(path)])
+        gains = tune([run.experiment(FLIGHT)])
         warning = check_verdict(gains, allow=False)
     except TuningError as error:
         run.decisions.forget_from("experiment")
@@ -216,9 +221,9 @@ def judge(run: AutotuneRun) -> Found:
     SitlError
         If the log does not tell.
     """
-    flight, gains = read_log(run.log(CHECK)), load_gains(run.file(GAINS))
-    _check_flown(flight, gains)
-    result = check_flight(flight, read_log(run.log(FLIGHT)), gains)
+    flight, gains = run.experiment(CHECK), load_gains(run.file(GAINS))
+    _check_flown(run, flight)
+    result = check_flight(flight, run.experiment(FLIGHT), gains)
     run.dialogue.show_check(result)
     write_autotune_report(run, gains, result)
     if result.worse:
@@ -226,13 +231,14 @@ def judge(run: AutotuneRun) -> Found:
     return result.as_table()
 
 
-def _check_flown(flight: Experiment, gains: Gains) -> None:
+def _check_flown(run: AutotuneRun, flight: Experiment) -> None:
+    """Refuse a log of a flight with other gains than the new ones."""
     if flight.flown is None:
         raise SitlError(f"{flight.source}: does not say which gains flew", exit_code=1)
-    flown, wanted = flight.flown.elements(), gains.elements()
-    other = [code for code in wanted if code != "TS" and flown[code] != wanted[code]]
+    flown, wanted = make_plan(flight.flown, run.options.profile).values, new_plan(run).values
+    other = [name for name, value in wanted.items() if not math.isclose(flown[name], value, rel_tol=SAME)]
     if other:
-        raise SitlError(f"{flight.source}: was flown with other gains ({other[0]}, ...)", exit_code=1)
+        raise SitlError(f"{flight.source}: was flown with other gains ({', '.join(other[:3])}, ...)", exit_code=1)
 
 
 def keep(run: AutotuneRun) -> Found:

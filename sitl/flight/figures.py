@@ -16,6 +16,7 @@ from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.tuning.reference_model import ReferenceModel
 
 MODEL = {"color": "#888888", "linewidth": 3.0, "alpha": 0.6}
+ALL_AXES = (*AXES, "yaw")
 SETPOINT = {"color": "black", "linewidth": 1.0}
 
 
@@ -69,7 +70,7 @@ def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer
 
 
 def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
-    """An experiment: injected and total torque, rates and angles of both axes; a detail on the right."""
+    """An experiment: injected and total torque, rates and angles of all axes; a detail on the right."""
     time = np.arange(len(flight.record)) * flight.scenario.Ts
     record = flight.record
     figure = Figure(figsize=(9, 7), layout="constrained")
@@ -80,16 +81,20 @@ def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
         ("body rate [deg/s]", np.degrees(record["rates"])),
         ("angle [deg]", np.degrees(record["attitude"])),
     )
-    middle = time[-1] / 2
+    excitation = flight.scenario.excitation
+    shown = [axis for axis in range(3) if axis < 2 or excitation[:, axis].any()]
+    roll = np.flatnonzero(excitation[:, 0])
+    middle = time[roll[-1]] if len(roll) and roll[-1] + 1 < len(time) else time[-1] / 2
     for row, (text, values) in zip(panels, signals, strict=True):
         # The overview is drawn as pixels: its lines would be most of the size of a report.
         for panel, width, pixels in zip(row, (0.4, 1.2), (True, False), strict=True):
-            for axis, (colour, _) in enumerate((STYLES[1], STYLES[0])):
-                line = {"color": colour, "linewidth": width, "rasterized": pixels, "label": AXES[axis]}
+            for axis in shown:
+                colour = (STYLES[1], STYLES[0], STYLES[2])[axis][0]
+                line = {"color": colour, "linewidth": width, "rasterized": pixels, "label": ALL_AXES[axis]}
                 panel.step(time, values[:, axis], where="post", **line)
             panel.grid(alpha=0.3)
         row[0].set_ylabel(text)
-    panels[0, 1].legend(loc="upper right", fontsize=9, ncols=2)
+    panels[0, 1].legend(loc="upper right", fontsize=9, ncols=3)
     panels[0, 0].set_title("Closed-loop experiment", loc="left")
     panels[0, 1].set_title("where roll ends and pitch begins", loc="left")
     for column, limits in enumerate(((time[0], time[-1]), (middle - zoom_s / 2, middle + zoom_s / 2))):

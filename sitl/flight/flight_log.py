@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +47,8 @@ def flight_log_bytes(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
         Gains in flight, logged as parameters of the vehicle.
     """
     truth = flight.truth
-    topics = _autopilot_topics(flight.record, len(airframe.rotors), flight.scenario.Ts) | {
+    topics = autopilot_topics(flight.record, len(airframe.rotors)) | injection_topics(flight.record, flight.scenario.Ts)
+    topics |= {
         "vehicle_attitude_groundtruth": {"q": quaternions(truth["attitude"])},
         "vehicle_angular_velocity_groundtruth": {"xyz": truth["rates"].astype(np.float32)},
         "vehicle_local_position_groundtruth": {
@@ -55,11 +57,12 @@ def flight_log_bytes(flight: Flight, airframe: Airframe, gains: Gains) -> bytes:
             for i, name in enumerate(names.split())
         },
     }
-    return _ulog_file(flight.scenario.Ts, topics, to_array(gains), airframe)
+    flown = {p.name: float(value) for p, value in zip(PARAMETERS, to_array(gains), strict=True)}
+    return _ulog_file(flight.scenario.Ts, topics, flown, airframe)
 
 
 def vehicle_log(
-    record: NDArray[Any], landed: NDArray[np.bool_], Ts: float, airframe: Airframe, gains: NDArray[np.float32]
+    record: NDArray[Any], landed: NDArray[np.bool_], Ts: float, airframe: Airframe, parameters: Mapping[str, float]
 ) -> bytes:
     """A flight without its true state, from arming to disarming, as a ULog file.
 
@@ -73,37 +76,40 @@ def vehicle_log(
         Control period.
     airframe : Airframe
         The vehicle.
-    gains : (36,) float32 array
-        Gains in flight, in the order of `tuning.parameters.PARAMETERS`.
+    parameters : mapping
+        Name -> value of the parameters in flight.
     """
-    topics = _autopilot_topics(record, len(airframe.rotors), Ts) | {
-        "vehicle_land_detected": {"landed": landed.astype(np.uint8)},
-        "actuator_armed": {"armed": np.ones(len(record), np.uint8)},
-    }
-    return _ulog_file(Ts, topics, gains, airframe)
+    topics = autopilot_topics(record, len(airframe.rotors)) | injection_topics(record, Ts) | vehicle_topics(landed)
+    return _ulog_file(Ts, topics, parameters, airframe)
 
 
 def _ulog_file(
-    Ts: float, topics: dict[str, dict[str, NDArray[Any]]], gains: NDArray[np.float32], airframe: Airframe
+    Ts: float, topics: dict[str, dict[str, NDArray[Any]]], parameters: Mapping[str, float], airframe: Airframe
 ) -> bytes:
-    parameters = {parameter.name: float(value) for parameter, value in zip(PARAMETERS, gains, strict=True)}
-    scale = airframe.moment_scale()
-    parameters |= {parameter.name: value for parameter, value in zip(IDENTITY, scale, strict=True)}
-    information = {
+    scale = {parameter.name: value for parameter, value in zip(IDENTITY, airframe.moment_scale(), strict=True)}
+    return ulog_bytes(Ts, topics, {**parameters, **scale}, log_information(airframe))
+
+
+def log_information(airframe: Airframe) -> dict[str, str]:
+    """Key -> text that says where a log comes from."""
+    return {
         "sys_name": "mimopilot",
         "ver_hw": f"SITL {airframe.name}",
         "ver_sw": f"mimopilot {generator_version()}",
     }
-    return ulog_bytes(Ts, topics, parameters, information)
 
 
-def _autopilot_topics(record: NDArray[Any], rotors: int, Ts: float) -> dict[str, dict[str, NDArray[Any]]]:
+def vehicle_topics(landed: NDArray[np.bool_]) -> dict[str, dict[str, NDArray[Any]]]:
+    """Topics of the state of an armed vehicle; (N,) whether it was on the ground."""
+    return {
+        "vehicle_land_detected": {"landed": landed.astype(np.uint8)},
+        "actuator_armed": {"armed": np.ones(len(landed), np.uint8)},
+    }
+
+
+def autopilot_topics(record: NDArray[Any], rotors: int) -> dict[str, dict[str, NDArray[Any]]]:
     """Topics of the inputs and outputs of the autopilot."""
-    excitation = record["excitation"]
-    # One message a period, as in the firmware; z is the excited axis, numbered as `ExcitationPhase`.
-    on_yaw = excitation[:, 2] != 0
-    active = np.select([excitation[:, 0] != 0, excitation[:, 1] != 0, on_yaw], [0, 1, 3], -1).astype(np.float32)
-    thrust = np.zeros_like(excitation)
+    thrust = np.zeros((len(record), 3), np.float32)
     thrust[:, 2] = -record["collective"]
     return {
         "vehicle_angular_velocity": {"xyz": record["rates"]},
@@ -121,6 +127,16 @@ def _autopilot_topics(record: NDArray[Any], rotors: int, Ts: float) -> dict[str,
         "vehicle_thrust_setpoint": {"xyz": thrust},
         "actuator_motors": {"control": record["commands"][:, :rotors]},
         "control_allocator_status": {"unallocated_torque": record["unallocated"]},
+    }
+
+
+def injection_topics(record: NDArray[Any], Ts: float) -> dict[str, dict[str, NDArray[Any]]]:
+    """Topic of the injected torque."""
+    excitation = record["excitation"]
+    # One message a period, as in the firmware; z is the excited axis, numbered as `ExcitationPhase`.
+    on_yaw = excitation[:, 2] != 0
+    active = np.select([excitation[:, 0] != 0, excitation[:, 1] != 0, on_yaw], [0, 1, 3], -1).astype(np.float32)
+    return {
         "debug_vect": {
             "x": np.where(on_yaw, excitation[:, 2], excitation[:, 0]),
             "y": np.where(on_yaw, _turned(record["rates"][:, 2], on_yaw, Ts), excitation[:, 1]),

@@ -119,7 +119,7 @@ def _repeat_outputs(before, record, k):  # type: ignore[no-untyped-def]
 @compiled
 def _fly(body, measuring, autopilot, link, before, record, truth):  # type: ignore[no-untyped-def]
     # Unpacked once: numba counts the references of a tuple's arrays at each access.
-    (step_address, controller, inputs, outputs, allocation), collective, altitude = autopilot
+    (step_address, state_address, inputs, outputs, allocation), collective, altitude = autopilot
     plant, state, steps, step = body
     sensors, measurement, noise = measuring
     runs, delays, history, first = link
@@ -130,7 +130,9 @@ def _fly(body, measuring, autopilot, link, before, record, truth):  # type: igno
         if runs[k] == 0:
             _repeat_outputs(before, record, k)
         for _ in range(runs[k]):
-            tick_unpacked(step_address, controller, inputs, outputs, allocation, collective, altitude, measurement, row)
+            tick_unpacked(
+                step_address, state_address, inputs, outputs, allocation, collective, altitude, measurement, row
+            )
         before = row
         roll, pitch, yaw = euler_angles(state[6], state[7], state[8], state[9])
         true.attitude[0], true.attitude[1], true.attitude[2] = roll, pitch, yaw

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,8 +13,11 @@ from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.common.console import print_table
 from mimopilot.common.files import inside
 from mimopilot.common.html_report import ReportTable, Section, write_report
+from mimopilot.common.progress import step
+from mimopilot.common.text_table import with_deviation
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.flight.excitation_flight import default_yaw_amplitude
 from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
 from mimopilot.sitl.flight.flight_log import save_flight
 from mimopilot.sitl.flight.metrics import Performance, performance
@@ -70,18 +70,6 @@ class DemoSummary:
         }
 
 
-@contextmanager
-def _stage(text: str) -> Iterator[None]:
-    """Show the current stage on standard error if that is a terminal."""
-    if not sys.stderr.isatty():
-        yield
-        return
-    from rich.console import Console
-
-    with Console(stderr=True).status(text):
-        yield
-
-
 def run_demo(out: Path, seed: int) -> DemoSummary:
     """Fly, tune, generate, compile, fly again, compare with MAVLink, report.
 
@@ -104,26 +92,29 @@ def run_demo(out: Path, seed: int) -> DemoSummary:
     vehicle = load_airframe(AIRFRAME)
     airframe, gains = vehicle.airframe, {"default": vehicle.default_gains()}
 
-    with _stage("experiment: 40 s of flight with a PRBS torque on roll, then on pitch (the first run compiles)"):
+    with step("experiment: 60 s of flight with a PRBS torque on roll, pitch, then yaw (the first run compiles)"):
         controllers = {"default": _controller(gains["default"], firmware["default"])}
         generator = np.random.default_rng(seed)
-        scenario = excitation_flight(SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH, gains["default"].Ts, generator)
+        yaw = default_yaw_amplitude(airframe)
+        scenario = excitation_flight(
+            SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH, gains["default"].Ts, generator, axes="all", yaw_amplitude=yaw
+        )
         autopilot = Autopilot(airframe, gains["default"], controllers["default"])
         flight = _survived(fly(airframe, autopilot, scenario, seed))
         save_flight(log, flight, airframe, gains["default"])
 
-    with _stage("tuning: gains designed on the log's response, axis by axis (SISO) and with full matrices (MIMO)"):
+    with step("tuning: gains designed on the log's response, axis by axis (SISO) and with full matrices (MIMO)"):
         experiment = read_log(log)
         for method in ("siso", "mimo"):
             gains[method] = tune(experiment, load_spec(method=method))
         for method, path in paths.items():
             gains[method].save(path)
 
-    with _stage("firmware: generating and compiling the C++ of each gain set"):
+    with step("firmware: generating and compiling the C++ of each gain set"):
         for method in ("siso", "mimo"):
             controllers[method] = _controller(gains[method], firmware[method])
 
-    with _stage("doublets: in process, then over MAVLink"):
+    with step("doublets: in process, then over MAVLink"):
         flights: dict[str, dict[str, Flight]] = {}
         for axis in AXES:
             task = doublet(axis, float(np.radians(DOUBLET_DEG)), DOUBLET_S, gains["default"].Ts)
@@ -137,7 +128,7 @@ def run_demo(out: Path, seed: int) -> DemoSummary:
         }
         for axis, methods in flights.items()
     }
-    with _stage("report"):
+    with step("report"):
         _write_report(report, gains, figures, flights, flight)
     samples = len(flights["roll"]["mimo"].record)
     return DemoSummary(
@@ -197,10 +188,9 @@ def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
             continue  # zero in every gain set
         for method, label in LABELS.items():
             found = gains[method].provenance.standard_deviation
-            spread = [f" ({v:.4f})" for v in np.ravel(found[name])] if name in found else [""] * 4
             values = np.ravel(getattr(gains[method], name))
-            numbers = [f"{float(v):.4f}".replace("-0.0000", "0.0000") for v in values]
-            rows.append([f"{name}  {label}", *(number + s for number, s in zip(numbers, spread, strict=True))])
+            deviations = np.ravel(found[name]) if name in found else [None] * 4
+            rows.append([f"{name}  {label}", *map(with_deviation, values, deviations)])
     return rows
 
 
@@ -255,7 +245,7 @@ def _write_report(
     ]
     lead = (
         "ADAM-0 with 10 % inertia coupling (class values: the thesis prints no inertia), tuned from one "
-        f"{2 * SECONDS_PER_AXIS:g} s closed-loop flight without a model of the vehicle. The design finds the attitude "
+        f"{3 * SECONDS_PER_AXIS:g} s closed-loop flight without a model of the vehicle. The design finds the attitude "
         f"model that can be followed within its limits: {outer.label} (rad/s, damping, delay in samples). SISO: the "
         "same design, axis by axis."
     )
@@ -263,8 +253,8 @@ def _write_report(
     sections = [
         Section(
             "Experiment",
-            f"PRBS torque of amplitude {AMPLITUDE:g} and bandwidth {BANDWIDTH:g} rad/s on roll, then on pitch, "
-            "under the flown gains.",
+            f"PRBS torque on roll, then on pitch (amplitude {AMPLITUDE:g}, bandwidth {BANDWIDTH:g} rad/s), then on yaw "
+            f"({np.abs(experiment.scenario.excitation[:, 2]).max():g}, half the bandwidth), under the flown gains.",
             figures=[svg(experiment_figure(experiment), "experiment")],
         ),
         Section(

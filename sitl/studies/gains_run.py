@@ -126,7 +126,7 @@ class LinearBench:
         stable = radius < 1
         return {
             "spectral_radius": radius,
-            "Ms": loop.sensitivity_peak(self.truth.fine),
+            "Ms": loop.sensitivity_peak(self.truth.fine, self.truth.fine_response),
             "damping": loop.damping,
             "noise": float((loop.noise / self.truth.loop(self.flown).noise).max()),
             "J_M": [float(np.mean(loop.J_M(model, period, TAIL))) if stable else np.inf for period in PERIODS],

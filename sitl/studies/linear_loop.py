@@ -13,7 +13,7 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ERROR, RATE, SETPOINT, rate_matrices, state_space
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.small_matrices import singular_values
-from mimopilot.tuning.statespace import StateSpace
+from mimopilot.tuning.statespace import Response, StateSpace
 
 #: Poles slower than this are dominant, rad/s: three times the usual attitude model. Faster ones are those of rotors,
 #: filters and delays, which damp out within a fraction of a manoeuvre.
@@ -108,9 +108,15 @@ class LinearLoop:
         dominant = continuous[(np.abs(continuous) < DOMINANT) & (np.abs(continuous) > 0)]
         return float((-dominant.real / np.abs(dominant)).min()) if len(dominant) else float("nan")
 
-    def sensitivity_peak(self, omega: Signal) -> float:
-        """Ms: largest singular value of the sensitivity at some frequencies (rad/s), cut at the torques."""
-        G = self.plant.frequency_response(omega)[:, :, :2]
+    def sensitivity_peak(self, omega: Signal, G: Response) -> float:
+        """Ms: largest singular value of the sensitivity, cut at the torques.
+
+        Parameters
+        ----------
+        omega : (K,) array, rad/s
+        G : (K, 4, 2) array
+            The plant's response from the torques there: the same for many controllers.
+        """
         K = self.controller.loop.frequency_response(omega)[:, :, MEASURED]
         return float(1 / singular_values(np.eye(2) - K @ G)[1].min())
 

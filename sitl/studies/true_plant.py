@@ -26,7 +26,7 @@ from mimopilot.tuning.plant.frequency_response import PlantResponse, hermitian_r
 from mimopilot.tuning.plant.rigid_body_fit import LOWEST, RigidBody
 from mimopilot.tuning.plant.wide_response import STEP, TOP, WideResponse
 from mimopilot.tuning.spec import DesignLimits, TuningSpec
-from mimopilot.tuning.statespace import StateSpace
+from mimopilot.tuning.statespace import Response, StateSpace
 
 #: Largest relative step between the frequencies at which margins are computed.
 FINE_STEP = 2e-3
@@ -142,13 +142,18 @@ class TruePlant:
         """Frequencies (K,), rad/s, dense enough for the margin."""
         return frequencies(self.airframe, self.Ts, FINE_STEP)
 
+    @cached_property
+    def fine_response(self) -> Response:
+        """The model's response from the torques at `fine`, (K, 4, 2)."""
+        return self.model.frequency_response(self.fine)[:, :, :2]
+
     def loop(self, gains: Gains) -> LinearLoop:
         """The loop of a gain set."""
         return LinearLoop(self.model, controller_of(gains))
 
     def sensitivity_peak(self, gains: Gains) -> float:
         """Ms: largest singular value of the sensitivity, cut at the torques. Says nothing about stability."""
-        return self.loop(gains).sensitivity_peak(self.fine)
+        return self.loop(gains).sensitivity_peak(self.fine, self.fine_response)
 
     def spectral_radius(self, gains: Gains) -> float:
         """Largest modulus of the closed loop's poles; the loop is stable below 1."""

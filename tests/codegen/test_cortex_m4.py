@@ -234,12 +234,12 @@ def test_pil_fails_if_a_figure_exceeds_its_limit(monkeypatch, capsys):
     assert "FAIL" in capsys.readouterr().out
 
 
-def test_a_missing_tool_is_reported_with_its_package(mimopilot, tmp_path, monkeypatch, fixed, image):
+def test_a_missing_tool_is_reported_with_its_package(mimopilot_process, tmp_path, monkeypatch, fixed, image):
     import os
 
     environment = {**os.environ, "PATH": "/nowhere"}
     for arguments in (("pil", FOLDER / "adam0.gains.toml"), ("fly", "adam0", "--on", "cortex-m4")):
-        result = mimopilot(*arguments, env=environment)
+        result = mimopilot_process(*arguments, env=environment)
         assert_one_clear_line(result, "arm-none-eabi-g++", "apt-get install gcc-arm-none-eabi")
     monkeypatch.setitem(__import__("sys").modules, "unicorn", None)
     with pytest.raises(CodegenError, match=r"pip install 'mimopilot\[emulator\]'"):

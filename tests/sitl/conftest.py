@@ -1,12 +1,7 @@
 """Fixtures of the upload tests."""
 
-import io
-import subprocess
-import sys
-
 import pytest
 
-import mimopilot.cli.main as front_door
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.parameters import IDENTITY
@@ -15,22 +10,11 @@ from tests.sitl.mavlink.scripted_vehicle import float32
 
 
 @pytest.fixture
-def quick_mimopilot(monkeypatch, capsys, tmp_path):
-    """The command line in this process, with the shortened `WAITS`: a real upload waits for seconds."""
+def quick_mimopilot(monkeypatch, mimopilot):
+    """The command line with the shortened `WAITS`: a real upload waits for seconds."""
     for (module, name), value in WAITS.items():
         monkeypatch.setattr(f"{module}.{name}", value)
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["mimopilot", *map(str, arguments)])
-        monkeypatch.setattr(sys, "stdin", io.StringIO())
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as end:
-            front_door.main()
-        code = end.value.code or 0
-        return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
-
-    return run
+    return mimopilot
 
 
 @pytest.fixture

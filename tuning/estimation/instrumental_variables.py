@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import SIGNALS, Experiment, YawSignals, excited_segments, external_signal
@@ -132,6 +131,8 @@ def align(first: Experiment, second: Experiment) -> tuple[Experiment, Experiment
     TuningError
         When their periods or their excitations differ.
     """
+    from scipy.signal import correlate  # takes a second to import, which most commands do not need
+
     one, other = external_signal(first)[0], external_signal(second)[0]
     if abs(first.Ts / second.Ts - 1) > SAME_PERIOD:
         raise TuningError(

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
-from scipy.signal import lfilter
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import autocorrelation
@@ -53,6 +52,8 @@ def prefilter(u: Signal, model: ReferenceModel) -> Callable[[Signal], Signal]:
     callable
         Filters (N, n) arrays, from rest.
     """
+    from scipy.signal import lfilter  # takes a second to import, which most commands do not need
+
     taps = whitening_filter(u)
 
     def shaped(signal: Signal) -> Signal:

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lstsq
-from scipy.signal import lfilter
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import cross_correlation
@@ -92,6 +91,8 @@ def flexible_model(
     TuningError
         When the data are too short or do not excite the plant.
     """
+    from scipy.signal import lfilter  # takes a second to import, which most commands do not need
+
     lags, drop = default_window([start]), 2 * start.settling_samples()
     lag = len(start.den) - len(start.num) + start.delay
     # F_i: one over the denominator, delayed by i samples.

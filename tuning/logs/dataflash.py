@@ -271,9 +271,9 @@ def _excitation(log: _DataflashLog) -> dict[str, Series]:
     time = np.concatenate([waveform.time, zeros])
     order = np.argsort(time, kind="stable")
     found = {}
-    for name, (factor, axes) in INJECTED_AXES.items():
+    for name, (factor, columns) in INJECTED_AXES.items():
         values = np.zeros((len(time), len(AXIS_NAMES)))
-        for code, column in axes.items():
+        for code, column in columns.items():
             values[: len(axis)][axis == code, column] = factor * waveform.values[axis == code, 0]
         if values.any():
             found[name] = Series(time[order], values[order], "SIDD")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
-from mimopilot.tuning.experiment import Experiment, external_signal
+from mimopilot.tuning.experiment import MOVES, Experiment, external_signal, external_yaw_signal
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.flight_phase import flying_parts, intersection
@@ -25,7 +25,7 @@ BAND_POWER = (0.05, 0.95)  # the band of a signal is between these fractions of 
 
 @dataclass(frozen=True)
 class SignalReport:
-    """One signal as logged; pairs are roll, pitch.
+    """One signal as logged; tuples are of roll and pitch, or of yaw.
 
     Attributes
     ----------
@@ -39,9 +39,9 @@ class SignalReport:
         Pauses of more than `tuning.logs.resample.MAX_GAP` periods.
     longest_gap_s : float, s
         The longest pause.
-    minimum, maximum : tuple of 2 float
+    minimum, maximum : tuple of float
         Extremes, in SI units.
-    saturated : tuple of 2 float or None
+    saturated : tuple of float or None
         Fraction of torque samples at the limit; None for other signals.
     """
 
@@ -50,9 +50,9 @@ class SignalReport:
     held: int
     gaps: int
     longest_gap_s: float
-    minimum: tuple[float, float]
-    maximum: tuple[float, float]
-    saturated: tuple[float, float] | None
+    minimum: tuple[float, ...]
+    maximum: tuple[float, ...]
+    saturated: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,10 @@ class Inspection:
         Signal name -> report.
     parts : tuple of (begin, end) in s
         Usable parts, since the first sample; empty when the vehicle did not fly.
+    yaw : dict
+        The same of yaw, with one value each.
+    external : dict
+        Axis that is excited -> name of the external signal that counts, see `tuning.experiment.EXTERNAL`.
     experiment : Experiment or None
         The usable parts; None when there are none.
     excitation : dict
@@ -95,6 +99,8 @@ class Inspection:
     experiment: Experiment | None
     excitation: dict[str, ExcitationReport]
     reason: str | None
+    yaw: dict[str, SignalReport]
+    external: dict[str, str]
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -138,11 +144,16 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
         if experiment.flown is not None:
             limit = min(experiment.flown.limits.moment_max[:2])
         instrument, name = external_signal(experiment)
-        excitation = {f"{name} {axis}": _excitation(instrument[:, i], experiment) for i, axis in enumerate(AXES)}
+        excitation = {
+            f"{name} {axis}": _excitation(instrument[:, i], experiment.segments, experiment.Ts)
+            for i, axis in enumerate(AXES)
+        }
         excited_stretches(experiment, instrument, "mimo")
         check_log(experiment, recording)
     except TuningError as error:
         reason = str(error).removeprefix(f"{path}: ").removeprefix(f"{path.name}: ")
+    if experiment is not None and experiment.yaw is not None and (of_yaw := external_yaw_signal(experiment.yaw)):
+        excitation[f"{of_yaw[1]} yaw"] = _excitation(of_yaw[0], experiment.yaw.segments, experiment.Ts)
     first, last = recording.span or (0.0, 0.0)
     begin = min((float(s.time[0]) for s in recording.signals.values()), default=first)
     end = max((float(s.time[-1]) for s in recording.signals.values()), default=last)
@@ -162,7 +173,27 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
         experiment=experiment,
         excitation=excitation,
         reason=reason,
+        yaw={name: _signal(name, signal, signal.time, 1.0) for name, signal in recording.yaw.items()},
+        external=_excited_axes(experiment),
     )
+
+
+def _excited_axes(experiment: Experiment | None) -> dict[str, str]:
+    """Axis -> name of its external signal, of the axes that one moves; a setpoint counts from `MOVES` on."""
+    if experiment is None:
+        return {}
+    found = {}
+    try:
+        signal, name = external_signal(experiment)
+    except TuningError:
+        pass
+    else:
+        least = MOVES if name == "r_o" else 0.0
+        for i, axis in enumerate(AXES):
+            if any(np.ptp(signal[a:b, i]) > least for a, b in experiment.segments):
+                found[axis] = name
+    yaw = external_yaw_signal(experiment.yaw) if experiment.yaw else None
+    return found | ({"yaw": yaw[1]} if yaw else {})
 
 
 def _signal(name: str, signal: Series, stamps: NDArray[np.float64], limit: float) -> SignalReport:
@@ -177,20 +208,20 @@ def _signal(name: str, signal: Series, stamps: NDArray[np.float64], limit: float
         held=held_samples(signal.values),
         gaps=int(np.count_nonzero(pauses > MAX_GAP * period * 1.001)),
         longest_gap_s=float(pauses.max()),
-        minimum=(float(low[0]), float(low[1])),
-        maximum=(float(high[0]), float(high[1])),
-        saturated=(float(share[0]), float(share[1])) if name == "u" else None,
+        minimum=tuple(low.tolist()),
+        maximum=tuple(high.tolist()),
+        saturated=tuple(share.tolist()) if name == "u" else None,
     )
 
 
-def _excitation(signal: NDArray[np.float64], experiment: Experiment) -> ExcitationReport:
+def _excitation(signal: NDArray[np.float64], segments: tuple[tuple[int, int], ...], Ts: float) -> ExcitationReport:
     """RMS and band of one axis of the external signal in the segments of the experiment."""
     from scipy.signal import periodogram
 
-    rows = [signal[a:b] for a, b in experiment.segments]
+    rows = [signal[a:b] for a, b in segments]
     used = np.concatenate(rows)
     longest = max(rows, key=len)
-    frequency, power = periodogram(longest, 1 / experiment.Ts, detrend="constant")
+    frequency, power = periodogram(longest, 1 / Ts, detrend="constant")
     total = np.cumsum(power)
     if total[-1] <= 0:
         return ExcitationReport(float(np.std(used)), (0.0, 0.0))

@@ -7,7 +7,8 @@ from dataclasses import asdict
 from typing import Any
 
 from mimopilot.common.console import print_table
-from mimopilot.tuning.logs.inspection import Inspection
+from mimopilot.tuning.experiment import EXTERNAL
+from mimopilot.tuning.logs.inspection import Inspection, SignalReport
 
 #: Signal -> its name, its unit in the table, and the factor from SI to that unit.
 _NAMES = {
@@ -36,12 +37,23 @@ def as_mapping(found: Inspection) -> dict[str, Any]:
         if experiment is None
         else {"Ts": experiment.Ts, "seconds": experiment.seconds, "segments": [list(s) for s in experiment.segments]},
         "excitation": {name: asdict(report) for name, report in found.excitation.items()},
+        "excited": found.external,
+        "yaw": {
+            "signals": {name: asdict(report) for name, report in found.yaw.items()},
+            "segments": [list(s) for s in experiment.yaw.segments] if experiment and experiment.yaw else [],
+        },
         "flown": None if found.flown is None else {name: m.tolist() for name, m in found.flown.matrices.items()},
         "warnings": list(found.warnings),
         "notes": list(recording.notes),
         "tunable": found.reason is None,
         "reason": found.reason,
     }
+
+
+def _spans(report: SignalReport, unit: str, factor: float) -> list[str]:
+    """Range of each axis of a signal."""
+    ends = zip(report.minimum, report.maximum, strict=True)
+    return [f"{factor * low:.3g} .. {factor * high:.3g} {unit}".rstrip() for low, high in ends]
 
 
 def print_inspection(found: Inspection) -> None:
@@ -51,15 +63,14 @@ def print_inspection(found: Inspection) -> None:
     for name, (title, unit, factor) in _NAMES.items():
         report = found.signals.get(name)
         if report is None:
-            rows.append([title, "not logged", *[""] * 5])
+            rows.append([title, "not logged", *[""] * 6])
             continue
         held = f" (held for {report.held})" if report.held > 1 else ""
-        ends = zip(report.minimum, report.maximum, strict=True)
-        spans = [f"{factor * low:.3g} .. {factor * high:.3g} {unit}".rstrip() for low, high in ends]
+        spans = [*_spans(report, unit, factor), *(_spans(found.yaw[name], unit, factor) if name in found.yaw else [""])]
         gaps = f"{report.gaps} ({report.longest_gap_s * 1e3:.0f} ms)"
         saturated = "" if report.saturated is None else " / ".join(f"{100 * share:.1f} %" for share in report.saturated)
         rows.append([title, report.source, f"{report.rate_hz:.1f} Hz{held}", gaps, *spans, saturated])
-    columns = ["signal", "from", "rate", "gaps (longest)", "roll", "pitch", "saturated"]
+    columns = ["signal", "from", "rate", "gaps (longest)", "roll", "pitch", "yaw", "saturated"]
     print_table(f"{recording.path.name}: {recording.format}, {found.seconds:.1f} s", columns, rows)
     if found.airborne is not None:
         print(f"airborne: {sum(b - a for a, b in found.airborne):.1f} s by {recording.evidence}")
@@ -68,6 +79,12 @@ def print_inspection(found: Inspection) -> None:
     if experiment is not None:
         count = len(experiment.segments)
         print(f"experiment: {experiment.seconds:.1f} s at {1 / experiment.Ts:.1f} Hz, {count} segments without a gap")
+        if experiment.yaw is not None:
+            parts = experiment.yaw.segments
+            print(f"yaw: {sum(b - a for a, b in parts) * experiment.Ts:.1f} s, {len(parts)} segments")
+    if found.external:
+        axes = {name: [axis for axis, of_axis in found.external.items() if of_axis == name] for name in EXTERNAL}
+        print("excited: " + "; ".join(f"{', '.join(on)} by {EXTERNAL[name]}" for name, on in axes.items() if on))
     for name, excitation in found.excitation.items():
         low, high = excitation.band_hz
         print(f"excitation {name}: {excitation.rms:.4f} RMS, 90 % of its power from {low:.2f} to {high:.2f} Hz")

@@ -53,7 +53,7 @@ class Kinematics:
 
 
 def measure_kinematics(experiment: Experiment) -> Kinematics:
-    """Least squares of the changes of the angles over `INTEGRATION` on the integrals of the rates."""
+    """Least squares of the changes of the angles over `INTEGRATION` on the integrals of the rates, where they move."""
     step, window = max(1, round(INTEGRATION / experiment.Ts)), max(1, round(WINDOW / experiment.Ts))
     outer, inner, moved = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
     energy = []
@@ -69,20 +69,23 @@ def measure_kinematics(experiment: Experiment) -> Kinematics:
             size, response = float(np.sum(x**2)), float(np.sum(y**2))
             if size <= 0 or response <= 0:
                 continue
+            moves = np.maximum(np.mean(x**2, axis=0), np.mean(y**2, axis=0) / NOISE**2)
+            if np.sqrt(moves.max()) <= STILL:
+                continue  # the noise of a calm hover, as in the pauses of an experiment and while yaw is excited
             # Normalise each window by its own movement.
             scale = math.sqrt(size * response)
             outer += y.T @ x / scale
             inner += x.T @ x / scale
             moved += np.sum(y**2, axis=0) / scale
-            energy.append(np.maximum(np.mean(x**2, axis=0), np.mean(y**2, axis=0) / NOISE**2))
+            energy.append(moves)
     if not energy:
         return Kinematics(np.eye(2), np.ones(2), np.zeros(2, bool))
-    moves = np.sqrt(np.median(energy, axis=0)) > STILL
-    if not moves.all():
-        return Kinematics(np.eye(2), np.ones(2), moves)
+    moving = np.sqrt(np.median(energy, axis=0)) > STILL
+    if not moving.all():
+        return Kinematics(np.eye(2), np.ones(2), moving)
     matrix = outer @ np.linalg.pinv(inner)
     explained = np.einsum("ij,ij->i", matrix, outer) / np.maximum(moved, 1e-300)
-    return Kinematics(matrix, explained, moves)
+    return Kinematics(matrix, explained, moving)
 
 
 def injected_in(total: Signal, injected: Signal, segments: tuple[tuple[int, int], ...]) -> Matrix:

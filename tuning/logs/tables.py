@@ -6,7 +6,7 @@ import csv
 import itertools
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +84,8 @@ def record_csv(path: Path, columns: Columns) -> Recording:
             rows = np.empty((0, 0))
             if places:
                 lines = itertools.chain([row], filled)
-                cell = {place: _number_or_nan if header[place] in optional else _cell for place in places}
+                cell: dict[int | str, Callable[[str], Any]] = {}
+                cell |= {place: _number_or_nan if header[place] in optional else _cell for place in places}
                 rows = np.loadtxt(lines, delimiter=delimiter, usecols=places, ndmin=2, converters=cell, quotechar='"')
     except TuningError:
         raise

@@ -77,7 +77,7 @@ def record_ulog(path: Path) -> Recording:
         for found, axes in ((signals, slice(0, 2)), (yaw, slice(2, 3))):
             if excitation.values[:, axes].any():
                 found["u_bar"] = Series(excitation.time, excitation.values[:, axes], excitation.topic)
-    published = {}
+    published: dict[str, NDArray[np.float64]] = {}
     for signal in ("r_o", "r_i", "r_bar", "u_bar"):
         for found in (signals, yaw):
             if signal in found and not log.is_sampled(found[signal].topic) and "u" in signals:

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
-    INT32,
+    ARDUPILOT,
     SOLE_PEER,
     Address,
     AltitudeReport,
@@ -43,9 +43,11 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     SetMessageInterval,
     SetParameter,
     StatusText,
+    StorageReport,
     ThrustReport,
 )
 from mimopilot.sitl.mavlink.wire.codec import Codec
+from mimopilot.sitl.mavlink.wire.float32 import INT32
 from mimopilot.sitl.mavlink.wire.ftp import FtpPacket
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from mimopilot.sitl.mavlink.wire.sockets import udp_socket
@@ -68,8 +70,11 @@ CONNECT_S = 5.0
 MAX_PEERS = 64
 
 
-def from_mavlink(message: Any) -> Incoming | None:
-    """Event of a parsed message; None if an exchange does not use it."""
+def from_mavlink(message: Any, cast: bool = False) -> Incoming | None:
+    """Event of a parsed message; None if an exchange does not use it.
+
+    `cast`: integer parameters are sent as floats, as by ArduPilot; False: the float holds their bits.
+    """
     kind = message.get_type()
     sender = message.get_srcSystem(), message.get_srcComponent()
     if kind == "HEARTBEAT":
@@ -80,17 +85,20 @@ def from_mavlink(message: Any) -> Incoming | None:
         return Heartbeat(*sender, message.autopilot, armed, message.custom_mode, message.type, simulated)
     if kind == "PARAM_VALUE":
         value = message.param_value
-        whole = struct.unpack("<i", struct.pack("<f", value))[0] if message.param_type == INT32 else value
-        return ParameterValue(*sender, message.param_id, whole + 0.0, message.param_type)
+        coded = message.param_type == INT32 and not cast
+        whole = struct.unpack("<i", struct.pack("<f", value))[0] if coded else value
+        return ParameterValue(*sender, message.param_id, whole + 0.0, message.param_type, message.param_index)
     if kind == "PARAM_ERROR":
         return ParameterRefusal(*sender, message.param_id, message.error)
     if kind == "COMMAND_ACK":
-        return CommandAck(*sender, message.command, message.result)
+        return CommandAck(*sender, message.command, message.result, message.progress)
     if kind == "ATTITUDE":
         rates = message.rollspeed, message.pitchspeed, message.yawspeed
         return AttitudeReport(*sender, message.roll, message.pitch, 1e-3 * message.time_boot_ms, rates, message.yaw)
     if kind == "EXTENDED_SYS_STATE":
         return LandedState(*sender, message.landed_state)
+    if kind == "STORAGE_INFORMATION" and message.status == mavlink.STORAGE_STATUS_READY:
+        return StorageReport(*sender, message.available_capacity)
     if kind == "DEBUG_VECT" and message.name in EXCITATION and message.z in PHASES:
         return InjectorState(*sender, int(message.z), message.time_usec)
     if kind == "VFR_HUD":
@@ -113,8 +121,8 @@ def from_mavlink(message: Any) -> Incoming | None:
     return None
 
 
-def to_mavlink(order: Outgoing) -> Any:
-    """MAVLink message that encodes an outgoing message."""
+def to_mavlink(order: Outgoing, cast: bool = False) -> Any:
+    """MAVLink message that encodes an outgoing message; `cast` as in `from_mavlink`."""
     if isinstance(order, GroundHeartbeat):
         return mavlink.MAVLink_heartbeat_message(
             mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
@@ -125,7 +133,8 @@ def to_mavlink(order: Outgoing) -> Any:
     if isinstance(order, SetParameter):
         name = order.name.encode()
         value = order.value
-        coded = struct.unpack("<f", struct.pack("<i", round(value)))[0] if order.kind == INT32 else value
+        bits = order.kind == INT32 and not cast
+        coded = struct.unpack("<f", struct.pack("<i", round(value)))[0] if bits else value
         return mavlink.MAVLink_param_set_message(order.system, order.component, name, coded, order.kind)
     if isinstance(order, FileRequest):
         return mavlink.MAVLink_file_transfer_protocol_message(0, order.system, order.component, order.packet.pack())
@@ -173,6 +182,8 @@ class Connection:
     def __init__(self, url: str, key: bytes | None = None) -> None:
         self.closed = False
         self.signer = None if key is None else Signer(key)
+        #: Systems with ArduPilot, which sends integer parameters as floats.
+        self.ardupilots: set[int] = set()
         self.kind, _, rest = url.partition(":")
         #: Senders on the link. Each has its own codec, so that frames of two senders are never mixed.
         self.peers: dict[Address, Codec] = {}
@@ -245,7 +256,8 @@ class Connection:
         """Send to one address or to all; a message that cannot be sent is lost, as on a radio."""
         for address in [*self.peers] if to is None else [to]:
             for message in messages:
-                self._transmit(self._peer(address).pack(to_mavlink(message)), address)
+                cast = isinstance(message, SetParameter) and message.system in self.ardupilots
+                self._transmit(self._peer(address).pack(to_mavlink(message, cast)), address)
 
     def _transmit(self, data: bytes, address: Address) -> None:
         try:
@@ -264,8 +276,14 @@ class Connection:
         if self.closed or not select.select([self.port], [], [], wait)[0]:
             return []
         data, origin = self._receive_bytes()
-        messages = map(from_mavlink, self._peer(origin).parse(data)) if data else ()
+        messages = map(self._event, self._peer(origin).parse(data)) if data else ()
         return [Received(origin, message) for message in messages if message is not None]
+
+    def _event(self, message: Any) -> Incoming | None:
+        event = from_mavlink(message, message.get_srcSystem() in self.ardupilots)
+        if isinstance(event, Heartbeat) and event.autopilot == ARDUPILOT:
+            self.ardupilots.add(event.system)
+        return event
 
     def discard(self) -> None:
         """Discard all messages that are waiting."""

@@ -10,16 +10,18 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from typing import NamedTuple, Protocol, TypeVar
 
-from mimopilot.sitl.mavlink.wire.float32 import REAL32
+from mimopilot.sitl.mavlink.wire.float32 import INT32, REAL32
 from mimopilot.sitl.mavlink.wire.ftp import FtpPacket
 
 #: MAV_PARAM_TYPE. PX4 sends the bits of an INT32. ArduPilot's whole numbers are INT8, INT16 or INT32, sent as floats.
-INT8, INT16, INT32 = 2, 4, 6
+INT8, INT16 = 2, 4
 WHOLE = (INT8, INT16, INT32)
 #: MAV_COMP_ID_AUTOPILOT1.
 AUTOPILOT = 1
 #: MAV_CMD_PREFLIGHT_STORAGE.
 STORAGE_COMMAND = 245
+#: PARAM_VALUE.param_index of a parameter that is in no list. PX4: of a module that was not started since boot.
+UNKNOWN_INDEX = 65535
 #: MAV_RESULT.
 ACCEPTED, DENIED, FAILED, IN_PROGRESS = 0, 2, 4, 5
 #: Message number of HEARTBEAT.
@@ -55,13 +57,14 @@ class Heartbeat(NamedTuple):
 
 
 class ParameterValue(NamedTuple):
-    """PARAM_VALUE; `kind` is its param_type. The value of an INT32 is the integer that its bits encode."""
+    """PARAM_VALUE; `kind` is its param_type, `place` its param_index."""
 
     system: int
     component: int
     name: str
     value: float
     kind: int = REAL32
+    place: int = UNKNOWN_INDEX
 
 
 class ParameterRefusal(NamedTuple):
@@ -80,6 +83,7 @@ class CommandAck(NamedTuple):
     component: int
     command: int
     result: int
+    progress: int = 0
 
 
 class AttitudeReport(NamedTuple):
@@ -126,6 +130,14 @@ class ThrustReport(NamedTuple):
     system: int
     component: int
     thrust: float
+
+
+class StorageReport(NamedTuple):
+    """STORAGE_INFORMATION of a usable card: free space, MiB."""
+
+    system: int
+    component: int
+    free: float
 
 
 class InjectorState(NamedTuple):
@@ -277,7 +289,16 @@ class EndLogs(NamedTuple):
 #: Pieces of a vehicle's files and logs.
 TransferReport = FileReply | LogEntry | LogData
 #: Flight state that a vehicle streams.
-FlightReport = AttitudeReport | LandedState | PowerReport | AltitudeReport | ThrustReport | InjectorState | StatusText
+FlightReport = (
+    AttitudeReport
+    | LandedState
+    | PowerReport
+    | AltitudeReport
+    | ThrustReport
+    | StorageReport
+    | InjectorState
+    | StatusText
+)
 Incoming = Heartbeat | ParameterValue | ParameterRefusal | CommandAck | FlightReport | TransferReport
 Outgoing = (
     GroundHeartbeat

@@ -17,6 +17,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     IN_PROGRESS,
     REASONS,
     STORAGE_COMMAND,
+    UNKNOWN_INDEX,
     WHOLE,
     CommandAck,
     Exchange,
@@ -45,12 +46,13 @@ STORAGE_RESULTS = {ACCEPTED: "acknowledged", DENIED: "denied", FAILED: "failed"}
 class Answer(NamedTuple):
     """Result of one request: the value last reported, and the problem (empty: none).
 
-    `absent`: the vehicle did not answer, or reported that the parameter does not exist.
+    `absent`: the vehicle did not answer, or reported that the parameter does not exist. `place`: its param_index.
     """
 
     value: float | None
     problem: str = ""
     absent: bool = False
+    place: int = UNKNOWN_INDEX
 
 
 @dataclass
@@ -203,7 +205,7 @@ class ParameterClient(VehicleLinkState):
             self.possible[message.name] = {wanted}
         else:
             self._set_agreed(message.name, message.value)
-        return Answer(message.value)
+        return Answer(message.value, place=message.place)
 
     def wait_until_quiet(self) -> Exchange[None]:
         """Wait until no messages are in transit: a late echo must not be taken for the value held afterwards."""

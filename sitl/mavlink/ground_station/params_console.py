@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mimopilot.common.console import print_json, print_table
 from mimopilot.common.files import write_atomically
+from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
@@ -64,7 +65,7 @@ def export(file: Path | None, options: LinkOptions, form: str, out: Path | None,
         gains = load_gains(file)
         warning = check_verdict(gains, allow=uncertified)
         if warning:
-            print(f"mimopilot: warning: {file}: {warning}", file=sys.stderr)
+            warn(file, [warning])
         text = _generated(gains, form) if form in GENERATED else parameter_text(form, make_plan(gains).values)
     elif not options.connect:
         raise SitlError("give a gains file to write, --connect to read from a vehicle, or both to compare them")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +20,9 @@ from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import STOCK_PARAMETERS
 from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S, VehicleLinkState
 from mimopilot.sitl.mavlink.wire.signing import read_key
 from mimopilot.tuning.parameter_row import PREFIX
+
+#: s until a link that a reboot has ended must be back; chosen: a board takes 10 to appear on USB.
+REOPEN_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,11 @@ class LinkOptions:
     stem: Path = Path("vehicle")
 
 
+def open_link(options: LinkOptions) -> Connection:
+    """Open the link of the options."""
+    return Connection(options.connect, read_key(options.signing_key) if options.signing_key else None)
+
+
 class LinkSession:
     """A link to a vehicle, for an interactive command; its subclasses set `client`.
 
@@ -64,7 +73,7 @@ class LinkSession:
 
     def __init__(self, options: LinkOptions) -> None:
         self.options = options
-        self.link = Connection(options.connect, read_key(options.signing_key) if options.signing_key else None)
+        self.link = open_link(options)
         self.tries = max(1, round(options.timeout / TRY_S))
 
     def run(self, exchange: Exchange[T]) -> T:
@@ -115,7 +124,34 @@ class Session(LinkSession):
 
     def __init__(self, options: LinkOptions, integers: Collection[str] = ()) -> None:
         super().__init__(options)
-        self.client = ParameterClient(self.link.now(), self.tries, options.system, options.force_armed, integers)
+        self.integers = integers
+        self.client = self._new_client()
+
+    def _new_client(self) -> ParameterClient:
+        options = self.options
+        return ParameterClient(self.link.now(), self.tries, options.system, options.force_armed, self.integers)
+
+    def reconnect(self) -> None:
+        """Open the link again after it has ended, as a USB port does when the vehicle reboots; hear the vehicle.
+
+        Raises
+        ------
+        SitlError
+            When that is not possible within `REOPEN_S`, or Ctrl-C.
+        """
+        self.link.close()
+        deadline = time.monotonic() + REOPEN_S
+        while True:
+            try:
+                self.link = open_link(self.options)
+                break
+            except SitlError:
+                if time.monotonic() > deadline or self.client.interrupted:
+                    raise
+                time.sleep(TRY_S)
+        interrupted, self.client = self.client.interrupted, self._new_client()
+        self.client.interrupted = interrupted
+        self.run(self.client.await_heartbeat())
 
     def read(self, names: Sequence[str], profile: str = "") -> dict[str, float]:
         """Parameters of the vehicle, after it is identified and found to fit a profile."""

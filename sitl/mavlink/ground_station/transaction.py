@@ -130,7 +130,7 @@ def upload_and_verify(
             "a stock vehicle does not publish how many N m one unit of its torque is; give --moment-scale "
             "ROLL,PITCH,YAW, or --moment-scale flown if the gains come from a log of this vehicle"
         )
-    with open_session(options) as vehicle:
+    with open_session(options, plan.integers) as vehicle:
         held = vehicle.read([*plan.values, *plan.fixed, *(plan.scale if ask_scale else ())], plan.profile)
         _check_vehicle(plan, held, vehicle, options)
         if ask_scale and gains is not None:
@@ -179,12 +179,18 @@ def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session
         raise SitlError("the vehicle is armed: nothing was written; disarm it, or give --force-armed", exit_code=1)
 
 
-def _save_snapshot(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat, options: LinkOptions) -> Path:
-    """Write the old values to a new file: an older snapshot may be the only copy of its values."""
+def snapshot_path(options: LinkOptions) -> Path:
+    """Path of a new snapshot: that of the options, or the first free one of their stem."""
     path, number = options.snapshot, 0
     while path is None or path.exists():
         number += 1
         path = options.stem.with_name(f"{options.stem.name}.before-{number}.params")
+    return path
+
+
+def _save_snapshot(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat, options: LinkOptions) -> Path:
+    """Write the old values to a new file: an older snapshot may be the only copy of its values."""
+    path = snapshot_path(options)
     old = {name: held[name] for name in plan.values}
     write_atomically(path, parameter_text("qgc", old, vehicle.system, vehicle.component))
     if read_parameters(path) != old:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,12 @@ BLOCK = 15_000  # rows allocated at once: one minute at 250 Hz
 
 @dataclass(frozen=True)
 class _RecordedFlight:
-    """A flight that has ended: its file, its records, (N,), whether it was landed, (N,), and its gains, (36,)."""
+    """A flight that has ended: its file, its records, (N,), whether it was landed, (N,), and its parameters."""
 
     path: Path
     record: NDArray[Any]
     landed: NDArray[np.bool_]
-    gains: NDArray[np.float32]
+    parameters: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class FlightRecorder:
         The vehicle.
     Ts : float, s
         Control period.
+    make_log : callable
+        Makes a log, as `sitl.flight.flight_log.vehicle_log` does.
 
     Attributes
     ----------
@@ -69,11 +72,11 @@ class FlightRecorder:
         When no file can be written there.
     """
 
-    def __init__(self, path: Path, airframe: Airframe, Ts: float) -> None:
+    def __init__(self, path: Path, airframe: Airframe, Ts: float, make_log: Callable[..., bytes] = vehicle_log) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.is_dir() or not os.access(path.parent, os.W_OK):
             raise SitlError(f"--log {path}: a file cannot be written there; name a file in a folder of yours")
-        self.path, self.airframe, self.Ts = path, airframe, Ts
+        self.path, self.airframe, self.Ts, self.make_log = path, airframe, Ts, make_log
         self.flights = 0
         self.logs: list[StoredLog] = []
         self._unsaved: list[_RecordedFlight] = []
@@ -83,16 +86,16 @@ class FlightRecorder:
     def _forget(self) -> None:
         self._blocks: list[NDArray[Any]] = []
         self._landed: list[bool] = []
-        self._gains: NDArray[np.float32] | None = None
+        self._parameters: dict[str, float] | None = None
 
-    def begin(self, gains: NDArray[np.float32]) -> None:
-        """Begin a flight, with these gains, (36,)."""
+    def begin(self, parameters: Mapping[str, float]) -> None:
+        """Begin a flight, with these parameters, name -> value."""
         self._forget()
-        self._gains = gains.copy()
+        self._parameters = dict(parameters)
 
     def next_row(self, vehicle: Commander) -> Any:
         """Append a record, of `sitl.autopilot.autopilot.RECORD`, for the next period; the caller fills it."""
-        if self._gains is None:
+        if self._parameters is None:
             return self._spare[0]
         place = len(self._landed) % BLOCK
         if place == 0:
@@ -118,16 +121,16 @@ class FlightRecorder:
         OSError
             When a file cannot be written; its flight and the later ones are kept for the next call.
         """
-        if self._gains is not None and self._landed:
+        if self._parameters is not None and self._landed:
             self.flights += 1
             name = self.path if self.flights == 1 else self.path.with_stem(f"{self.path.stem}-{self.flights}")
             record = np.concatenate(self._blocks)[: len(self._landed)]
-            self._unsaved.append(_RecordedFlight(name, record, np.array(self._landed), self._gains))
+            self._unsaved.append(_RecordedFlight(name, record, np.array(self._landed), self._parameters))
         self._forget()
         written = []
         while self._unsaved:
             flight = self._unsaved[0]
-            content = vehicle_log(flight.record, flight.landed, self.Ts, self.airframe, flight.gains)
+            content = self.make_log(flight.record, flight.landed, self.Ts, self.airframe, flight.parameters)
             write_atomically(flight.path, content)
             # The checksum is computed now: it takes too long in flight.
             self.logs.append(StoredLog(flight.path, len(content), crc32(content), int(time.time())))

@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from mimopilot.sitl.autopilot.flight_modes import Denied, Failed, Refused, Severity
 from mimopilot.sitl.mavlink.vehicle.log_server import LogServer
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
+from mimopilot.sitl.mavlink.vehicle.px4_parameter_server import Px4ParameterServer
 from mimopilot.sitl.mavlink.vehicle.setpoint_messages import SetpointReceiver
 from mimopilot.sitl.mavlink.vehicle.small_protocols import PROTOCOLS
 from mimopilot.sitl.mavlink.vehicle.stations import BUDGET_S, Stations
@@ -28,7 +29,7 @@ class GroundStationLink:
 
     Parameters
     ----------
-    parameters : ParameterServer
+    parameters : ParameterServer or Px4ParameterServer
         Answers the parameter protocol.
     commands : VehicleCommands
         Executes commands.
@@ -42,7 +43,7 @@ class GroundStationLink:
 
     def __init__(
         self,
-        parameters: ParameterServer,
+        parameters: ParameterServer | Px4ParameterServer,
         commands: VehicleCommands,
         telemetry: Telemetry,
         stations: Stations,

@@ -25,11 +25,8 @@ from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
 from mimopilot.sitl.mavlink.wire.fast_codec import GPS, SENSOR, STATE
 from mimopilot.sitl.physics.state_estimate import MEASUREMENT_SIZE, euler_angles
-from mimopilot.tuning.parameters import PARAMETERS
 
 # All chosen:
-#: Place of the control period among the gains.
-PERIOD = [parameter.code for parameter in PARAMETERS].index("TS")
 PLANT_TIMEOUT_S = 0.9  # s without a frame before it is reported: within one second
 GROUND_PERIOD_S = 0.002  # s between reads of the ground stations' links, which are polled, not waited for
 CHILD_PERIOD_S = 0.2  # s between reads of our own plant process's messages
@@ -233,7 +230,7 @@ class Host:
         if self.log is None:
             return
         if armed:
-            self.log.begin(self.autopilot.controller.state["gains"][0])
+            self.log.begin(self.autopilot.parameters)
             return
         try:
             written = self.log.save()
@@ -249,11 +246,10 @@ class Host:
         found = {}
         if fault:
             found["controller"] = f"the controller rejects its inputs (fault {fault}) and only damps the rates"
-        gains = self.autopilot.controller.state["gains"][0]
-        for parameter, value in zip(PARAMETERS, gains.tolist(), strict=True):
-            if not parameter.minimum <= value <= parameter.maximum:
-                found["parameters"] = f"{parameter.name} is {value:g}, outside its range"
-        Ts, passed = float(gains[PERIOD]), self._periods - self._checked
+        problem = self.autopilot.parameter_problem()
+        if problem:
+            found["parameters"] = problem
+        Ts, passed = self.autopilot.gains.Ts, self._periods - self._checked
         period = (self.stamp - self._first) * 1e-6 / max(passed, 1)
         if passed >= CHECK_PERIODS and abs(period - Ts) > PERIOD_TOLERANCE * Ts and not fault:
             found["rate"] = f"the plant's period is {1e3 * period:.3g} ms, the gains are for {1e3 * Ts:.3g} ms"

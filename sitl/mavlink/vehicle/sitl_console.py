@@ -8,22 +8,30 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.excitation_injector import Injector
+from mimopilot.sitl.autopilot.px4_law import Px4Controller
+from mimopilot.sitl.autopilot.stock_autopilot import StockAutopilot
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.faults.inject_autopilot import AutopilotFaults
 from mimopilot.sitl.faults.inject_plant import check_fault
 from mimopilot.sitl.faults.kinds import Fault
+from mimopilot.sitl.flight.flight_log import vehicle_log
 from mimopilot.sitl.flight.scenario import Scenario
 from mimopilot.sitl.flight.scripted_pilot import ScriptedPilot
+from mimopilot.sitl.flight.stock_log import stock_log
 from mimopilot.sitl.mavlink.simulator_api.plant_link import PlantLink
 from mimopilot.sitl.mavlink.simulator_api.plant_process import PlantProcess
+from mimopilot.sitl.mavlink.vehicle.autotune_command import AutotuneCommand
 from mimopilot.sitl.mavlink.vehicle.flight_recorder import FlightRecorder
 from mimopilot.sitl.mavlink.vehicle.ground_station_link import GroundStationLink
 from mimopilot.sitl.mavlink.vehicle.host import Host
 from mimopilot.sitl.mavlink.vehicle.log_server import LogServer
 from mimopilot.sitl.mavlink.vehicle.parameter_server import ParameterServer
 from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
+from mimopilot.sitl.mavlink.vehicle.px4_parameter_server import Px4ParameterServer
 from mimopilot.sitl.mavlink.vehicle.stations import Stations
 from mimopilot.sitl.mavlink.vehicle.telemetry import Telemetry
 from mimopilot.sitl.mavlink.vehicle.torque_injection import TorqueInjection
@@ -63,6 +71,8 @@ class SitlOptions:
         Flown at once, without a ground station.
     faults : tuple of Fault
         In seconds from the first frame of the plant.
+    stock : bool
+        Fly a stock PX4's controllers in place of the generated one.
     """
 
     name: str
@@ -81,6 +91,7 @@ class SitlOptions:
     log: Path | None
     scenario: Scenario | None
     faults: tuple[Fault, ...]
+    stock: bool = False
 
 
 def run(options: SitlOptions) -> None:
@@ -118,28 +129,53 @@ def _assemble(options: SitlOptions, leaving: ExitStack) -> tuple[Host, GroundSta
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # end as on Ctrl-C: logs written, plant ended
     if link.child is not None:
         link.child.start()  # it starts while we compile
-    autopilot = Autopilot(options.airframe, gains)
+    stock = StockAutopilot(options.airframe, gains) if options.stock else None
+    autopilot = stock or Autopilot(options.airframe, gains)
     autopilot.warm_up()
-    log = FlightRecorder(options.log, options.airframe, gains.Ts) if options.log else None
+    make_log = vehicle_log if stock is None else stock_log
+    log = FlightRecorder(options.log, options.airframe, gains.Ts, make_log) if options.log else None
     host = Host(autopilot, link, log)
     leaving.callback(host.leave)
     if len(options.faults) > len(plant_faults):
         host.faults = AutopilotFaults(options.faults, gains.Ts, autopilot)
     telemetry = Telemetry(host.state)
     commands = VehicleCommands(host.vehicle, telemetry, host.reboot)
-    injector = Injector(gains.Ts)
-    host.excitation = TorqueInjection(injector, host.state)
+    store = ParameterStore(options.parameters) if options.parameters else None
+    server = _serve_parameters(host, gains, store) if stock is None else _serve_stock(host, stock, commands, store)
     if options.scenario is not None:
         host.pilot = pilot = ScriptedPilot(options.scenario)
         host.excitation = lambda now: pilot.moment
-    store = ParameterStore(options.parameters) if options.parameters else None
-    server = ParameterServer(autopilot.controller, gains, injector, store)
     leaving.callback(server.close)
     if server.summary:
         print(server.summary)
     if link.child is not None:
         link.child.wait()
     return host, GroundStationLink(server, commands, telemetry, stations, LogServer(log.logs if log else ()))
+
+
+def _serve_parameters(host: Host, gains: Gains, store: ParameterStore | None) -> ParameterServer:
+    """Our module's parameters and injector."""
+    injector = Injector(gains.Ts)
+    host.excitation = TorqueInjection(injector, host.state)
+    controller = host.autopilot.controller
+    assert not isinstance(controller, Px4Controller)
+    return ParameterServer(controller, gains, injector, store)
+
+
+def _serve_stock(
+    host: Host, autopilot: StockAutopilot, commands: VehicleCommands, store: ParameterStore | None
+) -> Px4ParameterServer:
+    """A stock PX4's parameters and autotune, and its identity."""
+    host.state.autopilot = mavlink.MAV_AUTOPILOT_PX4
+    host.excitation = autotune = AutotuneCommand(autopilot, host.state)
+    commands.handlers[mavlink.MAV_CMD_DO_AUTOTUNE_ENABLE] = autotune.execute
+
+    def reboot() -> None:
+        host.reboot()
+        autopilot.boot()
+
+    commands.reboot = reboot
+    return Px4ParameterServer(autopilot, store)
 
 
 def _check_faults(options: SitlOptions) -> list[Fault]:

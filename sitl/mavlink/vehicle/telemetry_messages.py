@@ -57,7 +57,7 @@ def heartbeat(s: VehicleState) -> Any:
         status = mavlink.MAV_STATE_BOOT
     elif vehicle.armed and vehicle.in_failsafe:
         status = mavlink.MAV_STATE_CRITICAL
-    kind, mode = (mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_GENERIC), custom_mode(vehicle.mode)
+    kind, mode = (mavlink.MAV_TYPE_QUADROTOR, s.autopilot), custom_mode(vehicle.mode)
     return mavlink.MAVLink_heartbeat_message(*kind, base, mode, status, MAVLINK_VERSION)
 
 

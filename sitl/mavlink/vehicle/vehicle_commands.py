@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import common as mavlink
 
@@ -75,8 +75,15 @@ class Command:
         return round(value)
 
 
-#: A command's handler: returns the messages to send after the acknowledgement; may raise `Refused`.
-Handler = Callable[[Command], list[Any]]
+class Progress(NamedTuple):
+    """An acknowledgement with its MAV_RESULT and progress, %."""
+
+    result: int
+    percent: int
+
+
+#: A command's handler: returns the messages to send after the acknowledgement, or this; may raise `Refused`.
+Handler = Callable[[Command], list[Any] | Progress]
 
 
 class VehicleCommands:
@@ -114,8 +121,8 @@ class VehicleCommands:
         """Execute a command; return its acknowledgement and the messages that follow it."""
         sender = message.get_srcSystem(), message.get_srcComponent()
 
-        def acknowledge(result: int) -> Any:
-            return mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, *sender)
+        def acknowledge(result: int, percent: int = 0) -> Any:
+            return mavlink.MAVLink_command_ack_message(message.command, result, percent, 0, *sender)
 
         handler = self.handlers.get(message.command)
         if handler is None:
@@ -126,7 +133,7 @@ class VehicleCommands:
             if not isinstance(refusal, Unsupported):
                 self.vehicle.say(Severity.WARNING, str(refusal))
             return [acknowledge(RESULTS[type(refusal)])]
-        return [acknowledge(mavlink.MAV_RESULT_ACCEPTED), *more]
+        return [acknowledge(*more)] if isinstance(more, Progress) else [acknowledge(mavlink.MAV_RESULT_ACCEPTED), *more]
 
     def set_mode(self, message: Any) -> list[Any]:
         """Execute SET_MODE, the deprecated message; it has no acknowledgement."""

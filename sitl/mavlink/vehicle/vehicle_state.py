@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.autopilot.autopilot import RECORD
 from mimopilot.sitl.autopilot.flight_modes import Commander
@@ -40,6 +41,8 @@ class VehicleState:
         0 roll, 1 pitch, 2 between two axes, 3 yaw, -1 off.
     excitation_turn : float, rad
         Since yaw's excitation began.
+    autopilot : int
+        MAV_AUTOPILOT that the vehicle reports.
     """
 
     vehicle: Commander
@@ -51,6 +54,7 @@ class VehicleState:
     home: tuple[int, ...] = ()
     load: float = 0.0
     excitation_phase: int = -1
+    autopilot: int = mavlink.MAV_AUTOPILOT_GENERIC
     excitation_turn: float = 0.0
 
     @property

@@ -11,6 +11,7 @@ from mimopilot.sitl.errors import SitlError
 
 #: param_type of a float32.
 REAL32: int = mavlink.MAV_PARAM_TYPE_REAL32
+INT32: int = mavlink.MAV_PARAM_TYPE_INT32
 
 
 def single(value: float) -> float:

@@ -6,26 +6,29 @@ truncated file, with half a gain matrix, is detected.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from mimopilot.common.files import sha256
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.codec import COMPONENT, SYSTEM
-from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest
+from mimopilot.sitl.mavlink.wire.float32 import INT32, REAL32, shortest
 from mimopilot.tuning.logs.parameter_file import read_parameter_file
 
 
-def _qgc(values: Mapping[str, float], system: int, component: int) -> str:
-    lines = [f"{system}\t{component}\t{name}\t{shortest(value)}\t{REAL32}" for name, value in values.items()]
+def _qgc(values: Mapping[str, float], system: int, component: int, integers: Collection[str]) -> str:
+    lines = [
+        f"{system}\t{component}\t{name}\t{shortest(value)}\t{INT32 if name in integers else REAL32}"
+        for name, value in values.items()
+    ]
     return "\n".join(["# Vehicle-Id\tComponent-Id\tName\tValue\tType", *lines, ""])
 
 
-def _mavproxy(values: Mapping[str, float], system: int, component: int) -> str:
+def _mavproxy(values: Mapping[str, float], system: int, component: int, integers: Collection[str]) -> str:
     return "".join(f"{name:<16} {shortest(value)}\n" for name, value in values.items())
 
 
-def _mission_planner(values: Mapping[str, float], system: int, component: int) -> str:
+def _mission_planner(values: Mapping[str, float], system: int, component: int, integers: Collection[str]) -> str:
     return "".join(f"{name},{shortest(value)}\n" for name, value in values.items())
 
 
@@ -34,7 +37,12 @@ FORMATS = {"qgc": _qgc, "mavproxy": _mavproxy, "missionplanner": _mission_planne
 
 
 def parameter_text(
-    form: str, values: Mapping[str, float], system: int = SYSTEM, component: int = COMPONENT, checksum: bool = True
+    form: str,
+    values: Mapping[str, float],
+    system: int = SYSTEM,
+    component: int = COMPONENT,
+    checksum: bool = True,
+    integers: Collection[str] = (),
 ) -> str:
     """Text of a parameter file.
 
@@ -48,8 +56,10 @@ def parameter_text(
         The vehicle's identity; only QGroundControl's files hold it.
     checksum : bool
         Begin with the checksum line; False for a file that is meant to be edited.
+    integers : collection of str
+        Names of INT32 parameters; only QGroundControl's files hold the type.
     """
-    body = FORMATS[form](values, system, component)
+    body = FORMATS[form](values, system, component, integers)
     first = f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n" if checksum else ""
     return first + body
 
@@ -62,14 +72,14 @@ def read_parameters(path: Path) -> dict[str, float]:
     InputFileError, TuningError
         See `tuning.logs.parameter_file.read_parameter_file`.
     SitlError
-        When a parameter is no float: only these can be written.
+        When a parameter is neither a float nor an INT32: only these can be written.
     """
     values: dict[str, float] = {}
     for name, found in read_parameter_file(path).items():
-        if found.kind not in (None, REAL32):
+        if found.kind not in (None, INT32, REAL32):
             raise SitlError(
-                f"{path}, line {found.line}: {name}: param_type {found.kind}, expected {REAL32}; "
-                "delete the line, only floats can be written"
+                f"{path}, line {found.line}: {name}: param_type {found.kind}, expected {REAL32} "
+                f"or {INT32}; delete the line, only floats and INT32 can be written"
             )
         values[name] = found.value
     return values

@@ -1,6 +1,12 @@
 """The attitude studies of chapter 6 with few seeds: the same rules."""
 
 import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,6 +35,7 @@ from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.sitl.studies.expectations import expectations
 from mimopilot.sitl.studies.printed_figures import printed_figures
 from mimopilot.sitl.studies.reproduce import ALL, STUDIES, reproduce
+from tests.conftest import run_here
 
 PRINTED = json.loads(TABLES.read_text())
 SEEDS = 3
@@ -60,9 +67,14 @@ FITTED = ("adam0-sim-thesis", "adam0-thesis", "adam0-perturbed-thesis", "antr-th
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
+def fitted_folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fitted")
+
+
+@pytest.fixture(scope="module")
+def fitted(fitted_folder):
     """The studies on the airframes that are fitted to the thesis."""
-    every = computed(FITTED, tmp_path_factory.mktemp("fitted"))
+    every = computed(FITTED, fitted_folder)
     return {name: statistics_of(name, every) for name in FITTED}
 
 
@@ -268,3 +280,44 @@ def test_a_benchmark_has_its_own_report(tmp_path):
     found = reproduce("numerical-example", tmp_path)
     assert found.report == tmp_path / "numerical-example.html"
     assert set(found.figures) == {"numerical-example"}
+
+
+def test_a_study_goes_on_where_it_was_and_ends_at_once_on_ctrl_c(fitted, fitted_folder, tmp_path, capsys):
+    """One run is kept; the others are killed; the report has the same bytes as that of uninterrupted runs."""
+    out, seeds = tmp_path / "out", ("--seeds", str(SEEDS))
+    command = [sys.executable, "-m", "mimopilot", "reproduce", "antr-thesis", *seeds, "--workers", "2"]
+    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(
+        [*command, "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed
+    )
+    deadline = time.monotonic() + 300
+    while not list((out / "parts").glob("antr-thesis-*.part")):
+        assert time.monotonic() < deadline
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.02)
+    begin = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    _, message = process.communicate(timeout=60)
+    assert time.monotonic() - begin < 2.0
+    assert process.returncode == 130
+    lines = message.splitlines()
+    assert lines[0] == "mimopilot reproduce antr-thesis: 0 of 4 done, 0 s"
+    assert lines[-1].startswith("mimopilot: interrupted after ")
+    kept = {path: path.stat().st_mtime_ns for path in (out / "parts").iterdir()}
+    assert not list(out.glob("*.html"))
+    # In another folder: the runs of the fixture, which was not interrupted.
+    whole = tmp_path / "whole"
+    shutil.copytree(fitted_folder / "parts", whole / "parts")
+    resumed, uninterrupted = (reproduce("antr-thesis", folder, SEEDS, workers=2) for folder in (out, whole))
+    shown = capsys.readouterr().err
+    assert f"reproduce antr-thesis: {len(kept)} of 4 done, 0 s" in shown
+    assert "4 of 4 done" not in shown
+    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
+    assert resumed.report.read_bytes() == uninterrupted.report.read_bytes()
+    assert resumed.figures == uninterrupted.figures
+    # Fewer seeds: their runs are there already.
+    fewer = run_here(tmp_path, "reproduce", "antr-thesis", "--seeds", 2, "--out", "whole", "--json")
+    assert "2 of 3 done, 0 s" in fewer.stderr
+    study = json.loads(fewer.stdout)["antr-thesis"]
+    assert study["seeds"] == 2
+    assert study["comparison"][0]["name"] == "SISO Kp_o(1,1)"

@@ -1,9 +1,4 @@
 import json
-import signal
-import subprocess
-import sys
-import time
-from functools import partial
 
 import numpy as np
 import pytest
@@ -123,42 +118,6 @@ def test_figure_5_2_shows_every_run_and_their_mean():
     inputs[:, 1] = 1.0
     loop = LoopController({"P": gains[1, 0], "I": gains[1, 1]}, Filters(0.1))
     assert steps[1] == pytest.approx(closed_loop(task.plant, loop).simulate(inputs)[:, 2])
-
-
-def test_a_study_goes_on_where_it_was_and_ends_at_once_on_ctrl_c(mimopilot, tmp_path):
-    """Two runs are kept; the rest is killed; the report has the same bytes as without an interruption."""
-    arguments = ("reproduce", "antr-thesis", "--seeds", "4", "--workers", "2")
-    heed = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    command = [sys.executable, "-m", "mimopilot", *arguments, "--out", str(tmp_path / "out")]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=heed)
-    deadline = time.monotonic() + 300
-    while len(list((tmp_path / "out" / "parts").glob("antr-thesis-*.part"))) < 2:
-        assert time.monotonic() < deadline
-        assert process.poll() is None, process.stderr.read()
-        time.sleep(0.02)
-    begin = time.monotonic()
-    process.send_signal(signal.SIGINT)
-    _, message = process.communicate(timeout=60)
-    assert time.monotonic() - begin < 2.0
-    assert process.returncode == 130
-    lines = message.splitlines()
-    assert lines[0] == "mimopilot reproduce antr-thesis: 0 of 5 done, 0 s"
-    assert lines[-1].startswith("mimopilot: interrupted after ")
-    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "out" / "parts").iterdir()}
-    assert not list((tmp_path / "out").glob("*.html"))
-    resumed = mimopilot(*arguments, "--out", "out")
-    assert resumed.returncode == 0, resumed.stderr
-    assert f"reproduce antr-thesis: {len(kept)} of 5 done, 0 s" in resumed.stderr
-    assert all(path.stat().st_mtime_ns == when for path, when in kept.items())
-    whole = mimopilot(*arguments, "--out", "whole", "--json")
-    assert (tmp_path / "out" / "antr-thesis.html").read_bytes() == (
-        tmp_path / "whole" / "antr-thesis.html"
-    ).read_bytes()
-    # Fewer seeds: their runs are there already.
-    fewer = mimopilot("reproduce", "antr-thesis", "--seeds", "2", "--out", "out", "--json")
-    assert "2 of 3 done, 0 s" in fewer.stderr
-    assert json.loads(fewer.stdout)["antr-thesis"]["seeds"] == 2
-    assert json.loads(whole.stdout)["antr-thesis"]["comparison"][0]["name"] == "SISO Kp_o(1,1)"
 
 
 def test_the_command_prints_one_json_object_and_refuses_an_unknown_study(mimopilot):

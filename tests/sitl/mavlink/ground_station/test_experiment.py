@@ -10,9 +10,10 @@ import pytest
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SetParameter, run_exchange
-from mimopilot.sitl.mavlink.ground_station.experiment_console import ExcitationOptions, settings
+from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
+from mimopilot.sitl.mavlink.ground_station.experiments.module_injector import INTEGERS, excite, start_monitor
+from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import injector_settings
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
-from mimopilot.sitl.mavlink.ground_station.vehicle_experiment import INTEGERS, excite, start_monitor
 from mimopilot.tuning.logs.reader import read_log
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
@@ -20,7 +21,7 @@ from tests.sitl.mavlink.running import PATIENCE_S, Pilot, running_sitl, start
 from tests.sitl.mavlink.scripted_vehicle import SimulatedLink
 
 CHOICE = ExcitationOptions("both", 8.0, 0.2, 50.0, 3, "hold", 25.0)
-WANTED = settings(CHOICE, 0.004)
+WANTED = injector_settings(CHOICE, 0.004)
 PLANNED = 2 * 8.0 + 1.0
 
 
@@ -57,10 +58,10 @@ def test_a_complete_experiment_restores_all_settings(integers, loss):
 
 def test_all_three_axes_are_excited_one_after_the_other():
     vehicle = FlyingVehicle()
-    wanted = settings(replace(CHOICE, axis="all", yaw_amplitude=0.3), 0.004)
+    wanted = injector_settings(replace(CHOICE, axis="all", yaw_amplitude=0.3), 0.004)
     result, _ = experiment(vehicle, wanted=wanted)
     assert (result.complete, result.restored) == (True, True)
-    assert result.seconds == pytest.approx(3 * 8.0 + 2 * 1.0, abs=0.2)
+    assert result.seconds == pytest.approx(3 * 8.0 + 2 * 1.0, abs=0.3)  # messages at 10 Hz
     moments = np.array(vehicle.moments)
     assert np.abs(moments).max(axis=0) == pytest.approx([0.2, 0.2, 0.3])
     assert np.count_nonzero(moments, axis=0).tolist() == [400, 400, 400]
@@ -173,7 +174,7 @@ def test_the_injection_is_not_started_if_a_setting_is_refused():
 )
 def test_settings_out_of_range_are_refused_before_sending(change, parts):
     with pytest.raises(SitlError, match=parts):
-        settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
+        injector_settings(ExcitationOptions(**{**vars(CHOICE), **change}), 0.004)
 
 
 # The commands, against `mimopilot sitl`.
@@ -193,7 +194,7 @@ def test_an_experiment_over_mavlink_produces_a_log_for_tuning(tmp_path, mimopilo
     with running_sitl("--speed", "4", "--log", log) as sitl:
         pilot = hovering_pilot(sitl)
         link = ("--connect", f"tcp:127.0.0.1:{sitl.tcp}", "--yes")
-        done = mimopilot("experiment", *link, "--seconds-per-axis", 12)
+        done = mimopilot("experiment", *link, "--seconds-per-axis", 9)
         assert done.returncode == 0, done.stderr
         assert "mimopilot tune LOG" in done.stdout
         wrong = mimopilot("experiment", *link, "--mode", "position")
@@ -206,7 +207,7 @@ def test_an_experiment_over_mavlink_produces_a_log_for_tuning(tmp_path, mimopilo
         pilot.close()
     flown = read_log(log)
     excited = [np.flatnonzero(signal) for signal in (*flown.u_bar.T, flown.yaw.u_bar)]
-    assert [len(samples) * flown.Ts for samples in excited] == pytest.approx([12.0, 12.0, 12.0])
+    assert [len(samples) * flown.Ts for samples in excited] == pytest.approx([9.0, 9.0, 9.0])
     assert excited[2][0] - excited[1][-1] == 251  # 1 s pause
     assert flown.yaw.segments == ((excited[2][0], len(flown.u)),)
     assert flown.Ts == 0.004
@@ -227,7 +228,7 @@ def test_ctrl_c_in_the_client_restores_the_settings_and_the_vehicle_hovers_on():
         client.end()
         pilot.link.mav.param_request_list_send(1, 1)
         values = {}
-        while len(values) < 47:
+        while len(values) < 48:
             message = pilot.asks("PARAM_VALUE")
             values[message.param_id] = message.param_value
         assert values["MIMO_EX_AMP"] == pytest.approx(0.1)

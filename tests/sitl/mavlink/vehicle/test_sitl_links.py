@@ -66,7 +66,7 @@ def test_two_stations_by_udp_and_tcp_see_each_others_changes_and_only_their_own_
         for pilot in (first, second):
             pilot.link.mav.param_request_list_send(1, 1)
         for pilot in (first, second):
-            assert {pilot.asks("PARAM_VALUE").param_index for _ in range(47)} == set(range(47))
+            assert {pilot.asks("PARAM_VALUE").param_index for _ in range(48)} == set(range(48))
         first.close()
         second.close()
 
