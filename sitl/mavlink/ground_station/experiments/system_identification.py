@@ -108,11 +108,16 @@ class SystemIdentification(ExperimentProfile):
 
     def _set(self, client: ParameterClient, store: bool) -> Exchange[dict[str, float]]:
         """Set all parameters; returns those that were changed."""
-        old = values_of((yield from read_known(client, [*self.wanted, LOG_BITMASK])))
-        new = self.wanted | {LOG_BITMASK: float(round(old[LOG_BITMASK]) | FAST_LOG)}
+        first = values_of((yield from read_known(client, [SID_AXIS, LOG_BITMASK])))
+        new = {SID_AXIS: self.wanted[SID_AXIS], LOG_BITMASK: float(round(first[LOG_BITMASK]) | FAST_LOG)}
+        self.remember(first)
+        yield from set_values(client, new, first, store)
+        # The others do not exist while SID_AXIS is 0.
+        others = {name: value for name, value in self.wanted.items() if name != SID_AXIS}
+        old = values_of((yield from read_known(client, list(others))))
         self.remember(old)
-        yield from set_values(client, new, old, store)
-        return {name: value for name, value in new.items() if value != old[name]}
+        yield from set_values(client, others, old, store)
+        return {name: value for name, value in (new | others).items() if value != (first | old)[name]}
 
     def check(self, session: VehicleSession) -> FlightMonitor:
         """Check that the vehicle hovers in Stabilize in calm air."""
@@ -221,8 +226,12 @@ class SystemIdentification(ExperimentProfile):
         return reason
 
     def restore(self, session: VehicleSession) -> Restoration:
-        """Write all old values back."""
-        return Restoration(session.run(write_back(session.client, self.old)) if self.old else {})
+        """Write all old values back, SID_AXIS last: where it is 0, the others do not exist."""
+        left: dict[str, float] = {}
+        for names in (self.old.keys() - {SID_AXIS}, self.old.keys() & {SID_AXIS}):
+            old = {name: self.old[name] for name in sorted(names)}
+            left |= session.run(write_back(session.client, old)) if old else {}
+        return Restoration(left)
 
 
 def drifted(monitor: FlightMonitor, altitude: float) -> str:

@@ -68,6 +68,19 @@ def test_a_prepared_px4_is_not_rebooted_again():
     assert vehicle.reboots == 0
 
 
+def test_a_px4_that_cannot_restart_itself_is_rebooted_by_hand():
+    vehicle = StockPx4({30.0: StockPx4.reboot}, denies=True)
+    profile, _ = profile_of("px4-stock", vehicle)
+    assert profile.prepare(SimulatedSession(vehicle, profile.integers)).rebooted
+    assert (vehicle.reboots, vehicle.module is None) == (1, False)
+    never = StockPx4(denies=True)
+    profile, _ = profile_of("px4-stock", never)
+    session = SimulatedSession(never, profile.integers)
+    with pytest.raises(SitlError, match="not seen to reboot within 180 s; it refuses the command"):
+        profile.prepare(session)
+    assert profile.restore(session).complete
+
+
 def test_an_autotune_that_the_firmware_does_not_start_is_found_by_its_parameters_and_all_goes_back():
     vehicle = StockPx4(starts=False)
     profile, _ = profile_of("px4-stock", vehicle)
