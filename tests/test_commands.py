@@ -23,7 +23,7 @@ from tests.paths import PACKAGES, TOP
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
     *("fly", "faults", "campaign", "replay", "sitl", "plant", "convert", "upload", "restore", "params"),
-    *("import-params", "logs"),
+    *("import-params", "logs", "doctor"),
 ]
 
 

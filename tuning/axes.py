@@ -80,7 +80,8 @@ def law_of(gains: Gains, count: int, yaw_unit: float = 1.0) -> Law:
         scalar = getattr(gains.yaw, name) if name in YAW_GAINS else 0.0
         yaw = np.array([[scalar / yaw_unit if name.endswith("_i") else scalar]])
         matrices[name] = yaw if count == 1 else block_diag(getattr(gains, name), yaw)
-    return AxesLaw(**matrices, filters=replace(gains.filters, model_omega=0.0))
+    filters = replace(gains.filters, model_omega=0.0).on(slice(2, 3) if count == 1 else slice(0, 3), yaw_unit)
+    return AxesLaw(**matrices, filters=filters)
 
 
 def flown_law(experiment: Experiment) -> Law | None:
@@ -112,7 +113,7 @@ def yaw_axis(experiment: Experiment) -> Experiment:
 
 
 def excited_yaw(experiment: Experiment) -> tuple[Experiment, NDArray[np.float64]]:
-    """The yaw axis in the part of a flight that excites it, and its external signal, (N, 1).
+    """The yaw axis in the stretches of a flight that excite it, and its external signal, (N, 1).
 
     Raises
     ------
@@ -128,6 +129,7 @@ def excited_yaw(experiment: Experiment) -> tuple[Experiment, NDArray[np.float64]
         ) from None
     if name == "r_o":
         _check_setpoint(axis)
+    # The noise elsewhere is another: the vehicle's own, or what the excitation of roll and pitch causes.
     return replace(axis, segments=tuple(excited_segments(axis.segments, signal[:, 0]))), signal
 
 

@@ -130,7 +130,7 @@ class ReportedFlight:
             "excitation": self._excited(),
             "used": self.found.parts,
             "saturated": self._saturated(),
-            "crash": intersection(self.tumbles, self.airborne),
+            "crash": intersection(self.tumbles, self.airborne) if logged else self.tumbles,
             "gaps": self._gaps(),
         }
 
