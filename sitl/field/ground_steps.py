@@ -11,7 +11,7 @@ from mimopilot.common.files import sha256
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_report import write_autotune_report
 from mimopilot.sitl.field.autotune_run import ANSWER_S, CHECK, FLIGHT, GAINS, SNAPSHOT, AutotuneRun, Decided
-from mimopilot.sitl.field.check_flight import check_flight
+from mimopilot.sitl.field.check_flight import check_flight, yaw_model
 from mimopilot.sitl.field.flight_watch import start_watch
 from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, old_plan, save_snapshot, write_set
 from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
@@ -228,6 +228,9 @@ def judge(run: AutotuneRun) -> Found:
     """
     flight, gains = run.experiment(CHECK), load_gains(run.file(GAINS))
     _check_flown(run, flight)
+    if yaw_model(gains) is not None and flight.yaw is None:
+        why = "; ".join(flight.warnings) or "it is not logged"
+        run.dialogue.tell(f"yaw is not compared with its prediction: {why}")
     result = check_flight(flight, run.experiment(FLIGHT), gains)
     run.dialogue.show_check(result)
     write_autotune_report(run, gains, result)
