@@ -25,6 +25,13 @@ as-imported:
 	@rm -rf $(AS_IMPORTED) && mkdir -p $(AS_IMPORTED) && ln -s $(CURDIR)/mimopilot/* $(AS_IMPORTED) \
 	&& ln -s $(CURDIR)/tuning $(CURDIR)/codegen $(CURDIR)/sitl $(AS_IMPORTED)
 
+# The package on every Python that there is: built, installed outside of the tree, and used.
+PYTHONS ?= python3.11 python3.12 python3.13
+pythons: $(VENV)/.installed-test
+	@for python in $(PYTHONS); do \
+		if $$python -c "" 2>/dev/null; then $(BIN)/python -m tests.package $$python || exit 1; \
+		else echo "$$python: not here"; fi; done
+
 lint: $(VENV)/.installed-test as-imported
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -47,4 +54,4 @@ $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 clean:
 	rm -rf $(VENV) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-.PHONY: demo test lint bench clean cross as-imported
+.PHONY: demo test lint bench clean cross as-imported pythons

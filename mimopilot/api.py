@@ -123,8 +123,9 @@ def tune(
     -------
     Gains
         With their certificate, standard deviations and warnings. `provenance.details` holds the predicted figures of
-        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``; for a stock controller also
-        what our module's would do, ``worth_of_off_diagonals``.
+        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``; those of yaw in ``yaw``, or why
+        its gains are kept: ``kept``; for a stock controller also what our module's would do,
+        ``worth_of_off_diagonals``.
 
     Raises
     ------

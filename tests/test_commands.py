@@ -3,11 +3,8 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
-import zipfile
-from pathlib import Path
 
 import pytest
 from pyulog import ULog
@@ -18,12 +15,12 @@ from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.ulog_file import open_ulog
 from mimopilot.tuning.reference_model import SecondOrder
 from tests.conftest import assert_one_clear_line, run_here
-from tests.paths import PACKAGES, TOP
+from tests.paths import TOP
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
     *("fly", "faults", "campaign", "replay", "sitl", "plant", "convert", "upload", "restore", "params"),
-    *("import-params", "logs"),
+    *("import-params", "logs", "doctor"),
 ]
 
 
@@ -234,37 +231,6 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path, monkeypatch):
         write_atomically(path, "new")
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["x"]
-
-
-def test_the_wheel_holds_every_file_that_is_not_python(tmp_path):
-    copy = tmp_path / "source"
-    copy.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(TOP / name, copy)
-    for folder in PACKAGES.values():
-        shutil.copytree(folder, copy / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
-    build = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "-w",
-        str(tmp_path),
-        str(copy),
-    ]
-    subprocess.run(build, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    held = set(zipfile.ZipFile(wheel).namelist())
-    wanted = {
-        (Path(package.replace(".", "/")) / path.relative_to(folder)).as_posix()
-        for package, folder in PACKAGES.items()
-        for path in folder.rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    }
-    assert wanted <= held
 
 
 def test_the_demo_runs_the_whole_workflow(mimopilot, tmp_path):

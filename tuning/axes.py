@@ -113,7 +113,7 @@ def yaw_axis(experiment: Experiment) -> Experiment:
 
 
 def excited_yaw(experiment: Experiment) -> tuple[Experiment, NDArray[np.float64]]:
-    """The yaw axis in the part of a flight that excites it, and its external signal, (N, 1).
+    """The yaw axis in the stretches of a flight that excite it, and its external signal, (N, 1).
 
     Raises
     ------
@@ -129,6 +129,7 @@ def excited_yaw(experiment: Experiment) -> tuple[Experiment, NDArray[np.float64]
         ) from None
     if name == "r_o":
         _check_setpoint(axis)
+    # The noise elsewhere is another: the vehicle's own, or what the excitation of roll and pitch causes.
     return replace(axis, segments=tuple(excited_segments(axis.segments, signal[:, 0]))), signal
 
 

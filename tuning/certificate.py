@@ -75,6 +75,8 @@ class Certificate:
         0, ``disk_margin``, and by axis ``gain_margin_db``, ``gain_margin`` (``exact``, ``at least``, ``not known``),
         ``phase_margin_deg``, ``phase_margin_error_deg`` (two standard errors), ``delay_margin_ms``;
         ``simultaneous_gain_db`` and ``simultaneous_phase_deg`` for all axes at once. Empty if they were not computed.
+        They are those of roll and pitch, or of all three axes where the cross terms of yaw matter. ``yaw``: verdict,
+        reason, band and the same figures of yaw alone. ``cross_terms``: see `tuning.analysis.cross_terms.CrossTerms`.
     band : tuple of 2 float, rad/s
         Lowest and highest frequency at which the response is known.
     thresholds : mapping

@@ -43,6 +43,11 @@ def gains_from_toml(text: str, where: str) -> Gains:
 
 def _gains(table: dict[str, Any], where: str) -> Gains:
     schema = table.get("schema")
+    if isinstance(schema, int) and not isinstance(schema, bool) and schema > SCHEMA:
+        raise TuningError(
+            f"{where}: schema: got {schema}, this version of mimopilot knows up to {SCHEMA}: the file is from a later "
+            "one; update mimopilot"
+        )
     if isinstance(schema, bool) or schema not in (1, SCHEMA):
         raise TuningError(
             f"{where}: schema: got {shown(schema)}, expected {SCHEMA} (or 1, an older one); not a mimopilot gains file?"

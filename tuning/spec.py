@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
+from mimopilot.common.errors import InputFileError
 from mimopilot.common.toml import checked, read_toml
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
 from mimopilot.tuning.errors import TuningError
@@ -192,6 +193,8 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
         When the file cannot be read, is not TOML, or has an unknown or invalid entry.
     """
     table = read_toml(path, "specification") if path is not None else {}
+    if "schema" in table and "roll_pitch" in table:
+        raise InputFileError(f"{path}: is a gains file, expected a specification; leave out --spec")
     table |= {name: value for name, value in overrides.items() if value is not None}
     return checked(TuningSpec, table, str(path or "specification"))
 

@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 
 #: Tilt beyond which the experiment on a vehicle stops, degrees: that of the injector's own parameter, MIMO_EX_TILT.
 TILT_DEG = 28.0
+#: Of the excitation, chosen: length on each axis (s), bandwidth (rad/s).
+SECONDS, BANDWIDTH = 20.0, 50.0
+#: Profiles whose vehicle has an exciter of its own.
+STOCK = ("px4-stock", "ardupilot-stock")
 #: Vehicles that are named when several were lost.
 NAMED = 5
 
@@ -86,16 +90,21 @@ def experiment(
             show_default="all",
         ),
     ] = None,
-    seconds_per_axis: Annotated[float, typer.Option(help="Length of the excitation on each axis, s.")] = 20.0,
+    seconds_per_axis: Annotated[
+        float | None, typer.Option(help="Length of the excitation on each axis, s.", show_default="20")
+    ] = None,
     amplitude: Annotated[
         float | None,
-        typer.Option(help="Of the torque on roll and pitch (normalised); 0.15, or less if the motors would saturate."),
+        typer.Option(
+            help="Of the torque on roll and pitch (normalised); 0.15, or less if the motors would saturate. With "
+            "--profile px4-stock: of the rate setpoint, rad/s (1.5)."
+        ),
     ] = None,
     yaw_amplitude: Annotated[
         float | None,
         typer.Option(help="Of the torque on yaw; 0.3 (a vehicle: 0.2), or less if the motors would saturate."),
     ] = None,
-    bandwidth: Annotated[float, typer.Option(help="Of the injected torque, rad/s.")] = 50.0,
+    bandwidth: Annotated[float | None, typer.Option(help="Of the injected torque, rad/s.", show_default="50")] = None,
     seed: SeedOption = 0,
     runs: Annotated[
         int | None,
@@ -151,6 +160,12 @@ def experiment(
             excitation_seed=excitation_seed,
             both_axes=both_axes or None,
         )
+        own: dict[str, object] = {"seed": seed or None, "yaw_amplitude": yaw_amplitude}
+        if profile == "px4-stock":
+            own |= {"seconds_per_axis": seconds_per_axis, "bandwidth": bandwidth}
+        elif profile == "ardupilot-stock":
+            own |= {"mode": mode}
+        check_not_given(f"not with --profile {profile}, whose excitation has none", **own if profile in STOCK else {})
         excite_vehicle(
             LinkOptions(
                 connect, system, timeout, signing_key, force_armed=True, yes=yes, as_json=as_json, snapshot=snapshot
@@ -158,9 +173,9 @@ def experiment(
             profile or "mimo",
             ExcitationOptions(
                 axis=axis,
-                seconds_per_axis=seconds_per_axis,
+                seconds_per_axis=SECONDS if seconds_per_axis is None else seconds_per_axis,
                 amplitude=amplitude,
-                bandwidth=bandwidth,
+                bandwidth=BANDWIDTH if bandwidth is None else bandwidth,
                 seed=seed,
                 mode=mode or "hold",
                 tilt_deg=TILT_DEG if tilt_deg is None else tilt_deg,
@@ -180,9 +195,9 @@ def experiment(
     plan = ExperimentPlan(
         body,
         controller,
-        seconds_per_axis,
+        SECONDS if seconds_per_axis is None else seconds_per_axis,
         strength,
-        bandwidth,
+        BANDWIDTH if bandwidth is None else bandwidth,
         excitation_seed,
         both_axes,
         axis or "all",

@@ -93,7 +93,7 @@ def print_cross_terms(figures: Mapping[str, Any]) -> None:
         print(f"cross terms of yaw: not known: {cross['reason']}")
         return
     size = (
-        f"at most {cross['share']:.0%} +- {cross['share_error']:.0%} of a {cross['from']} torque's effect goes to "
+        f"at most {cross['share']:.1%} +- {cross['share_error']:.1%} of a {cross['from']} torque's effect goes to "
         f"{cross['to']} (at {cross['omega']:.1f} rad/s)"
         if cross["measured"]
         else "none above its error"

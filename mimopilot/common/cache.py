@@ -21,6 +21,11 @@ def cache_folder() -> Path:
     return Path(_temporary().name)
 
 
+def is_temporary(folder: Path) -> bool:
+    """Whether a cache folder is deleted at exit: no usual one is private."""
+    return _temporary.cache_info().currsize > 0 and folder == Path(_temporary().name)
+
+
 @lru_cache(maxsize=1)
 def _temporary() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="mimopilot-")

@@ -29,10 +29,10 @@ def write_images(charts: Sequence[Chart], folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for chart in charts:
-        figure = chart_figure(chart)
-        picture = io.BytesIO()
+        figure, picture = chart_figure(chart), io.BytesIO()
+        drawing = svg(figure, chart.name)  # which also computes the layout, once for both
         figure.savefig(picture, format="png", dpi=PIXELS_PER_INCH, metadata={"Software": None})
-        for suffix, content in ((".png", picture.getvalue()), (".svg", svg(chart_figure(chart), chart.name))):
+        for suffix, content in ((".png", picture.getvalue()), (".svg", drawing)):
             path = inside(folder, chart.name + suffix)
             write_atomically(path, content)
             written.append(path)

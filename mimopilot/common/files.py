@@ -13,6 +13,12 @@ from mimopilot.common.errors import InputFileError
 
 #: Largest text file that a user may give, bytes. The largest expected one, a full parameter file, has some 60 kB.
 MAX_TEXT_BYTES = 1 << 20
+#: First bytes of files that are given by mistake where a text file is expected.
+BINARIES = {
+    b"ULog\x01\x12\x35": "a flight log (ULog)",
+    b"\xa3\x95": "a flight log (dataflash)",
+    b"MATLAB 5.0": "a MATLAB file",
+}
 
 
 def read_bytes(path: Path, what: str) -> bytes:
@@ -39,7 +45,11 @@ def read_bytes(path: Path, what: str) -> bytes:
                 raise InputFileError(f"{path}: cannot read the {what}: it is {kind}; give a regular file")
             content = stream.read(MAX_TEXT_BYTES + 1)
     except OSError as error:
-        raise InputFileError(f"{path}: cannot read the {what}: {error.strerror or error}") from error
+        reason = missing_target(path) or error.strerror or error
+        raise InputFileError(f"{path}: cannot read the {what}: {reason}") from error
+    for begin, kind in BINARIES.items():
+        if content.startswith(begin):
+            raise InputFileError(f"{path}: cannot read the {what}: it is {kind}, expected text")
     if len(content) > MAX_TEXT_BYTES:
         size = max(status.st_size, len(content))
         raise InputFileError(
@@ -47,6 +57,18 @@ def read_bytes(path: Path, what: str) -> bytes:
             "file?"
         )
     return content
+
+
+def missing_target(path: Path) -> str:
+    """What a link to nothing leads to, as the reason in a message; empty for anything else."""
+    try:
+        path.stat()
+    except FileNotFoundError:
+        if path.is_symlink():
+            return f"it is a link to {path.readlink()}, which does not exist"
+    except OSError:
+        pass
+    return ""
 
 
 def read_text(path: Path, what: str) -> str:

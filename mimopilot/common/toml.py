@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import date, time
+from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 import numpy as np
 from pydantic import BaseModel, ValidationError
@@ -121,17 +122,37 @@ def checked(model: type[Model], table: Mapping[str, Any], where: str) -> Model:
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        raise InputFileError(f"{where}: {complaint(error)}") from error
+        raise InputFileError(f"{where}: {complaint(error, model)}") from error
 
 
-def complaint(error: ValidationError) -> str:
-    """The first error that pydantic found, in one line."""
+def complaint(error: ValidationError, model: type[BaseModel]) -> str:
+    """The first error that pydantic found in a table for `model`, in one line; for an unknown entry a similar one."""
     first = error.errors()[0]
     field = ".".join(str(part) for part in first["loc"])
     message = first["msg"].removeprefix("Value error, ")
+    if first["type"] == "extra_forbidden":
+        return f"{shown_text(field)}: unknown entry; {_meant(first['loc'], model)}"
     if first["type"] == "missing":  # its input is then the table, not a value
         return f"{shown_text(field)}: {message}"
     return f"{shown_text(field)}: {message}, got {shown(first.get('input'))}" if field else message
+
+
+def _meant(place: Sequence[str | int], model: type[BaseModel]) -> str:
+    """Which entry was perhaps meant instead of an unknown one, else all that are known there."""
+    known: Sequence[str] = ()
+    holder: Any = model
+    for step in place[:-1]:  # to the model of the table that holds the entry
+        field = getattr(holder, "model_fields", {}).get(step)
+        parts = () if field is None else (field.annotation, *get_args(field.annotation))
+        holder = next((part for part in parts if hasattr(part, "model_fields")), None)
+    if holder is not None:
+        known = sorted(holder.model_fields)
+    # Without regard to case: close names differ in it, too.
+    by_lower = {name.lower(): name for name in known}
+    close = get_close_matches(str(place[-1]).lower(), by_lower, n=1)
+    if close:
+        return f"did you mean {by_lower[close[0]]}?"
+    return f"known: {', '.join(known)}" if known else "leave it out"
 
 
 def shown(value: Any) -> str:

@@ -177,5 +177,7 @@ class Px4Controller:
             s[field] = [p[f"MC_{axis}RATE_{letter}"] * p[f"MC_{axis}RATE_K"] for axis in AXES]
         s["rate_ff"] = [p[f"MC_{axis}RATE_FF"] for axis in AXES]
         s["integral_max"] = [p[name] for name in INTEGRAL_LIMITS]
-        s["derivative_alpha"] = _alpha(p["IMU_DGYRO_CUTOFF"], self.Ts)
+        cutoff = p["IMU_DGYRO_CUTOFF"]
+        # PX4 switches this filter off from half the rate on.
+        s["derivative_alpha"] = _alpha(cutoff, self.Ts) if cutoff < 0.5 / self.Ts else 1.0
         s["yaw_alpha"] = _alpha(p["MC_YAW_TQ_CUTOFF"], self.Ts)

@@ -231,7 +231,7 @@ def make_fault(table: dict[str, Any], where: str) -> Fault:
     try:
         return Fault.model_validate(table)
     except ValidationError as error:
-        raise SitlError(f"{where}: {complaint(error)}") from error
+        raise SitlError(f"{where}: {complaint(error, Fault)}") from error
 
 
 def parse_fault(text: str) -> Fault:

@@ -24,7 +24,7 @@ def test_only_a_regular_file_of_bounded_size_is_read(tmp_path, monkeypatch):
         "pipe": "it is a pipe",
         "folder": "Is a directory",
         "loop": "symbolic links",
-        "dangling": "No such file",
+        "dangling": "does not exist",
         "device": "it is a device",
         "socket": "No such device",
         "sparse": "10737418240 bytes, expected at most 1048576",

@@ -75,16 +75,19 @@ class Vehicle:
         matrix, size = self.loop(gains, axes)
         return float(np.abs(np.linalg.eigvals(matrix[:size, :size])).max())
 
-    def peak(self, gains, axes=slice(0, 3), yaw_unit=1.0):
-        """Ms: largest singular value of the sensitivity at the torques, that of yaw in a unit."""
-        omega = np.geomspace(0.1, np.pi / TS * 0.999, 4000)
+    def peak(self, gains, axes=slice(0, 3)):
+        """Ms: largest singular value of the sensitivity at the torques; of yaw's in the unit that makes it least."""
+        omega = np.geomspace(0.1, np.pi / TS * 0.999, 2000)
         G_i, G_o = (G[:, axes, axes] for G in self.response(omega))
         whole = law_of(gains, 3)
         of_r, of_y = law.rate_response(_rate_matrices(whole, axes), whole.filters, omega)
-        unit = np.array([1.0, 1.0, yaw_unit])[axes]
         L = of_y @ G_i + of_r @ whole.Kp_o[axes, axes] @ G_o
-        L = L * unit / unit[:, None]
-        return float(1 / np.linalg.svd(np.eye(L.shape[1]) + L, compute_uv=False).min())
+        least = np.full(len(omega), np.inf)
+        for unit in np.geomspace(1e-3, 1e3, 121) if len(L[0]) == 3 else (1.0,):
+            scale = np.array([1.0, 1.0, unit])[axes]
+            scaled = np.eye(len(scale)) + L * scale / scale[:, None]
+            least = np.minimum(least, 1 / np.linalg.svd(scaled, compute_uv=False)[:, -1])
+        return float(least.max())
 
     def fly(self, gains, count=1, seconds=12.0, amplitude=(0.1, 0.1, 0.2), bandwidth=(50.0, 50.0, 25.0), seed=0):
         """Flights that excite roll, pitch and yaw one after the other, as experiments."""

@@ -1,10 +1,10 @@
 """What yaw does to roll and pitch and they to yaw: its size, and the loop of all three axes with it.
 
 The controller has no gains between yaw and the others. With L_d the loop without the cross terms and X = L - L_d,
-det(I + L) = det(I + L_d) det(I + S_d X), S_d = (I + L_d)^-1. Where sigma_max(S_d X) is small the loop's encirclements
-are those of its blocks, and its sensitivity differs by little. Else det(I + L) / det(I + L_d) must not encircle 0, and
-the sensitivity is that of all three axes. The yaw torque has a unit in which all torques are alike, see
-`tuning.plant.plant_estimates.PlantEstimates.yaw_unit`.
+det(I + L) = det(I + L_d) det(I + S_d X), S_d = (I + L_d)^-1. S_d X has a block A from yaw and a block B to yaw. With
+the yaw torque in the unit in which both are of one size (see `tuning.analysis.margins.balanced`) sigma_max(S_d X) is
+(|A| |B|)^(1/2). Where that is small, the loop's encirclements are those of its blocks, and its sensitivity differs by
+little. Else det(I + L) / det(I + L_d) must not encircle 0, and the sensitivity is that of all three axes.
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.plant.frequency_response import DRAWS, MIN_FREQUENCIES, PlantResponse
 from mimopilot.tuning.plant.rigid_body_fit import continued_below, rigid_body
 from mimopilot.tuning.reference_model import ReferenceModel
-from mimopilot.tuning.small_matrices import singular_values
 
-#: sigma_max(S_d X), error included, above which the cross terms count: below it they change the sensitivity by at most
+#: (|A| |B|)^(1/2), errors included, above which the cross terms count: below it they change the sensitivity by at most
 #: a ninth, as much as the certificate's own errors.
 MATTERS = 0.1
 #: Deviations that a cross term exceeds to be called measured: the largest of 4 elements at 50 frequencies exceeds them
@@ -58,7 +57,7 @@ class CrossTerms:
     omega : float, rad/s
         Where.
     effect : float
-        Largest sigma_max(S_d X), error (two standard deviations) included.
+        Largest (|A| |B|)^(1/2), errors (two standard deviations) included.
     verdict : Verdict
         Of the loop with the cross terms, as far as they change it; ``certified`` if they do not matter.
     reason : str
@@ -139,16 +138,19 @@ def _largest_share(known: PlantResponse) -> tuple[float, float, bool, str, str, 
 
 
 def _effect(law: Law, plant: PlantResponse) -> float:
-    """Largest sigma_max(S_d X), error included; below the band of the fitted body, whose error is small there."""
+    """Largest (|A| |B|)^(1/2), errors included; below the band of the fitted body, whose error is small there."""
     _, L, _ = whole_loop(law, plant)
     S_d: Complex = np.linalg.inv(np.eye(3) + np.where(CROSS, 0, L)).astype(np.complex128)
     _, C_o, C_y = cascade_response(law, plant.omega)
     # S_d has no cross terms, so those of S_d times the error of L are S_d times those of the error.
     rows = np.linalg.norm(S_d @ (C_y @ plant.rate_residual() + C_o @ plant.angle_residual()), axis=2)
     deviation = rows[:, :, None] * np.linalg.norm(plant.reach, axis=1)[:, None, :]
-    error = np.linalg.norm(np.where(CROSS, deviation, 0), axis=(1, 2))
-    cross: Complex = S_d @ np.where(CROSS, L, 0)
-    return float(np.max(singular_values(cross)[0] + error))
+    cross = S_d @ np.where(CROSS, L, 0)
+    sizes = [
+        np.linalg.norm(cross[block], axis=1) + np.sqrt(2) * np.linalg.norm(deviation[block], axis=1)
+        for block in (np.s_[:, :2, 2], np.s_[:, 2, :2])
+    ]
+    return float(np.sqrt(np.max(sizes[0] * sizes[1])))
 
 
 def _encirclements(loop: CascadeLoop) -> tuple[int, int]:

@@ -9,15 +9,35 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop
 from mimopilot.tuning.axes import axis_names
+from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.small_matrices import inverse, singular_values
+
+#: Smallest cross term: avoids a division by 0.
+SMALLEST = 1e-12
 
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
 
 def sensitivity(loop: CascadeLoop) -> Complex:
-    """S = (I + L_u)^-1 at the plant's input, (K, n, n)."""
-    return inverse(np.eye(loop.L_u.shape[-1]) + loop.L_u)
+    """S = (I + L_u)^-1 at the plant's input, (K, n, n); that of three axes `balanced`."""
+    S = inverse(np.eye(loop.L_u.shape[-1]) + loop.L_u)
+    return balanced(S) if S.shape[-1] == len(AXES) else S
+
+
+def balanced(S: Complex) -> Complex:
+    """S of three axes with the yaw torque in the unit, at each frequency, in which both cross terms are of one size.
+
+    No margin depends on the unit of a torque, but singular values do: in another unit a coupling of one direction
+    alone, which changes no margin, would look like a thin one. D S D^-1 bounds the structured singular value from above
+    (A. Packard, J. Doyle, "The complex structured singular value", Automatica 29, 1993).
+    """
+    to_yaw, from_yaw = np.linalg.norm(S[:, 2, :2], axis=1), np.linalg.norm(S[:, :2, 2], axis=1)
+    unit = np.sqrt(np.maximum(from_yaw, SMALLEST) / np.maximum(to_yaw, SMALLEST))
+    scaled = S.copy()
+    scaled[:, 2, :2] *= unit[:, None]
+    scaled[:, :2, 2] /= unit[:, None]
+    return scaled
 
 
 def peak(S: Complex) -> float:

@@ -36,7 +36,6 @@ from mimopilot.tuning.spec import TuningSpec
 YAW_BANDWIDTHS = (1.0, 1.12, 1.25, 1.4, 1.6, 1.8, 2.0, 2.24, 2.5, *BANDWIDTHS)
 #: Share of the rate loop's bandwidth that a starting point's attitude gain has.
 ATTITUDE_SHARE = 1 / 3
-GIVEN = "given in the specification"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +90,6 @@ def tune_yaw(measured: Sequence[PlantEstimates], spec: TuningSpec, base: Gains, 
     fastest : float, rad/s
         Largest bandwidth: that of roll and pitch.
     """
-    if spec.yaw is not None:
-        return YawTuning(base.yaw, {"kept": GIVEN})
     excited, reasons = _excited(measured)
     if not excited:
         return YawTuning(base.yaw, {"kept": "; ".join(dict.fromkeys(reasons))})

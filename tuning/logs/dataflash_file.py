@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.tuning.logs.recording import listed
+from mimopilot.tuning.logs.recording import INCOMPLETE, listed
 
 HEAD = b"\xa3\x95"
 FMT, FMT_LENGTH = 0x80, 89  # message that defines the others; its own layout is in AP_Logger's LogStructure.h
@@ -131,7 +131,7 @@ def open_dataflash(path: Path) -> DataflashFile:
     if unread:
         damage.append(f"the format of {listed(unread)} is unknown or damaged; these messages are not read")
     if at < end:
-        damage.append("the file ends inside a message: the download is incomplete or power was lost")
+        damage.append(INCOMPLETE)
     return DataflashFile(
         content,
         {names[number].name: names[number] for number in used},

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mimopilot.common.files import sha256
+from mimopilot.common.files import missing_target, sha256
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, manoeuvre_size
 from mimopilot.tuning.logs.columns import Columns
@@ -17,7 +17,7 @@ from mimopilot.tuning.logs.flight_phase import flying_parts
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.logs.formats import FORMATS, known_formats, log_format
 from mimopilot.tuning.logs.log_checks import check_angles, check_log
-from mimopilot.tuning.logs.recording import Recording
+from mimopilot.tuning.logs.recording import INCOMPLETE, Recording
 from mimopilot.tuning.logs.resample import Interval, on_common_grid
 from mimopilot.tuning.logs.yaw import yaw_intervals, yaw_signals
 from mimopilot.tuning.motors import Motors, fit_motors, saturation_warnings
@@ -58,7 +58,10 @@ def open_log(path: Path, columns: Columns | None = None) -> Recording:
         When the format is not known or the file is damaged.
     """
     if not path.is_file():
-        raise TuningError(f"{path}: no such file; give the path of a flight log: {known_formats()}")
+        reason = missing_target(path) or ("it is a folder" if path.is_dir() else "no such file")
+        raise TuningError(f"{path}: {reason}; give the path of a flight log: {known_formats()}")
+    if path.suffix == ".toml":
+        raise TuningError(f"{path}: a TOML file (gains, airframe, specification), expected {known_formats()}")
     found, head = log_format(path)
     if found is None:
         raise TuningError(f"{path}: not a flight log: it begins with {head[:8]!r}; known formats: {known_formats()}")
@@ -100,6 +103,11 @@ def unchecked_experiment(recording: Recording) -> Experiment:
 
 
 def _with_warnings(error: TuningError, warnings: Sequence[str]) -> TuningError:
+    """The error with the log's warnings; an incomplete file is the cause, so it comes first."""
+    cut = next((warning for warning in warnings if INCOMPLETE in warning), "")
+    if cut:
+        where, _, reason = str(error).partition(": ")
+        return TuningError(f"{where}: {cut}; fetch it again. In what is left: {reason}")
     return TuningError(f"{error} (warnings about the log: {'; '.join(warnings)})") if warnings else error
 
 

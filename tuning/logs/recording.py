@@ -14,6 +14,9 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.resample import REQUIRED, Interval, Series, monotone
 
+#: Damage of a log that ends too early.
+INCOMPLETE = "the file ends inside a message: the download is incomplete or power was lost"
+
 #: Largest plausible magnitude of a signal: torque (normalised), rad/s, rad. Gyros saturate at 35 rad/s (2000 deg/s).
 #: y_o in degrees passes here, so that `check_angles` can name the wrong unit.
 RANGES = {"u": 5.0, "u_bar": 5.0, "y_i": 100.0, "r_i": 100.0, "r_bar": 100.0, "y_o": 400.0, "r_o": 2 * np.pi}

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.logs.recording import listed
+from mimopilot.tuning.logs.recording import INCOMPLETE, listed
 
 FIRST = 16  # bytes of the file header; the first message follows
 KINDS = b"ABCDFILMOPQRS"
@@ -137,7 +137,7 @@ class UlogFile:
                 f"damaged: the format of {listed(sorted(self._undefined))} is not defined; these topics are not read"
             )
         if at < end:
-            damage.append("the file ends inside a message: the download is incomplete or power was lost")
+            damage.append(INCOMPLETE)
         self.damage = "; ".join(damage)
 
     def _message_end(self, at: int) -> int:

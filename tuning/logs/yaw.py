@@ -82,8 +82,8 @@ def yaw_signals(grid: Grid, experiment: Experiment, recording: Recording) -> tup
     if "r_o" in signals:
         signals["r_o"] = _near(signals["r_o"], signals["y_o"], grid.yaw_segments)
     yaw = YawSignals(**signals, segments=grid.yaw_segments)
-    wrong = _heading_fault(yaw, experiment, recording) or _injection_fault(yaw, recording)
-    wrong = wrong or _torque_fault(yaw, grid.Ts, recording)
+    wrong = _heading_fault(yaw, experiment, recording) or _torque_fault(yaw, grid.Ts, recording)
+    wrong = wrong or _injection_fault(yaw, recording)
     return (None, [f"yaw is left out: {wrong}"]) if wrong else (yaw, [])
 
 
@@ -161,7 +161,9 @@ def _injection_fault(yaw: YawSignals, recording: Recording) -> str:
         if share < CONTAINED:
             return (
                 f"{_name(whole, recording)} does not contain what was injected, {_name(part, recording)} "
-                f"({share:.2f} of it, expected 1): log both at full rate"
+                f"({share:.2f} of it, expected 1): "
+                f"{'one has the wrong sign' if share < -CONTAINED else 'log both at full rate'}"
+                f"{_correction(part, 'sign', recording) if share < -CONTAINED else ''}"
             )
     return ""
 

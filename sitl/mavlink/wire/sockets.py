@@ -8,6 +8,8 @@ from mimopilot.sitl.errors import SitlError
 
 #: Default address: reachable from this machine only.
 LOOPBACK = "127.0.0.1"
+#: Linux lets only root bind lower ports.
+PRIVILEGED = 1024
 
 
 def listen(host: str, port: int, backlog: int = 1, option: str = "--port") -> socket.socket:
@@ -25,10 +27,8 @@ def listen(host: str, port: int, backlog: int = 1, option: str = "--port") -> so
         server.listen(backlog)
     except OSError as error:
         server.close()
-        raise SitlError(
-            f"TCP port {port} on {host} cannot be used: {error.strerror or error}; is another simulator "
-            f"running? Choose another port with {option}"
-        ) from error
+        advice = f"is another simulator running? Choose another port with {option}"
+        raise _refused("TCP", host, port, error, advice) from error
     return server
 
 
@@ -47,6 +47,12 @@ def udp_socket(
         link.bind((host, port))
     except OSError as error:
         link.close()
-        raise SitlError(f"UDP port {port} on {host} cannot be used: {error.strerror or error}; {advice}") from error
+        raise _refused("UDP", host, port, error, advice) from error
     link.setblocking(False)
     return link
+
+
+def _refused(protocol: str, host: str, port: int, error: OSError, advice: str) -> SitlError:
+    if isinstance(error, PermissionError) and port < PRIVILEGED:
+        advice = f"ports below {PRIVILEGED} are reserved for the system; choose one above"
+    return SitlError(f"{protocol} port {port} on {host} cannot be used: {error.strerror or error}; {advice}")

@@ -157,7 +157,7 @@ def test_impossible_draws_are_repeated_and_counted_and_an_impossible_specificati
         ("mass = { uniform = [2, 1] }", "mass: uniform: expected [low, high]"),
         ("mass = { loguniform = [0, 1] }", "mass: loguniform: expected bounds above 0"),
         ("wind = { north = { normal = [1, 1], relative = true } }", "wind: the airframe has no value of its own"),
-        ("weight = { normal = [1, 1] }", "weight: Extra inputs"),
+        ("weight = { normal = [1, 1] }", "weight: unknown entry"),
         ("mass = ", "not a TOML file"),
     ],
 )

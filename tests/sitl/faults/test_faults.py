@@ -196,7 +196,7 @@ def test_a_scenario_file_flies_as_the_same_options_on_the_command_line(mimopilot
     ("change", "words"),
     [
         (("doublet", "loop"), ("manoeuvre", "'loop'")),
-        (("amplitude_deg", "amplitude"), ("amplitude", "Extra inputs")),
+        (("amplitude_deg", "amplitude"), ("amplitude", "unknown entry")),
         (("= 15", "= 90"), ("got 90 degrees",)),
         (("motor = 3", "engine = 3"), ("fault 1", "engine")),
         (("size = 0.2", "size = 2"), ("fault 2", "0 to 1 (probability)")),

@@ -27,7 +27,7 @@ from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterCl
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, SimulatedLink
 
 HOLD = 4 << 16 | 3 << 24
-ACCEPTED, REJECTED, FAILED, IN_PROGRESS = 0, 1, 4, 5
+ACCEPTED, REJECTED, DENIED, FAILED, IN_PROGRESS = 0, 1, 2, 4, 5
 BOOT_S = 4.0
 
 
@@ -92,20 +92,26 @@ class StockVehicle(ScriptedVehicle):
 
 
 class StockPx4(StockVehicle):
-    """PX4 v1.16. `starts`: its start script starts the module."""
+    """PX4 v1.16. `starts`: its start script starts the module; `denies`: it cannot restart itself, as in simulation."""
 
     whole = frozenset({"MC_AT_EN", "MC_AT_APPLY", "MC_AT_START", "SDLOG_PROFILE"})
 
-    def __init__(self, then=None, starts=True, **values):
+    def __init__(self, then=None, starts=True, denies=False, **values):
         first = {"MC_AT_EN": 0, "MC_AT_APPLY": 1, "MC_AT_SYSID_AMP": 0.7, "MC_AT_START": 0, "SDLOG_PROFILE": 1}
         super().__init__(12, HOLD, first | values, then)
-        self.starts, self.module, self.stick = starts, None, 0.0
+        self.starts, self.denies, self.module, self.stick = starts, denies, None, 0.0
         self.signal, self.runs = [], 0
         self.boot()
 
     def boot(self):
         self.values["MC_AT_START"] = 0.0
         self.module = AutotuneModule(self.values) if self.values["MC_AT_EN"] and self.starts else None
+
+    def reboot(self):
+        self.booted, self.reboots = self.now + BOOT_S, self.reboots + 1
+        self.stepped = self.booted
+        self.asked = set()
+        self.boot()
 
     def place(self, name):
         return UNKNOWN_INDEX if self.module is None and name in OF_THE_AUTOTUNE else super().place(name)
@@ -114,10 +120,9 @@ class StockPx4(StockVehicle):
         if number == 246:
             if self.armed:
                 return (REJECTED,)
-            self.booted, self.reboots = self.now + BOOT_S, self.reboots + 1
-            self.stepped = self.booted
-            self.asked = set()
-            self.boot()
+            if self.denies:
+                return (DENIED,)
+            self.reboot()
             return (ACCEPTED,)
         assert number == 212
         state = State.IDLE if self.module is None else self.module.state
@@ -154,6 +159,10 @@ class StockCopter(StockVehicle):
         }
         super().__init__(3, 0, first | values, then)
         self.chirps = []
+
+    def answer(self, order):
+        hidden = self.values["SID_AXIS"] == 0 and getattr(order, "name", "") in self.values
+        return [] if hidden and order.name.startswith("SID_") and order.name != "SID_AXIS" else super().answer(order)
 
     def command(self, number, params):
         assert (number, params[0]) == (176, 1)

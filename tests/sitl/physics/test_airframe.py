@@ -45,7 +45,7 @@ def test_an_unknown_airframe_lists_the_known_ones():
         ("mass = 1.45", "mass = -1", "mass: Input should be greater than 0"),
         ("mass = 1.45", "", "mass: Field required"),
         ("mass = 1.45", "mass = nan", "mass: .*"),
-        ("drag = 0.3", "drag = 0.3\ncolour = 'red'", "colour: Extra inputs"),
+        ("drag = 0.3", "drag = 0.3\ncolour = 'red'", "colour: unknown entry"),
         ('"ccw"', '"up"', "direction"),
         ("[0.0172, 0.0016, 0.0]", "[0.0172, 0.5, 0.0]", "symmetric"),
         ("mass = 1.45", "mass = = 1", "not a TOML file"),

@@ -186,3 +186,39 @@ def write_csv(path, columns, delimiter=","):
     lines = [delimiter.join(f"{value:.9g}" for value in row) for row in rows]
     path.write_text("\n".join([delimiter.join(columns), *lines]) + "\n")
     return path
+
+
+@dataclass(frozen=True)
+class YawFlight:
+    """Signals (N,) of yaw in the samples of a `Flight`: torque, rad/s, rad, and the injected part of the torque."""
+
+    u: np.ndarray
+    y_i: np.ndarray
+    y_o: np.ndarray
+    u_bar: np.ndarray
+
+
+#: Of yaw for a unit of torque, rad/s^2.
+YAW_ACCELERATION = 10.0
+
+
+def turning(flight, begin=-np.inf, end=np.inf, heading=3.0):
+    """Yaw of a flight that holds a heading (rad), with a torque of random sign injected from `begin` to `end` (s)."""
+    t, Ts = flight.t, flight.t[1] - flight.t[0]
+    hold = max(1, round(0.2 / Ts))
+    signs = np.random.default_rng(2).choice([-0.2, 0.2], len(t) // hold + 1).repeat(hold)[: len(t)]
+    u_bar = np.where((t >= begin) & (t < end), signs, 0.0)
+    u, y_i, y_o = np.zeros((3, len(t)))
+    y_o[0] = heading
+    for k in range(1, len(t)):
+        y_i[k] = y_i[k - 1] + Ts * YAW_ACCELERATION * u[k - 1]
+        y_o[k] = y_o[k - 1] + Ts * (y_i[k] + y_i[k - 1]) / 2
+        u[k] = 0.3 * (1.5 * (heading - y_o[k]) - y_i[k]) + u_bar[k]
+    # The body turns about the vertical: its rate and the heading are those at the small tilt of this flight.
+    rate = (y_i * np.cos(flight.y_o[:, 1]) - flight.y_i[:, 1] * np.sin(flight.y_o[:, 0])) / np.cos(flight.y_o[:, 0])
+    return YawFlight(u, rate, y_o, u_bar)
+
+
+def wrapped(angle):
+    """Angle from -pi to pi, as logs hold a heading."""
+    return np.remainder(angle + np.pi, 2 * np.pi) - np.pi

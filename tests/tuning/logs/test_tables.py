@@ -84,7 +84,7 @@ def test_other_names_units_and_signs_are_converted(tmp_path, flight):
     ("text", "words"),
     [
         ('thrust = { column = "T" }', "thrust: not a signal; known signals: t, u_roll"),
-        ('p = { column = "gx", units = "deg/s" }', "p.units: Extra inputs"),
+        ('p = { column = "gx", units = "deg/s" }', "p.units: unknown entry"),
         ('p = { unit = "deg" }', "p.unit: Input should be 'rad/s' or 'deg/s'"),
         ('t = { unit = "min" }', "t.unit"),
         ('p = { column = "gyro", index = 0 }', "p.index: Input should be greater than or equal to 1"),

@@ -29,7 +29,7 @@ from mimopilot.sitl.mavlink.wire.px4_modes import nav_state
 from mimopilot.tuning.parameters import EXCITATION
 
 #: Message -> (number, interval in us) that the vehicle is requested to stream.
-STREAMS = {**FLIGHT_STREAMS, "DEBUG_VECT": (250, 100_000)}
+STREAMS = {"ATTITUDE": FLIGHT_STREAMS["ATTITUDE"], "DEBUG_VECT": (250, 100_000), **FLIGHT_STREAMS}
 # Times and limits are chosen, unless a source is given.
 PARAMETER_UPDATE_S = 1.5  # PX4 applies changed parameters once a second
 START_TIMEOUT_S = 5.0  # from the write to the first pulse

@@ -52,12 +52,13 @@ FAST_LOG = 1 | 2  # fast and medium attitude: SystemID then logs every loop
 #: --axis -> values of SID_AXIS: mixer roll, pitch, yaw.
 AXES = {"roll": (10,), "pitch": (11,), "yaw": (12,), "both": (10, 11), "all": (10, 11, 12)}
 STABILIZE, SYSTEM_ID = 0, 25  # ArduCopter's mode numbers
-DELAY_S = 1.0  # from the mode change to the chirp (SYSTEM_ID_DELAY)
+DELAY_S = 1.0  # s, from the mode change to the chirp (SYSTEM_ID_DELAY)
 # Chosen:
 START_HZ = 0.4  # two cycles of it begin the chirp; attitude loops are slower than their tuned crossover, 1 to 2 Hz
 #: The chirp ends at this multiple of the bandwidth: it has no power beyond, unlike the PRBS of our injector.
 STOP_BANDWIDTHS = 2.0
 FADE_IN_S, FADE_OUT_S = 5.0, 1.0  # the two cycles at the start; a short end without a step
+AFTER_S = 0.5  # s in the mode after the chirp, in which the response fades
 ALTITUDE_BAND = 5.0  # m, above and below the start, that the pilot may drift before the experiment is stopped
 MODE_TIMEOUT_S, SETTLE_S, END_MARGIN_S = (
     5.0,
@@ -98,8 +99,9 @@ class SystemIdentification(ExperimentProfile):
             "SID_T_FADE_OUT": FADE_OUT_S,
         }
         self.wanted = {SID_AXIS: float(self.axes[0])} | {name: single(value) for name, value in values.items()}
-        #: s, from the mode change until ArduCopter reports the end.
-        self.planned = DELAY_S + options.seconds_per_axis + values["SID_T_FADE_IN"] + constant + FADE_OUT_S
+        #: s, from the mode change. ArduCopter reports the end later by the fades and the first two cycles, in which its
+        #: log shows no injection any more.
+        self.planned = DELAY_S + options.seconds_per_axis + AFTER_S
 
     def prepare(self, session: VehicleSession) -> Preparation:
         """Set the chirp's parameters and fast logging; ArduCopter needs no reboot for them."""
@@ -108,11 +110,16 @@ class SystemIdentification(ExperimentProfile):
 
     def _set(self, client: ParameterClient, store: bool) -> Exchange[dict[str, float]]:
         """Set all parameters; returns those that were changed."""
-        old = values_of((yield from read_known(client, [*self.wanted, LOG_BITMASK])))
-        new = self.wanted | {LOG_BITMASK: float(round(old[LOG_BITMASK]) | FAST_LOG)}
+        first = values_of((yield from read_known(client, [SID_AXIS, LOG_BITMASK])))
+        new = {SID_AXIS: self.wanted[SID_AXIS], LOG_BITMASK: float(round(first[LOG_BITMASK]) | FAST_LOG)}
+        self.remember(first)
+        yield from set_values(client, new, first, store)
+        # The others do not exist while SID_AXIS is 0.
+        others = {name: value for name, value in self.wanted.items() if name != SID_AXIS}
+        old = values_of((yield from read_known(client, list(others))))
         self.remember(old)
-        yield from set_values(client, new, old, store)
-        return {name: value for name, value in new.items() if value != old[name]}
+        yield from set_values(client, others, old, store)
+        return {name: value for name, value in (new | others).items() if value != (first | old)[name]}
 
     def check(self, session: VehicleSession) -> FlightMonitor:
         """Check that the vehicle hovers in Stabilize in calm air."""
@@ -221,8 +228,12 @@ class SystemIdentification(ExperimentProfile):
         return reason
 
     def restore(self, session: VehicleSession) -> Restoration:
-        """Write all old values back."""
-        return Restoration(session.run(write_back(session.client, self.old)) if self.old else {})
+        """Write all old values back, SID_AXIS last: where it is 0, the others do not exist."""
+        left: dict[str, float] = {}
+        for names in (self.old.keys() - {SID_AXIS}, self.old.keys() & {SID_AXIS}):
+            old = {name: self.old[name] for name in sorted(names)}
+            left |= session.run(write_back(session.client, old)) if old else {}
+        return Restoration(left)
 
 
 def drifted(monitor: FlightMonitor, altitude: float) -> str:

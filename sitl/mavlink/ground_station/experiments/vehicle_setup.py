@@ -11,7 +11,6 @@ from mimopilot.sitl.mavlink.ground_station.events import CommandAck, Exchange, H
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import VehicleSession
 from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
     FLIGHT_STREAMS,
-    POLL_S,
     STREAM_TIMEOUT_S,
     FlightMonitor,
     request_status,
@@ -25,6 +24,8 @@ from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
 
 #: From the command to reboot until the vehicle must be back, s; chosen: a Pixhawk with many sensors takes 20.
 BOOT_S = 60.0
+#: The same where the user has to reboot it, and between two looks whether it is back, s; chosen.
+HAND_S, LOOK_S = 180.0, 1.0
 #: Tries for a parameter that a vehicle may lack: at 30 % loss each way one answer in 3000 is missed.
 PROBE_TRIES = 12
 
@@ -158,24 +159,28 @@ def reboot(session: VehicleSession, monitor: FlightMonitor) -> FlightMonitor:
     SitlError
         If it refuses, or does not come back.
     """
-    before, begin = monitor.clock, session.client.now
-    ack = session.run(_command_reboot(session.client, monitor))
-    if ack is not None and ack.result != mavlink.MAV_RESULT_ACCEPTED:
+    before, begin, ack = monitor.clock, session.client.now, session.run(_command_reboot(session.client, monitor))
+    by_hand = ack is not None and ack.result in (mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED)
+    if ack is not None and ack.result != mavlink.MAV_RESULT_ACCEPTED and not by_hand:
         why = f": {monitor.text}" if monitor.text else ""
         raise SitlError(f"the vehicle refuses to reboot (MAV_RESULT {ack.result}){why}; reboot it by hand", exit_code=1)
-    deadline = begin + BOOT_S
-    while session.client.now < deadline and not session.client.interrupted:
+    # A firmware that cannot restart itself, as PX4 in simulation, is restarted by the user.
+    timeout, phase = (HAND_S, "reboot the vehicle by hand now") if by_hand else (BOOT_S, "rebooting")
+    while session.client.now < begin + timeout and not session.client.interrupted:
         if session.client.closed:
             session.reconnect()
             before = session.client.now - begin  # on a link that has ended, the vehicle's clock must be younger
+        session.client.progress(phase, round(session.client.now - begin), round(timeout))
         monitor = session.run(request_streams(session.client, FLIGHT_STREAMS))
         if not monitor.overdue(STREAM_TIMEOUT_S) and monitor.clock < before:
             return monitor
-        session.run(wait(session.client, POLL_S))
+        session.run(wait(session.client, LOOK_S))
     if session.client.interrupted:
         raise SitlError("interrupted while the vehicle rebooted", exit_code=1)
+    how = "it refuses the command: switch it off and on" if by_hand else "reboot it by hand"
     raise SitlError(
-        f"the vehicle was not seen to reboot within {BOOT_S:g} s; reboot it by hand and run this again", exit_code=1
+        f"the vehicle was not seen to reboot within {timeout:g} s; {how}, and run this again: nothing is lost",
+        exit_code=1,
     )
 
 

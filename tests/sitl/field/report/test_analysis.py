@@ -145,22 +145,13 @@ def test_the_interval_of_a_coherence_holds_it_and_shrinks_with_the_record():
     assert np.all(longer[1] - longer[0] < high - low)
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory):
-    """A flight with excitation, its log, a gain set, and their report."""
-    log = tmp_path_factory.mktemp("bench") / "flight.ulg"
-    flight = mp.experiment("adam0", log, seed=1, seconds_per_axis=8.0)
-    gains = flight.flown.with_elements({"RP_RR": 0.18, "RP_PP": 0.18, "RI_RR": 0.1, "RI_PP": 0.1})
-    return flight, gains, make_report([log], [("new", gains)])
-
-
 def test_margins_are_those_of_the_certificate(bench):
     flight, gains, report = bench
     certificate = mp.certify(flight, gains).certificate
-    case = next(case for case in report.cases if case.label == "new")
+    case = next(case for case in report.cases if case.label == "my")
     assert case.gains.certificate.figures == certificate.figures
     table = next(table for table in report.tables if table.caption == "Margins by the certificate")
-    shown = {row[0]: row[table.columns.index("new")] for row in table.rows}
+    shown = {row[0]: row[table.columns.index("my")] for row in table.rows}
     assert shown["Ms"] == f"{certificate.figures['Ms']:.2f} +- {certificate.figures['Ms_error']:.2f}"
     assert shown["phase margin, roll"].startswith(f"{certificate.figures['phase_margin_deg']['roll']:.0f} +-")
     assert shown["delay margin, pitch"] == f"{certificate.figures['delay_margin_ms']['pitch']:.1f} ms"
@@ -182,7 +173,7 @@ def test_predicted_doublets_and_steps_of_torque_end_at_rest_with_the_figures_of_
 
 def test_a_filter_costs_the_phase_that_it_takes_at_the_crossover(bench):
     report = bench[2]
-    case = next(case for case in report.cases if case.label == "new")
+    case = next(case for case in report.cases if case.label == "my")
     notch = LoopFilter("notch", NOTCH, 45.0, width_hz=30.0)
     response = case.flight.measured.response
     changed = behind(response, None, notch)
@@ -202,7 +193,7 @@ def test_a_filter_costs_the_phase_that_it_takes_at_the_crossover(bench):
 
 
 def test_advice_rests_on_the_torque_and_the_certificate_not_on_the_tone_alone(bench):
-    case = next(case for case in bench[2].cases if case.label == "new")
+    case = next(case for case in bench[2].cases if case.label == "my")
     flight = case.flight
     torque = flight.signal("u")
     loud = Series(torque.time, torque.values + 0.05 * np.sin(2 * np.pi * 70 * torque.time)[:, None], "u")
@@ -216,7 +207,7 @@ def test_advice_rests_on_the_torque_and_the_certificate_not_on_the_tone_alone(be
 
 def test_a_lower_derivative_filter_quiets_the_predicted_torque(bench):
     _, gains, report = bench
-    case = next(case for case in report.cases if case.label == "new")
+    case = next(case for case in report.cases if case.label == "my")
     cutoffs = [
         replace(gains, filters=replace(gains.filters, derivative_cutoff_hz=hertz)) for hertz in (10.0, 30.0, 60.0)
     ]

@@ -68,6 +68,19 @@ def test_a_prepared_px4_is_not_rebooted_again():
     assert vehicle.reboots == 0
 
 
+def test_a_px4_that_cannot_restart_itself_is_rebooted_by_hand():
+    vehicle = StockPx4({30.0: StockPx4.reboot}, denies=True)
+    profile, _ = profile_of("px4-stock", vehicle)
+    assert profile.prepare(SimulatedSession(vehicle, profile.integers)).rebooted
+    assert (vehicle.reboots, vehicle.module is None) == (1, False)
+    never = StockPx4(denies=True)
+    profile, _ = profile_of("px4-stock", never)
+    session = SimulatedSession(never, profile.integers)
+    with pytest.raises(SitlError, match="not seen to reboot within 180 s; it refuses the command"):
+        profile.prepare(session)
+    assert profile.restore(session).complete
+
+
 def test_an_autotune_that_the_firmware_does_not_start_is_found_by_its_parameters_and_all_goes_back():
     vehicle = StockPx4(starts=False)
     profile, _ = profile_of("px4-stock", vehicle)
@@ -276,7 +289,7 @@ def test_the_command_is_never_sent_to_a_running_px4_as_a_stop():
 
 def test_the_command_prepares_and_excites_a_stock_px4_whose_log_is_an_experiment(tmp_path, mimopilot):
     log, old = tmp_path / "flight.ulg", tmp_path / "old.params"
-    with running_sitl("--autopilot", "px4-stock", "--speed", "8", "--log", log) as sitl:
+    with running_sitl("--autopilot", "px4-stock", "--speed", "4", "--log", log) as sitl:
         pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
         pilot.ready()
         assert pilot.beat.autopilot == 12
@@ -284,8 +297,7 @@ def test_the_command_prepares_and_excites_a_stock_px4_whose_log_is_an_experiment
         options = ("--profile", "px4-stock", "--runs", 1, "--snapshot", old, "--yes")
         client = start("experiment", *link, *options)
         client.until("4 parameters set, rebooted; take off and hover now")
-        pilot.ready()
-        assert pilot.command(400, 1) == 0
+        pilot.wait(lambda: pilot.command(400, 1) == 0)  # it has just booted
         assert pilot.command(22, 0, 0, 0, 0, 0, 0, 5) == 0
         pilot.wait(lambda: client.process.poll() is not None)
         client.end()

@@ -74,7 +74,7 @@ def test_every_parameter_name_is_valid_in_a_file():
         ("MIMO_RP_RR 1\nMIMO_RP_RR 2", "line 2: MIMO_RP_RR is in the file twice"),
         ("MIMO_RP_RR_TOO_LONG 1", "at most 16 capitals"),
         ("mimo 1", "got 'mimo 1'"),
-        ("1\t1\tSYS_AUTOSTART\t4001\t6", "SYS_AUTOSTART: param_type 6, expected 9"),
+        ("1\t1\tSYS_AUTOSTART\t4001\t4", "SYS_AUTOSTART: param_type 4, expected 9 or 6"),
         ("1\t1\tMIMO_RP_RR\t0.12", "got '1"),
     ],
 )

@@ -1,0 +1,190 @@
+"""The page of a report in a real browser, its images, and the commands that write it."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+import mimopilot as mp
+from mimopilot.common.charts import FLOWN, NEW, SISO, STYLES
+from mimopilot.common.figures import thinned
+from mimopilot.common.plotly_page import charts_json
+from mimopilot.sitl.field.report.flight_report import MOST_LOGS, make_report
+from tests.conftest import assert_one_clear_line
+from tests.sitl.field.report.chromium import Chromium
+from tests.tuning.logs.flights import make_flight, table, write_csv
+
+#: Sections of every report, in their order.
+HEADINGS = (
+    "Timeline",
+    "Setpoint and response",
+    "Step response",
+    "Gains",
+    "Predicted motion",
+    "Stability and margins",
+    "Frequency response of the vehicle",
+    "Spectra and vibration",
+    "Filters",
+    "What the log holds",
+)
+#: Bytes of a page, at most.
+LARGEST_PAGE = 6_000_000
+
+
+@pytest.fixture(scope="module")
+def folder(bench, tmp_path_factory):
+    """The pages of the bench flight and of a log of attitudes alone."""
+    path = tmp_path_factory.mktemp("report")
+    bench[2].write(path / "flight.html")
+    columns = table(make_flight(seconds=30.0, Ts=0.02))
+    write_csv(path / "slow.csv", {name: columns[name] for name in ("t", "roll", "pitch", "roll_sp", "pitch_sp")})
+    mp.report(path / "slow.csv", path / "slow.html", figures=path / "pictures")
+    return path
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    with Chromium(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+@pytest.mark.parametrize("page", ["flight", "slow"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_page_draws_all_its_figures_without_error_request_or_sideways_scroll(folder, browser, page, width):
+    browser.errors.clear()
+    browser.requests.clear()
+    path = folder / f"{page}.html"
+    browser.open(path, width)
+    panels = int(browser.value("document.querySelectorAll('.panel').length"))
+    assert panels == int(browser.value("document.documentElement.dataset.drawn"))
+    drawn = browser.value("[...document.querySelectorAll('.panel .js-plotly-plot')].filter(p => p.data.length).length")
+    assert drawn == panels > 5
+    assert browser.value("document.querySelectorAll('.panel path.js-line, .panel .heatmaplayer image').length") > panels
+    assert browser.value("document.documentElement.scrollWidth") <= width
+    widest = "Math.max(...[...document.querySelectorAll('.panel')].map(p => p.getBoundingClientRect().right))"
+    assert browser.value(widest) <= width
+    assert browser.errors == []
+    assert {address for address in browser.requests if not address.startswith("data:")} == {path.resolve().as_uri()}
+    headings = json.loads(browser.value("JSON.stringify([...document.querySelectorAll('h2')].map(h => h.textContent))"))
+    assert [heading for heading in headings if heading in HEADINGS] == list(HEADINGS)
+
+
+def test_zooming_a_panel_zooms_those_beside_it(folder, browser):
+    browser.open(folder / "flight.html", 1280)
+    zoom = "Plotly.relayout('tracking-1-0', {'xaxis.range[0]': 2, 'xaxis.range[1]': 3}).then(() => new Promise(r => "
+    browser.value(f"{zoom}setTimeout(r, 300)))")
+    shown = browser.value("document.getElementById('tracking-1-3').layout.xaxis.range.join()")
+    assert shown == "2,3"
+
+
+def test_a_page_prints_without_a_heading_at_the_end_of_a_sheet(folder, browser):
+    from pypdf import PdfReader
+
+    browser.open(folder / "flight.html", 1280)
+    browser.print_to(folder / "flight.pdf")
+    sheets = [page.extract_text().strip().splitlines() for page in PdfReader(folder / "flight.pdf").pages]
+    assert 4 <= len(sheets) < 25
+    text = "\n".join("\n".join(lines) for lines in sheets)
+    for heading in HEADINGS:
+        assert heading in text
+    for lines in sheets:
+        assert lines
+        assert lines[-1].strip() not in HEADINGS
+    assert browser.errors == []
+
+
+def test_the_same_log_gives_the_same_bytes_within_the_size_of_a_page(folder, tmp_path):
+    again = tmp_path / "again.html"
+    mp.report(folder / "slow.csv", again)
+    assert again.read_bytes() == (folder / "slow.html").read_bytes()
+    for name in ("flight", "slow"):
+        assert (folder / f"{name}.html").stat().st_size < LARGEST_PAGE
+
+
+def test_the_images_are_those_of_the_page(folder):
+    names = re.findall(r'id="([a-z0-9-]+)-0" style', (folder / "slow.html").read_text())
+    assert {path.stem for path in (folder / "pictures").glob("*.png")} == set(names)
+    assert {path.stem for path in (folder / "pictures").glob("*.svg")} == set(names)
+    assert (folder / "pictures" / "tracking-1.png").read_bytes()[:4] == b"\x89PNG"
+    assert FLOWN.lower() in (folder / "pictures" / "tracking-1.svg").read_text().lower()
+
+
+def test_one_thing_has_one_colour(bench):
+    report = bench[2]
+    assert [(case.label, case.colour) for case in report.cases] == [("flown", FLOWN), ("my", NEW)]
+    assert [colour for colour, _ in STYLES[:3]] == [FLOWN, SISO, NEW]
+    for chart in report.charts:
+        for panel in chart.panels:
+            for line in panel.lines:
+                if getattr(line, "label", "") in ("flown", "my"):
+                    assert line.colour == {"flown": FLOWN, "my": NEW}[line.label], chart.name
+
+
+def test_two_flights_are_compared_on_the_same_axes_with_their_difference(folder, tmp_path):
+    fast, slow = tmp_path / "before.csv", tmp_path / "after.csv"
+    columns = table(make_flight(seconds=30.0, Ts=0.01))
+    write_csv(fast, columns)
+    columns["roll"] = 0.5 * columns["roll"]
+    write_csv(slow, columns)
+    report = make_report([fast, slow])
+    section = next(one for one in report.sections if one.heading == "Before and after")
+    rows = {row[0]: row[1:] for row in section.tables[0].rows}
+    before, after, difference, share = rows["roll angle, RMS of the error [deg]"]
+    errors = [np.degrees(columns["roll_sp"] - factor * columns["roll"]) for factor in (2.0, 1.0)]
+    assert [float(before), float(after)] == pytest.approx([np.sqrt(np.mean(one**2)) for one in errors], rel=1e-3)
+    assert float(difference) == pytest.approx(float(after) - float(before), abs=0.01)
+    assert share == f"{float(after) / float(before) - 1:+.0%}"
+    steps = next(chart for chart in report.charts if chart.name == "step-response")
+    assert [line.colour for line in steps.panels[0].lines if getattr(line, "label", "")] == [FLOWN, NEW]
+
+
+def test_a_log_that_cannot_be_tuned_from_says_why_and_shows_the_rest(folder):
+    report = make_report([folder / "slow.csv"])
+    assert report.headline.sentence.startswith("Gains cannot be tuned from slow.csv: lacks column u_roll and u_pitch")
+    assert {"timeline-1", "tracking-1", "step-response"} <= {chart.name for chart in report.charts}
+    for section in report.sections:
+        assert section.charts or section.tables or section.text, section.heading
+
+
+def test_a_crash_is_in_the_headline_and_in_the_timeline(tmp_path):
+    columns = table(make_flight(seconds=20.0))
+    fallen = columns["t"] > 26.0
+    columns["roll"] = np.where(fallen, 3.0, columns["roll"])
+    report = make_report([write_csv(tmp_path / "crash.csv", columns)])
+    assert report.headline.sentence.startswith("The vehicle tumbled 16.0 s into crash.csv.")
+    assert report.headline.tone == "bad"
+    assert report.flights[0].phases["crash"][0] == pytest.approx((16.0, 20.0), abs=0.02)
+
+
+def test_commands_write_the_page_and_refuse_what_is_no_log(folder, mimopilot, tmp_path):
+    done = mimopilot("report", folder / "slow.csv", "--out", "page.html", "--json")
+    found = json.loads(done.stdout)
+    assert done.returncode == 0, done.stderr
+    assert found["headline"].startswith("Gains cannot be tuned from")
+    assert "tracking-1" in found["figures"]
+    flown = mimopilot("fly", "adam0", "--report", "flight.html")
+    assert flown.returncode == 0, flown.stderr
+    assert "Setpoint and response" in (tmp_path / "flight.html").read_text()
+    (tmp_path / "no.txt").write_text("nothing\n")
+    assert_one_clear_line(mimopilot("report", "no.txt", "--out", "page.html"), "no.txt", "not a flight log")
+    too_many = mimopilot("report", *[folder / "slow.csv"] * (MOST_LOGS + 1), "--out", "page.html")
+    assert_one_clear_line(too_many, f"{MOST_LOGS + 1} logs")
+
+
+def test_thinning_keeps_extremes_gaps_and_equal_steps():
+    x = np.arange(10_000) * 0.004
+    y = np.sin(x)
+    y[1234], y[5000:5100] = 9.0, np.nan
+    short, values = thinned(x, y, 400)
+    assert len(short) <= 400
+    assert np.nanmax(values) == 9.0
+    assert np.isnan(values).any()
+    assert np.ptp(np.diff(short)) < 1e-9
+
+
+def test_text_of_a_log_cannot_end_the_script_of_the_page(folder):
+    report = make_report([folder / "slow.csv"])
+    chart = report.charts[0]
+    bad = type(chart)(chart.name, "</script>", [type(chart.panels[0])("</script>", "</script>", "", [])])
+    assert "</" not in charts_json([bad])
