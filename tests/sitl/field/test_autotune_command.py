@@ -29,7 +29,7 @@ def test_one_command_tunes_a_simulated_vehicle(tmp_path):
 
 
 def test_without_a_terminal_the_command_asks_for_yes(mimopilot):
-    done = mimopilot("autotune", "--connect", "tcp:127.0.0.1:1", "--out", "tuned", stdin=subprocess.DEVNULL)
+    done = mimopilot("autotune", "--connect", "tcp:127.0.0.1:1", "--out", "tuned")
     assert_one_clear_line(done, "no terminal to ask", "--yes")
     done = mimopilot("autotune", "--connect", "tcp:127.0.0.1:1", "--out", "tuned", "--yes", "--profile", "betaflight")
     assert_one_clear_line(done, "--profile: got 'betaflight'", "px4-stock")
