@@ -18,7 +18,7 @@ from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.ulog_file import open_ulog
 from mimopilot.tuning.reference_model import SecondOrder
 from tests.conftest import assert_one_clear_line, run_here
-from tests.paths import PACKAGES, TOP
+from tests.paths import DOCS, PACKAGES, TOP
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
@@ -328,19 +328,19 @@ def test_damage_of_a_log_is_reported_once_by_every_command_that_reads_it(mimopil
     assert "damaged: " in (tmp_path / "g.gains.toml").read_text()
 
 
-def test_help_and_readme_name_every_target_and_airframe(mimopilot):
-    readme = (TOP / "README.md").read_text()
+def test_help_and_manual_name_every_target_and_airframe(mimopilot):
+    manual = "".join(page.read_text() for page in DOCS.glob("*.md"))
     help_text = " ".join(mimopilot("generate", "--help").stdout.split())
     for name, target in targets().items():
         assert f"{name}: {target.help}" in help_text
-        assert f"--target {name}" in readme
+        assert f"--target {name}" in manual
         for option, values in target.options.items():
             assert f"--{option.replace('_', '-')}" in help_text
             assert all(value in help_text for value in values)
     flights = mimopilot("fly", "--help").stdout
     for name in known_airframes():
         assert name in flights
-        assert f"`{name}`" in readme
+        assert f"`{name}`" in manual
 
 
 def test_the_design_that_readme_shows_is_what_its_commands_print(mimopilot):
