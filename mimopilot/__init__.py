@@ -35,6 +35,7 @@ _PUBLIC = {
             "report",
             "experiment",
             "upload",
+            "autotune",
             "list_logs",
             "download_log",
         ),
@@ -53,6 +54,7 @@ _PUBLIC = {
 
 if TYPE_CHECKING:
     from mimopilot.api import advise as advise
+    from mimopilot.api import autotune as autotune
     from mimopilot.api import certify as certify
     from mimopilot.api import download_log as download_log
     from mimopilot.api import experiment as experiment

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from mimopilot.common.blas import reproducible
 
 if TYPE_CHECKING:
+    from mimopilot.sitl.field.autotune_run import AutotuneDialogue
+    from mimopilot.sitl.field.decisions import Decisions
     from mimopilot.sitl.field.report.flight_report import FlightReport
     from mimopilot.sitl.flight.metrics import Performance
     from mimopilot.sitl.flight.scenario import Scenario
@@ -115,14 +117,15 @@ def tune(
     columns : str or Path, optional
         As in `read_log`.
     **options
-        Further entries of `tuning.spec.TuningSpec`: ``method``, ``structure``, ``instrument``, ``window``...
+        Further entries of `tuning.spec.TuningSpec`: ``profile``, ``method``, ``structure``, ``instrument``...
 
     Returns
     -------
     Gains
         With their certificate, standard deviations and warnings. `provenance.details` holds the predicted figures of
-        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``; and those of yaw in ``yaw``, or
-        why its gains are kept: ``kept``.
+        these and the flown gains: ``predicted``, ``better_than_flown``, ``keep_flown``; those of yaw in ``yaw``, or why
+        its gains are kept: ``kept``; for a stock controller also what our module's would do,
+        ``worth_of_off_diagonals``.
 
     Raises
     ------
@@ -291,6 +294,7 @@ def import_params(
     connect: str | None = None,
     defaults: str | None = None,
     rate: float | None = None,
+    profile: str = "mimo",
     airframe: PathLike | Airframe | None = None,
     timeout: float = 12.0,
     signing_key: PathLike | None = None,
@@ -308,6 +312,8 @@ def import_params(
         ``px4-v1.16``: that PX4's defaults for what the source lacks. None: then it is refused.
     rate : float, optional, Hz
         Control rate; by default that of the parameters.
+    profile : str
+        ``mimo``: gains for our module. ``px4-stock``, ``ardupilot-stock``: the set of that controller itself.
     airframe : str, Path or Airframe, optional
         Vehicle whose unit of torque the gains have. None: what the vehicle publishes, else not known.
     timeout, signing_key, system
@@ -339,7 +345,7 @@ def import_params(
         found = read_stock_parameters(LinkOptions(str(connect), system, timeout, key))
     body = load_airframe(airframe) if isinstance(airframe, str | Path) else airframe
     scale = body.moment_scale() if body else None
-    return import_gains(found, defaults=defaults, rate=rate, moment_scale=scale)
+    return import_gains(found, defaults=defaults, rate=rate, moment_scale=scale, profile=profile)
 
 
 class GeneratedTree(NamedTuple):
@@ -592,7 +598,6 @@ def upload(
     dry_run: bool = False,
     force_armed: bool = False,
     uncertified: bool = False,
-    drop_off_diagonals: bool = False,
     timeout: float = 12.0,
     snapshot: PathLike | None = None,
     signing_key: PathLike | None = None,
@@ -606,10 +611,10 @@ def upload(
     connect : str
         ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
     profile : str
-        ``mimo``: our module. ``px4-stock``, ``ardupilot-stock``: the diagonal, in their controllers.
+        Controller that the gains are for: ``mimo``, our module, ``px4-stock`` or ``ardupilot-stock``.
     moment_scale : tuple of 3 float (N m), or ``flown``, optional
         Unit of torque of a vehicle that does not publish it.
-    dry_run, force_armed, uncertified, drop_off_diagonals : bool
+    dry_run, force_armed, uncertified : bool
         As the command's options.
     timeout : float, s
         Abort after this many seconds without a message.
@@ -637,7 +642,6 @@ def upload(
         connect,
         profile=profile,
         uncertified=uncertified,
-        drop_off_diagonals=drop_off_diagonals,
         system=system,
         timeout=timeout,
         signing_key=Path(signing_key) if signing_key else None,
@@ -649,6 +653,69 @@ def upload(
     done = upload_and_verify(plan, options, loaded, moment_scale)
     done.check()
     return done.outcome
+
+
+def autotune(
+    connect: str,
+    out: PathLike,
+    *,
+    profile: str = "mimo",
+    take_off: float | None = None,
+    arm: bool = False,
+    seconds_per_axis: float = 20.0,
+    amplitude: float | None = None,
+    dialogue: AutotuneDialogue | None = None,
+    timeout: float = 12.0,
+    signing_key: PathLike | None = None,
+    system: int = 0,
+) -> Decisions:
+    """Tune a vehicle in the field: experiment, gains, check flight; keep the new gains, or go back to the old ones.
+
+    Parameters
+    ----------
+    connect, timeout, signing_key, system
+        As in `upload`.
+    out : str or Path
+        Folder of logs, gains, decisions and report; after an interruption the same one goes on.
+    profile : str
+        ``mimo``: our module.
+    take_off : float, optional, m
+        Arm, take off to this height, and land. None: a pilot does that.
+    arm : bool
+        Arm a vehicle that does not say that it is simulated.
+    seconds_per_axis, amplitude
+        Of the excitation, as the command's options.
+    dialogue : AutotuneDialogue, optional
+        What is told and asked. None: nothing; every answer is yes.
+
+    Returns
+    -------
+    Decisions
+        What was done, when the new gains were kept.
+
+    Raises
+    ------
+    Error
+        When they were not: the message says why, and which gains the vehicle holds.
+    """
+    from mimopilot.sitl.field.autotune_console import SilentAnswers
+    from mimopilot.sitl.field.autotune_run import AutotuneOptions
+    from mimopilot.sitl.field.workflow import autotune as run
+
+    options = AutotuneOptions(
+        connect,
+        Path(out),
+        profile=profile,
+        take_off=take_off,
+        yes=dialogue is None,
+        arm=arm,
+        seconds_per_axis=seconds_per_axis,
+        amplitude=amplitude,
+        system=system,
+        timeout=timeout,
+        signing_key=Path(signing_key) if signing_key else None,
+    )
+    return run(options, dialogue or SilentAnswers())
 
 
 def list_logs(
@@ -723,7 +790,7 @@ def download_log(
 
 
 def prepare_upload(
-    gains: GainSet, connect: str, *, profile: str, uncertified: bool, drop_off_diagonals: bool, **link: Any
+    gains: GainSet, connect: str, *, profile: str, uncertified: bool, **link: Any
 ) -> tuple[UploadPlan, LinkOptions, Gains, str]:
     """Plan of an upload, the options of its link, the gains, and a warning about their stability; see `upload`."""
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
@@ -734,7 +801,7 @@ def prepare_upload(
     warning = check_verdict(loaded, allow=uncertified)
     source = Path(gains) if isinstance(gains, str | Path) else Path("gains")
     stem = source.with_name(source.name.removesuffix(".toml").removesuffix(".gains"))
-    plan = make_plan(loaded, profile, drop_off_diagonals)
+    plan = make_plan(loaded, profile)
     return plan, LinkOptions(connect, stem=stem, **link), loaded, warning
 
 

@@ -34,6 +34,7 @@ from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.sitl.studies.standard_faults import standard_faults
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.logs.reader import read_log
+from tests.bench_autotune import autotune_rows
 from tests.bench_campaign import campaign_rows, rotorpy_rows
 from tests.bench_tuning import best, tuning_rows
 from tests.sitl.mavlink import flood
@@ -161,6 +162,7 @@ def main() -> None:
             title = f"upload of 25 parameters, verified and stored, round trip {round_trip * 1e3:.0f} ms"
             rows.append([title, f"{slowest:.2f} s", limit])
         rows += flood.rows()
+        rows += autotune_rows()
     print_table("mimopilot bench", ["what", "figure", "beside"], rows)
 
 

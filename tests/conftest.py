@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, settings
 
 import mimopilot.cli.main as front_door
 from mimopilot.tuning.gains import Gains, Limits, YawGains
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_terms import Filters, StockFilters
 
 #: No deadlines: tests must not depend on the machine's speed.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -59,6 +59,25 @@ def following_gains() -> Gains:
         Kff_o=np.array([[0.9, 0.04], [-0.03, 1.05]]),
         Kaff_i=np.array([[0.006, 0.0005], [-0.0004, 0.007]]),
     )
+
+
+def stock_gains(controller: str = "px4-stock") -> Gains:
+    """A set for a stock controller, every term and filter in use, each axis with its own."""
+    filters = {
+        "px4-stock": StockFilters("px4-stock", (30.0, 30.0, 30.0), torque_hz=(0.0, 0.0, 2.0)),
+        "ardupilot-stock": StockFilters(
+            "ardupilot-stock",
+            derivative_hz=(20.0, 25.0, 10.0),
+            setpoint_hz=(20.0, 22.0, 15.0),
+            error_hz=(0.0, 30.0, 2.5),
+            derivative_feedforward=(0.001, 0.002, 0.003),
+        ),
+    }
+    diagonal = {
+        name: np.diag(np.diag(getattr(coupled_gains(), name))) for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i")
+    }
+    base = replace(coupled_gains(), limits=Limits((5.0, 4.0, 3.0), integral_max=(0.3, 0.25, 0.2)))
+    return replace(base, filters=Filters(0.0025, stock=filters[controller]), **diagonal)
 
 
 @pytest.fixture

@@ -80,7 +80,8 @@ def law_of(gains: Gains, count: int, yaw_unit: float = 1.0) -> Law:
         scalar = getattr(gains.yaw, name) if name in YAW_GAINS else 0.0
         yaw = np.array([[scalar / yaw_unit if name.endswith("_i") else scalar]])
         matrices[name] = yaw if count == 1 else block_diag(getattr(gains, name), yaw)
-    return AxesLaw(**matrices, filters=replace(gains.filters, model_omega=0.0))
+    filters = replace(gains.filters, model_omega=0.0).on(slice(2, 3) if count == 1 else slice(0, 3), yaw_unit)
+    return AxesLaw(**matrices, filters=filters)
 
 
 def flown_law(experiment: Experiment) -> Law | None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from mimopilot.common.files import sha256, write_atomically
 from mimopilot.common.toml import toml_entries, toml_value
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_terms import MIMO, Filters, StockFilters
 from mimopilot.tuning.parameter_row import ANY, AXES, POSITIVE, Row, Shape, Valid
 from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, YAW_GAINS, rows
 from mimopilot.tuning.provenance import Provenance
@@ -107,7 +107,8 @@ class Gains:
     Raises
     ------
     TuningError
-        When a matrix is not 2x2 or is missing, a number is not finite, or a limit is out of its range.
+        When a matrix is not 2x2 or is missing, a number is not finite, a limit is out of its range, or a set for a
+        stock controller has what that one does not have.
     """
 
     Kp_o: Matrix
@@ -151,12 +152,25 @@ class Gains:
                         f"{where}: got {value}{_unit(row)}, expected at most {row.largest_in_period:g}/Ts, "
                         f"{row.largest_in_period / self.Ts:g}{_unit(row)}"
                     )
+        self._check_law()
         for axis, value in zip(AXES, self.moment_scale or (), strict=False):
             if not POSITIVE.holds(value):
                 raise TuningError(f"moment_scale ({axis}): got {value} N m, expected {POSITIVE}")
 
+    def _check_law(self) -> None:
+        """Refuse what the law of a stock controller does not have."""
+        law = self.filters.law
+        for row in ROWS:
+            if row.key in law.lacks and any(value != (row.default or 0.0) for value in self._values(row)):
+                raise TuningError(f"{row.key}: got {self.of(row)}, but the {self.controller} controller has none")
+            if row.shape is Shape.MATRIX and not law.coupled and np.any(self.of(row)[[0, 1], [1, 0]]):
+                raise TuningError(
+                    f"{row.key}: got off-diagonal gains {self.of(row)[[0, 1], [1, 0]].tolist()}, expected 0: the "
+                    f"{self.controller} controller is diagonal"
+                )
+
     @classmethod
-    def from_rows(cls, values: Mapping[Row, Any], **others: Any) -> Gains:
+    def from_rows(cls, values: Mapping[Row, Any], stock: StockFilters | None = None, **others: Any) -> Gains:
         """A set from what it holds for the rows of the parameter table, see `of`; `others`: the other attributes.
 
         A row with a default may be left out.
@@ -168,7 +182,7 @@ class Gains:
         return cls(
             **parts[Shape.MATRIX],
             yaw=YawGains(**parts[Shape.YAW]),
-            filters=Filters(**parts[Shape.POLE], **parts[Shape.SCALAR]),
+            filters=Filters(**parts[Shape.POLE], **parts[Shape.SCALAR], stock=stock),
             limits=Limits(**parts[Shape.AXES]),
             **others,
         )
@@ -186,8 +200,21 @@ class Gains:
 
     @property
     def derivative_cutoff_hz(self) -> float:
-        """Cut-off of the derivative filter, Hz; 0: none."""
-        return self.filters.derivative_cutoff_hz
+        """Cut-off of the derivative filter, of roll, Hz; 0: none."""
+        stock = self.filters.stock
+        return self.filters.derivative_cutoff_hz if stock is None else stock.derivative_hz[0]
+
+    @property
+    def controller(self) -> str:
+        """Controller that the set is for: ``mimo`` (ours), ``px4-stock`` or ``ardupilot-stock``."""
+        return MIMO if self.filters.stock is None else self.filters.stock.controller
+
+    def for_our_law(self) -> Gains:
+        """The gains in our law, without a certificate; of a stock law's filters only that of D, roll's, is kept."""
+        if self.filters.stock is None:
+            return self
+        filters = replace(self.filters, stock=None, derivative_cutoff_hz=self.derivative_cutoff_hz)
+        return replace(self, filters=filters, certificate=None)
 
     def of(self, row: Row) -> Any:
         """Value of a row of the parameter table: a matrix, a triple or a number."""
@@ -219,7 +246,18 @@ class Gains:
             yield where + index.get(row.shape, ""), value
 
     def elements(self) -> dict[str, float]:
-        """Every number of the controller by code, in the order of the C++ struct."""
+        """Every number of our controller by code, in the order of the C++ struct.
+
+        Raises
+        ------
+        TuningError
+            When the set is for a stock controller.
+        """
+        if self.controller != MIMO:
+            raise TuningError(
+                f"controller: the gains are for {self.controller}, expected {MIMO}: our controller flies those of "
+                "`mimopilot tune` without --profile"
+            )
         return {
             code: row.element(value, self.Ts)
             for row in ROWS
@@ -280,6 +318,8 @@ class Gains:
             if not self.at_default(row):
                 numbers |= dict(zip(row.codes, (row.element(value, self.Ts) for value in values), strict=True))
                 numbers |= {row.key: values[0]} if row.shape is Shape.POLE else {}
+        if self.filters.stock is not None:
+            content |= {"law": asdict(self.filters.stock)}
         return sha256(json.dumps([content, numbers, self.moment_scale], sort_keys=True, default=str))
 
     def verdict(self) -> tuple[Verdict, str]:
@@ -324,12 +364,17 @@ class Gains:
         deviations = dict(self.provenance.standard_deviation)
         for name in deviations.keys() & matrices.keys():
             deviations[name] = (np.array(deviations[name]) * ratio[:2, None]).tolist()
+        stock = self.filters.stock
+        if stock is not None:
+            moved = tuple(v * float(r) for v, r in zip(stock.derivative_feedforward, ratio, strict=True))
+            stock = replace(stock, derivative_feedforward=moved)
         of_yaw = deviations.get("yaw", {})
         if of_yaw:
             deviations["yaw"] = {n: v * float(ratio[2]) if n.endswith("_i") else v for n, v in of_yaw.items()}
         changed = replace(
             self,
             moment_scale=scale,
+            filters=replace(self.filters, stock=stock),
             yaw=replace(self.yaw, **yaw),
             limits=replace(self.limits, **limits),  # type: ignore[arg-type]
             provenance=replace(self.provenance, standard_deviation=deviations),
@@ -384,22 +429,28 @@ def gains_to_toml(gains: Gains) -> str:
         plain = np.asarray(value, dtype=np.float64).tolist()
         return f"{row.key} = {toml_value(plain)}{f'  # {note}' if note else ''}"
 
-    def lines_of(shape: Shape) -> list[str]:
-        return [line(row) for row in rows(shape) if not (row.option and not gains.uses(row) and gains.at_default(row))]
+    def left_out(row: Row) -> bool:
+        return row.key in law.lacks or bool(row.option and not gains.uses(row) and gains.at_default(row))
 
-    following = bool(gains.filters.model_omega)
+    def lines_of(shape: Shape) -> list[str]:
+        return [line(row) for row in rows(shape) if not left_out(row)]
+
+    following, law, stock = bool(gains.filters.model_omega), gains.filters.law, gains.filters.stock
     scale = toml_value(list(gains.moment_scale)) if gains.moment_scale else '"unknown"'
     lines = [
-        "# mimopilot gains. Row: output; column: error; roll then pitch. Positive Kd damps.",
-        "# r_i = Kp_o (r_o - y_o);  u = Kp_i (r_i - y_i) + I - Kd_i dy_i/dt + Kff_i r_i,  I += Ts Ki_i (r_i - y_i)",
+        *law.text,
         *(_MODEL_COMMENT if following else ()),
         f"schema = {SCHEMA}",
+        *(() if stock is None else (f"controller = {toml_value(stock.controller)}",)),
         *lines_of(Shape.SCALAR),
         *lines_of(Shape.POLE),
         f"moment_scale = {scale}  # N m that u = 1 stands for: roll, pitch, yaw",
     ]
     for shape, head in ((Shape.MATRIX, ""), (Shape.YAW, ""), (Shape.AXES, "  # roll, pitch, yaw")):
         lines += ["", f"[{rows(shape)[0].section}]{head}", *lines_of(shape)]
+    if stock is not None:
+        lines += ["", "[filters]  # roll, pitch, yaw; Hz, 0: none"]
+        lines += [f"{name} = {toml_value(list(getattr(stock, name)))}" for name in law.filters]
     tables = {"certificate": gains.certificate, "provenance": gains.provenance}
     for name, content in tables.items():
         entries = content.as_table() if content is not None else {}

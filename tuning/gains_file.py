@@ -13,13 +13,16 @@ from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, Gains
+from mimopilot.tuning.law_terms import LAWS, MIMO, StockFilters
 from mimopilot.tuning.parameter_row import Row, Shape
 from mimopilot.tuning.parameters import ROWS, rows
 from mimopilot.tuning.provenance import Provenance
 
 #: Tables and entries other than the parameter table's keys.
 SECTIONS = ("roll_pitch", "yaw", "limits")
-OTHERS = ("schema", "moment_scale", "certificate", "provenance")
+OTHERS = ("schema", "controller", "moment_scale", "certificate", "provenance")
+#: Table of the filters of a stock controller.
+FILTERS = "filters"
 
 
 def load_gains(path: str | Path) -> Gains:
@@ -49,26 +52,45 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
         raise TuningError(
             f"{where}: schema: got {shown(schema)}, expected {SCHEMA} (or 1, an older one); not a mimopilot gains file?"
         )
-    known = {*OTHERS, *SECTIONS, *(row.key for row in rows(Shape.POLE, Shape.SCALAR))}
+    controller = table.get("controller", MIMO)
+    if controller not in LAWS:
+        raise TuningError(f"{where}: controller: got {shown(controller)}, expected one of {', '.join(LAWS)}")
+    lacks = LAWS[controller].lacks
+    scalars = {row.key for row in rows(Shape.POLE, Shape.SCALAR)} - set(lacks)
+    known = {*OTHERS, *SECTIONS, *scalars, *(() if controller == MIMO else (FILTERS,))}
     for key in sorted(set(table) - known):
         raise TuningError(f"{where}: {shown_text(key)}: unknown entry; known: {', '.join(sorted(known))}")
     for name in ("certificate", "provenance"):
         if not isinstance(table.get(name, {}), dict):
             raise TuningError(f"{where}: {name}: got {shown(table[name])}, expected a table")
     try:
-        values = {row: _entry(table, row) for row in ROWS if not _is_left_out(table, row)}
+        values = {row: _entry(table, row) for row in ROWS if row.key not in lacks and not _is_left_out(table, row)}
+        values |= {row: 0.0 for row in rows(Shape.POLE) if row.key in lacks}
         certificate = Certificate.from_table(table["certificate"]) if "certificate" in table else None
         if certificate is not None and schema == 1:
             certificate = replace(certificate, seal=SCHEMA_1)
         scale = _get(table, "moment_scale", "")
         return Gains.from_rows(
             values,
+            stock=_stock(table, controller),
             moment_scale=None if scale == "unknown" else _triple(scale, "moment_scale"),
             certificate=certificate,
             provenance=Provenance.from_table(table.get("provenance", {})),
         )
     except (Error, OverflowError) as error:
         raise TuningError(f"{where}: {error}") from error
+
+
+def _stock(table: dict[str, Any], controller: str) -> StockFilters | None:
+    """Filters of a stock controller; None for ours."""
+    if controller == MIMO:
+        return None
+    section, names = _get(table, FILTERS, ""), LAWS[controller].filters
+    for key in sorted(set(section) - set(names)) if isinstance(section, dict) else ():
+        raise TuningError(f"{FILTERS}.{shown_text(key)}: unknown entry; known: {', '.join(names)}")
+    return StockFilters(
+        controller, **{name: _triple(_get(section, name, FILTERS), f"{FILTERS}.{name}") for name in names}
+    )
 
 
 def _is_left_out(table: dict[str, Any], row: Row) -> bool:

@@ -60,15 +60,17 @@ def inverse_law(matrices: Mapping[str, Signal], filters: Filters) -> InverseLaw:
     Raises
     ------
     NotMinimumPhaseError
-        When the controller has no inverse.
+        When the controller has no inverse, or is a stock one.
     """
+    if filters.stock is not None:
+        raise NotMinimumPhaseError(f"the rate controller of {filters.stock.controller} is not inverted")
     direct: Any = 0.0
     poles, pushes = [], []
     for letter, term in LOOP_TERMS.items():
         if letter in matrices and term.signal != RATE:
-            shape, matrix = term.filter(filters), matrices[letter]
-            direct = direct + (matrix if shape is None else shape.direct * matrix)
-            if shape is not None:
+            chain, matrix = term.filter(filters), matrices[letter]
+            direct = direct + (chain[0].direct * matrix if chain else matrix)
+            for shape in chain:
                 poles.append(shape.pole * np.eye(len(matrix)))
                 pushes.append(shape.memory * matrix)
     if np.linalg.cond(direct) > SINGULAR:

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from mimopilot.common.errors import InputFileError
 from mimopilot.common.toml import checked, read_toml
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
 from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.law_terms import LAWS, MIMO
 from mimopilot.tuning.reference_model import ContinuousModel, ReferenceModel, SecondOrder, model_from_table
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -67,6 +68,9 @@ class TuningSpec(_SpecTable):
 
     Attributes
     ----------
+    profile : str
+        Controller that the gains are for: ``mimo`` (ours), ``px4-stock`` or ``ardupilot-stock``. Those of a stock one
+        are designed within its own law, diagonal, from a flight with it.
     method : str
         ``mimo``: full matrices. ``siso``: each axis by itself, with the optimal prefilter (3.12).
     inner, outer : tuple of 2 ContinuousModel or None
@@ -107,6 +111,7 @@ class TuningSpec(_SpecTable):
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
+    profile: Literal["mimo", "px4-stock", "ardupilot-stock"] = "mimo"
     method: Literal["mimo", "siso"] = "mimo"
     inner: Models | None = None
     outer: Models | None = None
@@ -145,6 +150,33 @@ class TuningSpec(_SpecTable):
         """The same, as specified."""
         given: Models | None = getattr(self, loop)
         return given or DEFAULT_MODELS[loop]
+
+    @model_validator(mode="after")
+    def _stock_laws_are_as_they_are(self) -> TuningSpec:
+        if self.profile == MIMO:
+            return self
+        given = {
+            "method": self.method != "mimo",
+            "inner, outer": self.for_models,
+            "follow_model": self.follow_model,
+            "derivative_cutoff_hz": self.derivative_cutoff_hz is not None,
+        }
+        for name in (name for name, found in given.items() if found):
+            raise ValueError(
+                f"{name}: not with profile {self.profile}, whose law is diagonal, with the filters that flew; leave it "
+                "out"
+            )
+        return self
+
+    @property
+    def label(self) -> str:
+        """Name of the method: that of the stock controller, if it is for one."""
+        return self.method if self.profile == MIMO else self.profile
+
+    @property
+    def full(self) -> bool:
+        """Whether the gains have off-diagonals."""
+        return self.method == "mimo" and LAWS[self.profile].coupled
 
     @property
     def for_models(self) -> bool:

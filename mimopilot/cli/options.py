@@ -41,6 +41,12 @@ ReportOption = Annotated[
     Path | None, typer.Option(help="Also write a page with figures of the log and of these gains (HTML).")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Controller: mimo (our module), px4-stock or ardupilot-stock (the autopilot's own).", show_default="mimo"
+    ),
+]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]
 TimeoutOption = Annotated[
     float, typer.Option(min=0.5, max=600, help="Abort after this many seconds without a message from the vehicle.")

@@ -160,7 +160,7 @@ def experiment(
             excitation_seed=excitation_seed,
             both_axes=both_axes or None,
         )
-        own = {"seed": seed or None, "yaw_amplitude": yaw_amplitude}
+        own: dict[str, object] = {"seed": seed or None, "yaw_amplitude": yaw_amplitude}
         if profile == "px4-stock":
             own |= {"seconds_per_axis": seconds_per_axis, "bandwidth": bandwidth}
         elif profile == "ardupilot-stock":

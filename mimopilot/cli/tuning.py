@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ReportOption
+from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ProfileOption, ReportOption
 from mimopilot.cli.report import check_count, name_of, write_report_of
 from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
 from mimopilot.common.console import print_json, print_table, progress_console
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from mimopilot.tuning.logs.columns import Columns
     from mimopilot.tuning.spec import TuningSpec
 
+#: Details of a designed set that `tune --json` has, too.
+SHARED = ("predicted", "better_than_flown", "keep_flown", "worth_of_off_diagonals")
 #: Columns of the tables of predicted figures.
 PREDICTED = ("", "follows [deg]", "other axis [deg]", "after torque [deg]", "noise of u", "Ms")
 PREDICTED_TITLE = (
@@ -38,6 +40,7 @@ def register(app: typer.Typer) -> None:
     app.command(
         epilog="Example: mimopilot tune flight.ulg --out my.gains.toml; "
         "mimopilot tune light.ulg heavy.ulg --out both.gains.toml; "
+        "mimopilot tune stock.ulg --profile px4-stock --out stock.gains.toml; "
         "mimopilot tune flight.ulg --inner 20,0.4,0 --outer 10,0.7,0 --out thesis.gains.toml"
     )(tune)
     app.command(
@@ -53,6 +56,7 @@ def tune(
         typer.Argument(help="Flight log, or several of one vehicle; with --campaign many, or folders of them."),
     ],
     out: Annotated[Path, typer.Option(help="Where the gains are written: FILE.gains.toml; a folder with --campaign.")],
+    profile: ProfileOption = None,
     method: Annotated[
         str | None, typer.Option(help="mimo (full matrices, the default) or siso (each axis by itself).")
     ] = None,
@@ -102,6 +106,7 @@ def tune(
 
     task = load_spec(
         spec,
+        profile=profile,
         method=method,
         inner=parse_model(inner) if inner else None,
         outer=parse_model(outer) if outer else None,
@@ -131,11 +136,17 @@ def tune(
     known = {warning for experiment in experiments for warning in experiment.warnings}
     warn(logs[0], (warning for warning in gains.provenance.warnings if warning not in known))
     details, deviations = gains.provenance.details, gains.provenance.standard_deviation
-    comparison = {name: details[name] for name in ("predicted", "better_than_flown", "keep_flown") if name in details}
+    comparison = {name: details[name] for name in SHARED if name in details}
     if as_json:
         matrices: dict[str, Any] = {name: matrix.tolist() for name, matrix in gains.matrices.items()}
         models = gains.provenance.as_table()
-        found = {"out": str(out), "method": task.method, **matrices, "standard_deviation": deviations}
+        found = {
+            "out": str(out),
+            "controller": gains.controller,
+            "method": task.label,
+            **matrices,
+            "standard_deviation": deviations,
+        }
         certificate = gains.certificate.as_table() if gains.certificate else None
         print_json(
             {
@@ -149,7 +160,7 @@ def tune(
         )
     else:
         names = " and ".join(log.name for log in logs)
-        print_gains(f"{task.method.upper()} gains from {names} (standard deviation)", gains, deviations)
+        print_gains(f"{task.label.upper()} gains from {names} (standard deviation)", gains, deviations)
         print_comparison(gains, [log.name for log in logs])
         print_yaw(gains)
         print_certificate(gains)
@@ -167,13 +178,19 @@ def print_comparison(gains: Gains, logs: list[str]) -> None:
     model = f"{gains.provenance.outer_model[0].bandwidth:g} rad/s"
     rows = []
     for place, log in enumerate(logs):
-        for name in ("flown", "siso", "tuned"):
+        for name in ("flown", "siso", "tuned", "module"):
             if name in predicted:
-                shown = {"siso": "SISO"}.get(name, name)
+                shown = {"siso": "SISO", "module": "our module"}.get(name, name)
                 rows.append([f"{shown}, {log}" if len(logs) > 1 else shown, *prediction_cells(predicted[name][place])])
     print_table(PREDICTED_TITLE.format(model=model), PREDICTED, rows)
     if details.get("better_than_flown"):
         print("better than the gains that flew: in following and on the other axis, within the limits of Ms and noise")
+    worth = details.get("worth_of_off_diagonals", {})
+    for before, after in zip(worth.get("tuned", ()), worth.get("module", ()), strict=True):
+        print(
+            f"off-diagonals would bring: the other axis moves {after[0]:.2f} / {after[1]:.2f} instead of "
+            f"{before[0]:.2f} / {before[1]:.2f} degrees with our module"
+        )
     for reason in details.get("keep_flown", ()):
         print(f"keep what you fly: {reason}")
     if details["limited_by"]:

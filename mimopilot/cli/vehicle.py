@@ -12,6 +12,7 @@ from mimopilot.cli.options import (
     GainsArgument,
     JsonOption,
     KeyOption,
+    ProfileOption,
     SystemOption,
     TimeoutOption,
     UncertifiedOption,
@@ -49,9 +50,7 @@ def register(app: typer.Typer) -> None:
 def upload(
     gains: GainsArgument,
     connect: ConnectOption,
-    profile: Annotated[
-        str, typer.Option(help="mimo: our module. px4-stock, ardupilot-stock: the diagonal, in their controllers.")
-    ] = "mimo",
+    profile: ProfileOption = None,
     moment_scale: Annotated[
         str | None,
         typer.Option(
@@ -63,9 +62,6 @@ def upload(
     yes: YesOption = False,
     force_armed: ForceArmedOption = False,
     uncertified: UncertifiedOption = False,
-    drop_off_diagonals: Annotated[
-        bool, typer.Option("--drop-off-diagonals", help="Stock profiles: drop off-diagonals of any size.")
-    ] = False,
     timeout: TimeoutOption = 12.0,
     snapshot: SnapshotOption = None,
     signing_key: KeyOption = None,
@@ -86,9 +82,8 @@ def upload(
     plan, options, loaded, doubt = prepare_upload(
         gains,
         connect,
-        profile=profile,
+        profile=profile or "mimo",
         uncertified=uncertified,
-        drop_off_diagonals=drop_off_diagonals,
         system=system,
         timeout=timeout,
         signing_key=signing_key,
@@ -217,6 +212,13 @@ def import_params(
     rate: Annotated[
         float | None, typer.Option(help="Control rate, Hz; by default IMU_GYRO_RATEMAX or SCHED_LOOP_RATE.")
     ] = None,
+    profile: Annotated[
+        str,
+        typer.Option(
+            help="mimo: for our module, to fly it with the gains of before. px4-stock, ardupilot-stock: the stock "
+            "set itself."
+        ),
+    ] = "mimo",
     airframe: Annotated[
         str | None, typer.Option(help="Airframe whose unit of torque the gains have; by default it is unknown.")
     ] = None,
@@ -242,6 +244,7 @@ def import_params(
         connect=connect,
         defaults=defaults,
         rate=rate,
+        profile=profile,
         airframe=airframe,
         timeout=timeout,
         signing_key=signing_key,
@@ -258,8 +261,9 @@ def import_params(
                 "source_sha256": origin["source_sha256"],
                 "parameters": found.used,
                 "defaults": list(found.defaults),
+                "controller": found.gains.controller,
                 "Ts": found.gains.Ts,
-                "elements": found.gains.elements(),
+                "elements": found.gains.for_our_law().elements(),
                 "moment_scale": found.gains.moment_scale,
                 "not_carried": list(found.not_carried),
                 "warnings": list(found.warnings),
@@ -277,7 +281,7 @@ def print_import(found: ImportedGains) -> None:
     from mimopilot.tuning.parameters import ROWS
 
     gains, rows = found.gains, []
-    elements = gains.elements()
+    elements = gains.for_our_law().elements()
     for row in ROWS:
         for code in row.codes:
             names = found.stock.names(row, code)

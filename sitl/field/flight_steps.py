@@ -73,7 +73,7 @@ def fly_experiment(run: AutotuneRun) -> Found:
 
 def _excitation(options: AutotuneOptions) -> ExcitationOptions:
     return ExcitationOptions(
-        axis=None,
+        axis="all" if options.profile == "mimo" else None,
         seconds_per_axis=options.seconds_per_axis,
         amplitude=options.amplitude,
         bandwidth=BANDWIDTH,

@@ -67,9 +67,11 @@ def closed_loop_poles(gains: Law, plant: StateSpace) -> Complex:
     start = np.eye(n + m + 2 * axes)
     state, memory, rate, angle = np.split(start, [n, n + m, n + m + axes])
     now = plant.C @ state
-    angle = angle + gains.Ts / 2 * (now + rate)
+    before, angle = angle, angle + gains.Ts / 2 * (now + rate)
     poles = []
-    for setpoint in (np.zeros_like(now), -law.attitude_matrix(gains) @ angle):
+    # The attitude controller's setpoint is that of this period or, with a delay, of the one before.
+    measured = before if gains.filters.law.delay else angle
+    for setpoint in (np.zeros_like(now), -law.attitude_matrix(gains) @ measured):
         signals = {law.ERROR: setpoint - now, law.RATE: now, law.SETPOINT: setpoint}
         torque = flown.C @ memory + sum(flown.D[signal] @ values for signal, values in signals.items())
         ahead = flown.A @ memory + sum(flown.B[signal] @ values for signal, values in signals.items())

@@ -15,6 +15,7 @@ from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_terms import MIMO
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import ContinuousModel, second_order
 from mimopilot.tuning.spec import TuningSpec
@@ -123,6 +124,8 @@ def advise(
     TuningError
         As `tuning.design.tune_by_design.tune_by_design`.
     """
+    if spec.profile != MIMO:
+        raise TuningError(f"profile: got {spec.profile}, expected {MIMO}: for a stock controller use tune --profile")
     measured = PlantEstimates(experiment)
 
     def certified(gains: Gains, outer: ContinuousModel) -> Gains:
@@ -174,7 +177,7 @@ def _candidate(name: str, gains: Gains, model: ContinuousModel, bench: ResponseD
 def _slowest_zero(experiment: Experiment, cutoff_hz: float) -> float | None:
     """Slowest non-minimum-phase zero from torque to rate of the two axes, rad/s; None: there is none."""
     start, external = second_order(*FLEXIBLE, experiment.Ts), external_signal(experiment)[0]
-    flown = experiment.flown.filters if experiment.flown else Filters(experiment.Ts)
+    flown = experiment.flown.for_our_law().filters if experiment.flown else Filters(experiment.Ts)
     filters = replace(flown, Ts=experiment.Ts, derivative_cutoff_hz=cutoff_hz)
     models = [
         flexible_model(

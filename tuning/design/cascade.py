@@ -10,6 +10,7 @@ import numpy as np
 from mimopilot.tuning.analysis.certify_axes import certify_axes
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.quality_checks import check_saturation
+from mimopilot.tuning.design.stock_profile import check_profile
 from mimopilot.tuning.design.tune_by_design import tune_by_design
 from mimopilot.tuning.design.tune_for_models import tune_for_models
 from mimopilot.tuning.design.yaw_design import tune_yaw, with_yaw
@@ -61,6 +62,8 @@ def tune(
     """
     spec = spec or TuningSpec()
     flights = [experiments] if isinstance(experiments, Experiment) else list(experiments)
+    for one in flights:
+        check_profile(one, spec)
     estimates = [measured] if measured is not None else [PlantEstimates(one) for one in flights]
     doubts = [_doubts(one, spec) for one in flights]
     if not spec.for_models:

@@ -23,6 +23,7 @@ from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains, Limits, YawGains
 from mimopilot.tuning.law import TERMS, Filters
 from mimopilot.tuning.law_inverse import rebuild_rate_setpoint
+from mimopilot.tuning.law_terms import MIMO
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.spec import TuningSpec
@@ -223,6 +224,8 @@ def starting_set(experiment: Experiment, spec: TuningSpec) -> Gains:
         When neither the log nor the specification says what the yaw gains or the derivative's filter are.
     """
     flown = experiment.flown
+    if flown is not None and spec.profile == MIMO:
+        flown = flown.for_our_law()
     required = {
         "which yaw gains flew ([yaw]: Kp_o, Kp_i, Ki_i, Kd_i)": spec.yaw,
         "which derivative filter flew (derivative_cutoff_hz, Hz, 0 for none)": spec.derivative_cutoff_hz,

@@ -11,6 +11,7 @@ from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.response_design import Design, ResponseDesign
+from mimopilot.tuning.design.stock_profile import at_loop_rates, in_digits
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import ContinuousModel, SecondOrder
 from mimopilot.tuning.spec import TuningSpec
@@ -43,8 +44,13 @@ def certified_design(
     """
     bandwidth = None
     for attempt in range(MAX_DESIGNS):
-        found = bench.design(starts, spec.structure, spec.method == "mimo", bandwidth)
-        certificates = [certificate(found.law, one, spec, inner, found.model) for one in measured]
+        found = bench.design(starts, spec.structure, spec.full, bandwidth)
+        found = replace(found, law=in_digits(found.law))
+        certificates = [
+            certificate(at_rate, one, spec, inner, found.model)
+            for one in measured
+            for at_rate in at_loop_rates(found.law, one.experiment)
+        ]
         if not uncertified(certificates) or attempt == MAX_DESIGNS - 1:
             break
         starts, bandwidth = [found.law], found.model.omega

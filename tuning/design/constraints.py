@@ -194,7 +194,7 @@ class GainLimit:
         return controller @ self.G, self.limit - error
 
     def _shapes(self, free: FreeGains) -> dict[str, Complex]:
-        one = np.ones((1, 1))
+        one = np.ones((1, self.G.shape[-1]))
         return {
             name: rate_response({LETTERS[name]: one}, free.base.filters, self.omega)[1]
             for name in free.units
@@ -211,14 +211,14 @@ class GainLimit:
         if not len(self.omega):
             return
         product, left = self._gain(loop)
-        shapes = {name: shape[:, 0, 0] for name, shape in self._shapes(loop.free).items()}
+        shapes = self._shapes(loop.free)
         U, sizes, V = np.linalg.svd(product)
         for part in range(loop.plant.axes):
             slope = np.zeros((len(product), problem.size))
             right = (self.G @ V[:, part].conj()[:, :, None])[:, :, 0]
             for place, (name, row, column) in enumerate(loop.free.places()):
                 if name in shapes:
-                    slope[:, place] = np.real(U[:, row, part].conj() * shapes[name] * right[:, column])
+                    slope[:, place] = np.real(U[:, row, part].conj() * shapes[name][:, 0, column] * right[:, column])
             problem.above(-slope * loop.free.size / self.limit, (left - sizes[:, part]) / self.limit)
 
 
@@ -313,6 +313,38 @@ class Definite:
             problem.above(slope, value)
         else:
             problem.cone(slope[None], value[None])
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterRange:
+    """The diagonal of a gain matrix stays within the range of the autopilot's parameters.
+
+    Attributes
+    ----------
+    matrix : str
+    largest : (n,) array
+        In the unit of the matrix.
+    """
+
+    matrix: str
+    largest: Signal
+
+    @property
+    def name(self) -> str:
+        """See `Constraint`."""
+        return f"the autopilot's range of {self.matrix}"
+
+    def margin(self, loop: LoopGradient) -> float:
+        """See `Constraint`."""
+        return float(np.min(1 - np.diag(loop.matrices[self.matrix]) / self.largest))
+
+    def add(self, problem: ConicProblem, loop: LoopGradient) -> None:
+        """See `Constraint`."""
+        slope = np.zeros((len(self.largest), problem.size))
+        for place, (name, row, column) in enumerate(loop.free.places()):
+            if name == self.matrix and row == column:
+                slope[row, place] = -loop.free.units[name] / self.largest[row]
+        problem.above(slope, 1 - np.diag(loop.matrices[self.matrix]) / self.largest)
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.design.free_gains import ACCELERATION, FreeGains
-from mimopilot.tuning.law import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, model_response, rate_response
+from mimopilot.tuning.law import (
+    ATTITUDE,
+    ATTITUDE_FEEDFORWARD,
+    LOOP_TERMS,
+    attitude_response,
+    fixed_matrices,
+    model_response,
+    rate_response,
+)
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.small_matrices import inverse
 
@@ -74,18 +82,21 @@ class LoopGradient:
 
     @cached_property
     def _shapes(self) -> Mapping[str, tuple[Complex, Complex]]:
-        """Rate controller's matrix -> responses (K, 1, 1) from the rate setpoint and from the measured rate to u."""
-        one = np.ones((1, 1))
-        return {
+        """Rate controller's matrix -> responses (K, 1, n) of its columns from the rate setpoint and rate to u."""
+        one, shape = np.ones((1, self.plant.axes)), (len(self.plant.omega), 1, self.plant.axes)
+        found = {
             name: rate_response({LETTERS[name]: one}, self.free.base.filters, self.plant.omega)
             for name in self.free.units
             if name in LETTERS
         }
+        return {name: (np.broadcast_to(r, shape), np.broadcast_to(y, shape)) for name, (r, y) in found.items()}
 
     @cached_property
     def C_r(self) -> Complex:  # noqa: N802
         """From the rate setpoint to u, (K, n, n)."""
-        return np.asarray(sum(of_r * self.matrices[name] for name, (of_r, _) in self._shapes.items()), complex)
+        tuned = np.asarray(sum(of_r * self.matrices[name] for name, (of_r, _) in self._shapes.items()), complex)
+        fixed = fixed_matrices(self.free.base.filters, self.plant.axes)
+        return tuned + rate_response(fixed, self.free.base.filters, self.plant.omega)[0] if fixed else tuned
 
     @cached_property
     def C_y(self) -> Complex:  # noqa: N802
@@ -95,7 +106,12 @@ class LoopGradient:
     @cached_property
     def C_o(self) -> Complex:  # noqa: N802
         """From the measured angles to -u, (K, n, n)."""
-        return self.C_r @ self.matrices[ATTITUDE.matrix]
+        return self.C_r @ self.matrices[ATTITUDE.matrix] * self._delay
+
+    @cached_property
+    def _delay(self) -> Complex:
+        """From the attitude controller's output to the rate controller, (K, 1, 1)."""
+        return attitude_response(self.free.base.filters, self.plant.omega)
 
     @cached_property
     def L_i(self) -> Complex:  # noqa: N802
@@ -121,7 +137,7 @@ class LoopGradient:
     def _rate_setpoint(self) -> Complex:
         """From the attitude setpoint to the rate setpoint, without the measured angles, (K, n, n)."""
         angle, rate, _ = self._model
-        found: Complex = self.matrices[ATTITUDE.matrix] * angle
+        found: Complex = self.matrices[ATTITUDE.matrix] * angle * self._delay
         return found + self.matrices[ATTITUDE_FEEDFORWARD.matrix] * rate if self._follows else found
 
     @property
@@ -173,7 +189,8 @@ class LoopGradient:
     def _rows(self) -> Mapping[str, Complex]:
         """alpha, beta, gamma, xi of the module's equations and beta of the rate loop alone, (K, n, ...) each."""
         count, n, N = len(self.plant.omega), self.plant.axes, self.plant.noise
-        eye, Kp_o = np.eye(n), self.matrices[ATTITUDE.matrix]
+        eye, delay = np.eye(n), self._delay[:, 0]
+        Kp_o = self.matrices[ATTITUDE.matrix] * self._delay
         angle, noise_o = Kp_o @ self.plant.G_o, Kp_o @ N[:, n:]
         model_angle, model_rate, model_acceleration = (part[:, 0] for part in self._model)
         none, noiseless = np.zeros(n), np.zeros(2 * n)
@@ -187,13 +204,13 @@ class LoopGradient:
             if name == ATTITUDE.matrix:
                 add(
                     alpha=self.C_r[:, :, row],
-                    beta=self.plant.G_o[:, column],
-                    gamma=model_angle * eye[column],
-                    xi=N[:, n + column],
+                    beta=self.plant.G_o[:, column] * delay,
+                    gamma=model_angle * eye[column] * delay,
+                    xi=N[:, n + column] * delay,
                     beta_i=none,
                 )
             elif name in LETTERS:
-                of_r, of_y = (shape[:, 0] for shape in self._shapes[name])
+                of_r, of_y = (shape[:, :, column] for shape in self._shapes[name])
                 add(
                     alpha=eye[row],
                     beta=of_y * self.plant.G_i[:, column] + of_r * angle[:, column],

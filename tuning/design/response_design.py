@@ -26,6 +26,7 @@ from mimopilot.tuning.design.constraints import (
     Distance,
     MotorLimit,
     NoiseLimit,
+    ParameterRange,
     gain_above_band,
     structural_modes,
 )
@@ -324,6 +325,9 @@ class ResponseDesign:
             found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
         if TERMS["D"].matrix in free.units:
             found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(plant.axes))]
+        largest = free.base.filters.law.largest or {}
+        axes = slice(2, 3) if plant.axes == 1 else slice(0, plant.axes)
+        found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
         return found + self._actuators(place)
 
     def _actuators(self, place: int) -> list[Constraint]:

@@ -15,10 +15,12 @@ from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
 from mimopilot.tuning.design.certified_design import certified_design, rate_model, uncertified, weakest
 from mimopilot.tuning.design.prediction import Prediction, offaxis_doubt, predict, reasons_to_keep
 from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign, vehicle_damps
+from mimopilot.tuning.design.stock_profile import WORTH, at_loop_rates, our_module, stock_starts, worth
 from mimopilot.tuning.design.yaw_design import tune_yaw, with_yaw
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS
+from mimopilot.tuning.law_terms import MIMO
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import SecondOrder
@@ -71,15 +73,19 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
     yaw = tune_yaw(measured, spec, found.gains, found.model.omega)
 
     def certified(gains: Gains) -> Certificate:
-        rate, attitude = ([model.discretise(gains.Ts)] * 2 for model in (inner, found.model))
-        return weakest([certify_axes(gains, one, rate, attitude, spec.certificate) for one in measured])
+        certificates = []
+        for one in measured:
+            for at_rate in at_loop_rates(gains, one.experiment):
+                rate, attitude = ([model.discretise(at_rate.Ts)] * 2 for model in (inner, found.model))
+                certificates.append(certify_axes(at_rate, one, rate, attitude, spec.certificate))
+        return weakest(certificates)
 
     gains, yaw, final = with_yaw(found.gains, yaw, certified)
     warnings = [] if all(one.experiment.motors for one in measured) else [MOTORS_UNKNOWN]
     if vehicle_damps(found):
         warnings.append(VEHICLE_DAMPS)
     provenance = Provenance(
-        method=spec.method,
+        method=spec.label,
         inner_model=(inner, inner),
         outer_model=(found.model, found.model),
         standard_deviation={name: value.tolist() for name, value in bench.deviations(found).items()},
@@ -101,6 +107,8 @@ def starting_points(
     """Gain sets that a search begins at, and their origin: VRFT's of the first log, and the flown ones."""
     first, B = measured[0].experiment, bench.plants[0].body.B
     base = starting_set(first, spec)
+    if spec.profile != MIMO:
+        return stock_starts(base, first, inner.omega, B), "flown, rigid body"
     # The bandwidth is the design's.
     filters = replace(base.filters, model_omega=FIRST_BANDWIDTH if spec.follow_model else 0.0)
     inverse = np.asarray(np.linalg.inv(B), np.float64)
@@ -126,14 +134,19 @@ def starting_points(
 def comparison(
     found: Design, measured: Sequence[PlantEstimates], bench: ResponseDesign, spec: TuningSpec
 ) -> dict[str, Any]:
-    """Predicted figures as plain values: of a design, of the flown gains, and of the same design axis by axis.
+    """Predicted figures as plain values: of a design, of the flown gains, and of an alternative.
+
+    That is the same design axis by axis, or for a stock controller our module's with full matrices.
 
     ``keep_flown`` says why the flown gains are better; it is empty if they are not.
     """
     tasks = [(plant, manoeuvres(plant, found.model.discretise(plant.Ts))) for plant in bench.plants]
     new = [predict(found.gains, *task) for task in tasks]
     shown = {"tuned": new}
-    if spec.method == "mimo":
+    if spec.profile != MIMO:
+        module = our_module(found, bench, spec)
+        shown["module"] = [predict(module.gains, *task) for task in tasks]
+    elif spec.full:
         siso = bench.design([found.gains], spec.structure, full=False, bandwidth=found.model.omega)
         shown["siso"] = [predict(siso.gains, *task) for task in tasks]
     result: dict[str, Any] = {}
@@ -147,6 +160,8 @@ def comparison(
         ]
         keep = reasons_to_keep(new, shown["flown"], spec.design, found.model.omega / fastest, doubts)
         result |= {"better_than_flown": not keep, "keep_flown": keep}
+    if spec.profile != MIMO:
+        result |= {WORTH: worth(shown)}
     return {"predicted": {name: _plain(figures) for name, figures in shown.items()}, **result}
 
 

@@ -14,11 +14,14 @@ import numpy as np
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law_terms import LAWS
 from mimopilot.tuning.logs.stock_controllers import stock_of
 from mimopilot.tuning.parameter_row import AXIS_LETTERS, PREFIX, Row, Shape
-from mimopilot.tuning.parameters import ENABLE, ROWS, SCALE
+from mimopilot.tuning.parameters import ENABLE, ROWS, SCALE, rows
 from mimopilot.tuning.provenance import Provenance
 
+#: Details of a flown stock set: filters whose parameters are not logged, and the control rate in the parameters, Hz.
+LACKING, LOOP_RATE = "lacking_parameters", "loop_rate_hz"
 #: The period is that of the log.
 _PERIOD = next(row for row in ROWS if row.key == "Ts")
 
@@ -37,7 +40,9 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
     -------
     Gains or None
         None when the parameters do not describe a complete controller, or one that cannot run with that period.
-        Elements without a ``MIMO_`` parameter in the log (yaw, limits) are the autopilot's own.
+        Elements without a ``MIMO_`` parameter in the log (yaw, limits) are the autopilot's own. Without any, the set is
+        that of the stock law, with its filters; where a parameter of these is not logged the set is in our law, and
+        `LACKING` of its details names what is missing.
     """
     # Vehicles store float32: use the shortest decimal that rounds to the same float32.
     values = {name: float(str(np.float32(value))) for name, value in parameters.items()}
@@ -45,7 +50,17 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
         values = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
     stock = stock_of(values)
     found: dict[Row, Any] = {_PERIOD: Ts}
+    details: dict[str, Any] = {}
+    filters = None
+    if not any(PREFIX + code in values for row in rows(Shape.MATRIX) for code in row.codes):
+        lacking = [name for name in stock.filter_names if name not in values]
+        details = {LACKING: lacking} if lacking else {LOOP_RATE: values[stock.rate]} if stock.rate in values else {}
+        filters = None if lacking else stock.stock_filters(values)
+    lacks = () if filters is None else LAWS[stock.profile].lacks
     for row in ROWS:
+        if row.key in lacks:
+            found |= {row: 0.0} if row.shape is Shape.POLE else {}
+            continue
         ours = any(PREFIX + code in values for code in row.codes)
         if row is _PERIOD or (row.default is not None and not ours and not stock.maps(row)):
             continue
@@ -58,7 +73,7 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
         found[row] = numbers[0] if len(numbers) == 1 else numbers
     scale: Any = tuple(values.get(f"{PREFIX}{SCALE}_{letter}") for letter in AXIS_LETTERS)
     try:
-        gains = Gains.from_rows(found, provenance=Provenance("flown"))
+        gains = Gains.from_rows(found, stock=filters, provenance=Provenance("flown", details=details))
     except TuningError:  # such as an attitude model that is too fast for the period of the log
         return None
     return replace(gains, moment_scale=None if None in scale else scale)

@@ -17,6 +17,7 @@ from mimopilot.common.files import read_bytes, sha256
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains, Triple
+from mimopilot.tuning.law_terms import MIMO
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.logs.formats import log_format
 from mimopilot.tuning.logs.parameter_file import read_parameter_file
@@ -159,7 +160,8 @@ def needed_names(stock: StockController) -> list[str]:
 
 def vehicle_names(stock: StockController) -> tuple[list[str], list[str]]:
     """Parameters to read from a vehicle: those that it must have, and others."""
-    return needed_names(stock), [*optional_names(stock), *(parameter.name for parameter in IDENTITY)]
+    others = [name for name in stock.filter_names if name not in needed_names(stock)]
+    return needed_names(stock), [*others, *optional_names(stock), *(parameter.name for parameter in IDENTITY)]
 
 
 def import_gains(
@@ -168,8 +170,9 @@ def import_gains(
     defaults: str | None = None,
     rate: float | None = None,
     moment_scale: Triple | None = None,
+    profile: str = MIMO,
 ) -> ImportedGains:
-    """The gains of a stock controller, for our law.
+    """The gains of a stock controller, for our law or as the stock set itself.
 
     Parameters
     ----------
@@ -180,6 +183,8 @@ def import_gains(
         Control rate; by default that of the parameters.
     moment_scale : tuple of 3 float, optional, N m
         Torque of u = 1 on the vehicle. By default what it publishes, else not known.
+    profile : str
+        ``mimo``: for our law. Else the stock set, in its own law; it must be that of the source.
 
     Raises
     ------
@@ -193,7 +198,12 @@ def import_gains(
     stock = _stock_controller(values, source)
     if defaults is not None and stock is not PX4:
         raise TuningError(f"--defaults {defaults}: {source.name} is of {stock.name}; leave it out")
-    needed = [name for name in needed_names(stock) if not (rate is not None and name == stock.rate)]
+    if profile not in (MIMO, stock.profile):
+        known = f"{MIMO} or {stock.profile}"
+        raise TuningError(f"--profile: got {profile!r}, but {source.name} is of {stock.name}: give {known}")
+    exact = profile != MIMO
+    wanted = [*needed_names(stock), *(stock.filter_names if exact else ())]
+    needed = [name for name in dict.fromkeys(wanted) if not (rate is not None and name == stock.rate)]
     missing = [name for name in needed if name not in values]
     if missing and defaults is None:
         advice = "read it from the vehicle (--connect), or save all parameters, not only those that were changed"
@@ -205,10 +215,12 @@ def import_gains(
         raise TuningError(f"{'--rate' if rate else stock.rate}: got {hertz:g} Hz, expected more than 0")
     _check_values(stock, complete, source)
     found = flown_gains(complete, 1 / hertz)
+    if found is not None and not exact:
+        found = found.for_our_law()
     if found is None:
         raise TuningError(f"{source.name}: {hertz:g} Hz: our law cannot run at this control rate; give another --rate")
     warnings = [*source.warnings, *_doubts(source, stock, hertz, rate is not None)]
-    not_carried = differences(stock, complete)
+    not_carried = differences(stock, complete, exact)
     scale = moment_scale or _published_scale(source.values)
     if scale is None:
         warnings.append("the torque of u = 1 is not known: moment_scale is unknown, and fly and upload ask for it")
@@ -219,7 +231,7 @@ def import_gains(
     details["not_carried"] = not_carried
     gains = replace(found, moment_scale=scale, provenance=Provenance("imported", details=details))
     try:
-        check_ranges(gains)
+        check_ranges(gains.for_our_law())
     except TuningError as error:
         warnings.append(f"{error}: generate and upload will refuse it")
     used = {name: complete[name] for name in needed}

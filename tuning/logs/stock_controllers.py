@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from mimopilot.tuning.gains import Limits
+from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, PX4_STOCK, StockFilters
 from mimopilot.tuning.parameter_row import AXIS_LETTERS, Row, Shape
 
 
@@ -31,6 +32,12 @@ class StockController:
         Cut-off of a filter -> parameter, Hz.
     rate : str
         Parameter of the control rate, Hz.
+    profile : str
+        Its law, a key of `tuning.law_terms.LAWS`.
+    filters : mapping
+        Filter of its law -> parameter for roll, pitch and yaw; empty: none.
+    later : tuple of str
+        Parameters that earlier versions do not have, and do not need: their filter or gain is 0.
     scalars : mapping
         Scalar of our table -> parameter.
     unlimited : mapping
@@ -44,8 +51,24 @@ class StockController:
     limits: Mapping[str, list[tuple[str, float, float]]]
     cutoffs: Mapping[str, str]
     rate: str
+    profile: str
+    filters: Mapping[str, tuple[str, str, str]]
+    later: tuple[str, ...]
     scalars: Mapping[str, str] = field(default_factory=dict)
     unlimited: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+
+    @property
+    def filter_names(self) -> list[str]:
+        """Parameters of the filters that every version has."""
+        names = [name for axes in self.filters.values() for name in axes if name and name not in self.later]
+        return list(dict.fromkeys(names))
+
+    def stock_filters(self, values: Mapping[str, float]) -> StockFilters:
+        """The filters of its law; `values` hold all `filter_names`."""
+        return StockFilters(
+            self.profile,
+            **{name: tuple(values.get(one, 0.0) for one in axes) for name, axes in self.filters.items()},
+        )
 
     def maps(self, row: Row) -> bool:
         """Whether it has parameters for a row of our table."""
@@ -108,9 +131,19 @@ PX4 = StockController(
     },
     cutoffs={"derivative_cutoff_hz": "IMU_DGYRO_CUTOFF"},
     rate="IMU_GYRO_RATEMAX",
+    profile=PX4_STOCK,
+    filters={"derivative_hz": ("IMU_DGYRO_CUTOFF",) * 3, "torque_hz": ("", "", "MC_YAW_TQ_CUTOFF")},
+    later=("MC_YAW_TQ_CUTOFF",),
     scalars={"yaw_weight": "MC_YAW_WEIGHT"},
 )
 _ARDUPILOT_AXES = ("RLL", "PIT", "YAW")
+
+
+def _of_axes(name: str) -> tuple[str, str, str]:
+    roll, pitch, yaw = (f"ATC_RAT_{axis}_{name}" for axis in _ARDUPILOT_AXES)
+    return roll, pitch, yaw
+
+
 ARDUPILOT = StockController(
     name="ArduPilot",
     axes=_ARDUPILOT_AXES,
@@ -129,6 +162,14 @@ ARDUPILOT = StockController(
     },
     cutoffs={"derivative_cutoff_hz": "ATC_RAT_RLL_FLTD"},
     rate="SCHED_LOOP_RATE",
+    profile=ARDUPILOT_STOCK,
+    filters={
+        "derivative_hz": _of_axes("FLTD"),
+        "setpoint_hz": _of_axes("FLTT"),
+        "error_hz": _of_axes("FLTE"),
+        "derivative_feedforward": _of_axes("D_FF"),
+    },
+    later=_of_axes("D_FF"),
     unlimited={"rate_max": Limits().rate_max},
 )
 

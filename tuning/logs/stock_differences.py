@@ -45,7 +45,7 @@ def optional_names(stock: StockController) -> tuple[str, ...]:
     return (*per_axis, *cutoffs, *_ARDUPILOT, *_ARDUPILOT_GYRO, "FRAME_CLASS")
 
 
-def differences(stock: StockController, values: Mapping[str, float]) -> list[str]:
+def differences(stock: StockController, values: Mapping[str, float], exact: bool = False) -> list[str]:
     """One text for each thing that the gains cannot carry over.
 
     Parameters
@@ -53,11 +53,16 @@ def differences(stock: StockController, values: Mapping[str, float]) -> list[str
     stock : StockController
     values : mapping
         All parameters that are known.
+    exact : bool
+        The gains are for this stock controller itself.
     """
-    return _of_px4(values) if stock is PX4 else _of_ardupilot(values)
+    if exact:  # what its own set holds is not missing from it
+        held = {name for axes in stock.filters.values() for name in axes}
+        values = {name: value for name, value in values.items() if name not in held}
+    return _of_px4(values, exact) if stock is PX4 else _of_ardupilot(values, exact)
 
 
-def _of_px4(values: Mapping[str, float]) -> list[str]:
+def _of_px4(values: Mapping[str, float], exact: bool) -> list[str]:
     found = _named(_PX4, values)
     damped = [axis for axis in PX4.axes if values.get(f"MC_{axis}RATE_D", 0)]
     if damped:
@@ -65,29 +70,33 @@ def _of_px4(values: Mapping[str, float]) -> list[str]:
             f"D ({', '.join(axis.lower() for axis in damped)}): PX4 differentiates and filters at the sensor's rate, "
             "ours at the control rate, with the same first-order cut-off"
         )
-    found.append("PX4 integrates less when the rate error is large (none at 400 deg/s); ours does not")
+    if damped and exact:
+        found[-1] = f"{found[-1].partition(':')[0]}: PX4 filters at the gyro's rate, here at the control rate"
+    ours = "" if exact else "; ours does not"
+    found.append(f"PX4 integrates less when the rate error is large (none at 400 deg/s){ours}")
     found += _gyro(_PX4_GYRO, values)
     return found
 
 
-def _of_ardupilot(values: Mapping[str, float]) -> list[str]:
+def _of_ardupilot(values: Mapping[str, float], exact: bool) -> list[str]:
     found = [
         text
         for axis in ARDUPILOT.axes
         for text in _named({f"ATC_RAT_{axis}_{name}": what for name, what in _ARDUPILOT_AXIS.items()}, values)
     ]
     own = values.get("ATC_RAT_RLL_FLTD")
-    for axis in ARDUPILOT.axes[1:]:
+    for axis in () if exact else ARDUPILOT.axes[1:]:
         name = f"ATC_RAT_{axis}_FLTD"
         if values.get(f"ATC_RAT_{axis}_D", 0) and values.get(name, own) != own:
             found.append(f"{name} {values[name]:g} Hz: our law has one derivative filter, that of roll ({own:g} Hz)")
-    if any(values.get(f"ATC_RAT_{axis}_D", 0) for axis in ARDUPILOT.axes):
+    if not exact and any(values.get(f"ATC_RAT_{axis}_D", 0) for axis in ARDUPILOT.axes):
         found.append("D: ArduPilot's acts on the error, ours on the measured rate")
     found += _named(_ARDUPILOT, values)
     for axis, limit in zip("RPY", ARDUPILOT.unlimited["rate_max"], strict=True):
         if values.get(f"ATC_RATE_{axis}_MAX") == 0:
             found.append(f"ATC_RATE_{axis}_MAX 0: no limit; our law needs one, {limit:g} rad/s")
-    found.append(f"yaw_weight {YAW_WEIGHT:g}: our default; ArduPilot has another law for tilt and yaw together")
+    if not exact:
+        found.append(f"yaw_weight {YAW_WEIGHT:g}: our default; ArduPilot has another law for tilt and yaw together")
     found.append("ArduPilot scales torque with battery voltage and air density in its motor library")
     found += _gyro(_ARDUPILOT_GYRO, values)
     return found

@@ -1,28 +1,24 @@
 """Conversion of gains to the parameters of a vehicle: our module's, or those of a stock autopilot.
 
-A stock controller is diagonal: off-diagonal gains are lost. No factor is needed for the gains: PX4's and ArduPilot's
-angle P is in 1/s; their rate P, I, D and FF are normalised torque per rad/s, its integral, its derivative and the rate
-setpoint. Both filter the derivative by a first-order low-pass with our cutoff. Rate limits are converted to deg/s.
-The unit of the normalised torque is the vehicle's own: see `sitl.physics.moment_scale`.
+A set is for one controller, and only that one receives it: what flies is what was certified. No factor is needed: PX4's
+and ArduPilot's angle P is in 1/s; their rate P, I, D and FF are normalised torque per rad/s, its integral, its
+derivative and the rate setpoint. Rate limits are converted to deg/s. The unit of the normalised torque is the vehicle's
+own: see `sitl.physics.moment_scale`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-
-import numpy as np
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
-from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameter_row import AXES, AXIS_LETTERS, PREFIX, Parameter
-from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, MATRICES, PARAMETERS, ROWS, YAW_GAINS, Setting
-
-#: Largest off-diagonal gain, as a share of its row's diagonal, that a stock profile drops without the option; chosen.
-DROPPED_SHARE = 0.1
+from mimopilot.tuning.gains import Gains, Triple
+from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, MIMO, PX4_STOCK, StockFilters
+from mimopilot.tuning.parameter_row import PREFIX, Parameter, Shape
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, ROWS, Setting, rows
 
 
 @dataclass(frozen=True)
@@ -48,8 +44,6 @@ class UploadPlan:
         Name -> value that the firmware must have been built with.
     scale : tuple of str
         Parameters in which the vehicle publishes its unit of torque, N m; empty if it has none.
-    dropped : dict
-        Code of a gain that the vehicle has no parameter for -> its size as a share of its row's diagonal.
     notes : tuple of str
         Other differences of the vehicle's controller.
     profile : str
@@ -61,7 +55,6 @@ class UploadPlan:
     settings: tuple[ParameterWrite, ...]
     fixed: dict[str, float]
     scale: tuple[str, ...]
-    dropped: dict[str, float]
     notes: tuple[str, ...] = ()
     profile: str = ""
     integers: frozenset[str] = frozenset()
@@ -79,65 +72,75 @@ def _mimo(gains: Gains) -> UploadPlan:
         ParameterWrite(p.name, p.unit, elements[p.code], p.minimum, p.maximum) for p in PARAMETERS if p.writable
     )
     fixed = {p.name: single(elements[p.code]) for p in PARAMETERS if not p.writable}
-    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY), {})
+    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY))
 
 
 def _px4_stock(gains: Gains) -> UploadPlan:
-    """Ranges are from PX4's parameter reference; if it has no maximum, from our table."""
+    """PX4 multiplies P, I and D by K: it is set to 1."""
+    stock, largest = _stock_law(gains)
     settings: list[ParameterWrite] = []
-    largest_p, largest_d = (0.5, 0.6, 0.6), (0.01, 0.5, 0.5)
     for axis, name in enumerate(("ROLL", "PITCH", "YAW")):
-        angle, p, i, d, ff = _diagonal(gains, axis)
-        limit = math.degrees(gains.limits.rate_max[axis])
+        names = (f"MC_{name}_P", *(f"MC_{name}RATE_{term}" for term in ("P", "I", "D", "FF")))
         settings += [
-            ParameterWrite(f"MC_{name}_P", "1/s", angle, 0.0, 5.0 if name == "YAW" else 12.0),
-            ParameterWrite(f"MC_{name}RATE_P", "s", p, 0.0, largest_p[axis]),
-            ParameterWrite(f"MC_{name}RATE_I", "", i, 0.0, 10.0),
-            ParameterWrite(f"MC_{name}RATE_D", "s^2", d, 0.0, largest_d[axis]),
-            ParameterWrite(f"MC_{name}RATE_FF", "s", ff, 0.0, 5.0),
-            # PX4 multiplies P, I and D by it.
+            *_gains_of(gains, axis, names, largest),
             ParameterWrite(f"MC_{name}RATE_K", "", 1.0, 1.0, 1.0),
             ParameterWrite(f"MC_{name[0]}R_INT_LIM", "norm", gains.limits.integral_max[axis], 0.0, 1.0),
-            ParameterWrite(f"MC_{name}RATE_MAX", "deg/s", limit, 0.0, 1800.0),
+            ParameterWrite(f"MC_{name}RATE_MAX", "deg/s", math.degrees(gains.limits.rate_max[axis]), 0.0, 1800.0),
         ]
     settings.append(ParameterWrite("MC_YAW_WEIGHT", "norm", gains.filters.yaw_weight, 0.0, 1.0))
-    settings.append(ParameterWrite("IMU_DGYRO_CUTOFF", "Hz", gains.derivative_cutoff_hz, 0.0, 1000.0))
-    notes = ("PX4 integrates less when the rate error is large, and MC_YAW_TQ_CUTOFF filters yaw; neither is set",)
-    return UploadPlan(tuple(settings), {}, (), {}, notes)
+    settings.append(ParameterWrite("IMU_DGYRO_CUTOFF", "Hz", stock.derivative_hz[0], 0.0, 1000.0))
+    if stock.torque_hz[2]:  # older versions have no such filter
+        settings.append(ParameterWrite("MC_YAW_TQ_CUTOFF", "Hz", stock.torque_hz[2], 0.0, 10.0))
+    return UploadPlan(tuple(settings), {}, (), ("PX4 integrates less when the rate error is large",))
 
 
 def _ardupilot_stock(gains: Gains) -> UploadPlan:
-    """Ranges are from ArduPilot's parameter reference, but start at 0: it enforces none."""
+    """Ranges start at 0: ArduPilot enforces none."""
+    stock, largest = _stock_law(gains)
     settings: list[ParameterWrite] = []
-    largest_p, largest_i, largest_d = (0.5, 0.5, 2.5), (2.0, 2.0, 1.0), (0.05, 0.05, 0.02)
     for axis, name in enumerate(("RLL", "PIT", "YAW")):
-        angle, p, i, d, ff = _diagonal(gains, axis)
+        names = (f"ATC_ANG_{name}_P", *(f"ATC_RAT_{name}_{term}" for term in ("P", "I", "D", "FF")))
+        limit = math.degrees(gains.limits.rate_max[axis])
         settings += [
-            ParameterWrite(f"ATC_ANG_{name}_P", "1/s", angle, 0.0, 12.0),
-            ParameterWrite(f"ATC_RAT_{name}_P", "s", p, 0.0, largest_p[axis]),
-            ParameterWrite(f"ATC_RAT_{name}_I", "", i, 0.0, largest_i[axis]),
-            ParameterWrite(f"ATC_RAT_{name}_D", "s^2", d, 0.0, largest_d[axis]),
-            ParameterWrite(f"ATC_RAT_{name}_FF", "s", ff, 0.0, 0.5),
+            *_gains_of(gains, axis, names, largest),
             ParameterWrite(f"ATC_RAT_{name}_IMAX", "norm", gains.limits.integral_max[axis], 0.0, 1.0),
-            ParameterWrite(f"ATC_RAT_{name}_FLTD", "Hz", gains.derivative_cutoff_hz, 0.0, 100.0),
-            ParameterWrite(f"ATC_RATE_{name[0]}_MAX", "deg/s", math.degrees(gains.limits.rate_max[axis]), 0.0, 1080.0),
+            ParameterWrite(f"ATC_RAT_{name}_FLTT", "Hz", stock.setpoint_hz[axis], 0.0, 100.0),
+            ParameterWrite(f"ATC_RAT_{name}_FLTE", "Hz", stock.error_hz[axis], 0.0, 100.0),
+            ParameterWrite(f"ATC_RAT_{name}_FLTD", "Hz", stock.derivative_hz[axis], 0.0, 100.0),
+            ParameterWrite(f"ATC_RATE_{name[0]}_MAX", "deg/s", limit, 0.0, 1080.0),
         ]
-    notes = (
-        "ArduPilot's D acts on the error, not on the measurement; its FLTT and FLTE filters, which our loop does not "
-        "have, are not set",
-    )
-    return UploadPlan(tuple(settings), {}, (), {}, notes)
+        if stock.derivative_feedforward[axis]:  # older versions have none
+            value = stock.derivative_feedforward[axis]
+            settings.append(ParameterWrite(f"ATC_RAT_{name}_D_FF", "s^2", value, 0.0, 0.02))
+    notes = ("ArduPilot replaces the angle P by a square root for large errors, and shapes the setpoint",)
+    return UploadPlan(tuple(settings), {}, (), notes)
+
+
+def _stock_law(gains: Gains) -> tuple[StockFilters, Mapping[str, Triple]]:
+    """Filters of a stock set, and the largest gains of its controller."""
+    stock, largest = gains.filters.stock, gains.filters.law.largest
+    assert stock is not None and largest is not None  # make_plan compares the profile with the set's controller
+    return stock, largest
+
+
+def _gains_of(
+    gains: Gains, axis: int, names: tuple[str, ...], largest: Mapping[str, Triple]
+) -> Iterator[ParameterWrite]:
+    """P of the attitude controller, then P, I, D and FF of the rate controller, of one axis."""
+    for row, name in zip(rows(Shape.YAW), names, strict=True):
+        value = getattr(gains.yaw, row.key) if axis == 2 else float(getattr(gains, row.key)[axis, axis])
+        yield ParameterWrite(name, row.unit, value, 0.0, largest[row.key][axis])
 
 
 #: Profile -> its conversion of gains.
 PROFILES: dict[str, Callable[[Gains], UploadPlan]] = {
-    "mimo": _mimo,
-    "px4-stock": _px4_stock,
-    "ardupilot-stock": _ardupilot_stock,
+    MIMO: _mimo,
+    PX4_STOCK: _px4_stock,
+    ARDUPILOT_STOCK: _ardupilot_stock,
 }
 
 
-def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> UploadPlan:
+def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
     """Plan the upload of gains to a vehicle.
 
     Parameters
@@ -145,19 +148,22 @@ def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> Upload
     gains : Gains
         To upload.
     profile : str
-        A key of `PROFILES`.
-    drop : bool
-        Drop off-diagonal gains of any size.
+        A key of `PROFILES`: the controller that the gains are for.
 
     Raises
     ------
     SitlError
-        If the profile is unknown, a value is out of its parameter's range, or a large off-diagonal would be dropped.
+        If the profile is unknown or not that of the gains, or a value is out of its parameter's range.
     CodegenError
         If a value is out of the range of our module's parameter.
     """
     if profile not in PROFILES:
         raise SitlError(f"--profile: got {profile!r}, expected one of {', '.join(PROFILES)}")
+    if profile != gains.controller:
+        raise SitlError(
+            f"--profile {profile}: the gains are for {gains.controller}; upload them with --profile "
+            f"{gains.controller}, or design gains for this one: mimopilot tune LOG --profile {profile}"
+        )
     plan = PROFILES[profile](gains)
     for setting in plan.settings:
         if not setting.minimum <= setting.value <= setting.maximum:
@@ -166,47 +172,13 @@ def make_plan(gains: Gains, profile: str = "mimo", drop: bool = False) -> Upload
                 f"{setting.unit}".rstrip()
                 + f"; the {profile} controller does not accept it: tune again, or use another profile"
             )
-    if profile != "mimo":
-        plan = replace(plan, dropped=off_diagonal_shares(gains), notes=plan.notes + _lost_features(gains))
-        code, share = max(plan.dropped.items(), key=lambda item: item[1], default=("", 0.0))
-        if share > DROPPED_SHARE and not drop:
-            raise SitlError(
-                f"{code}: the {profile} controller has no off-diagonals, and this one is {share:.0%} of its diagonal, "
-                f"expected at most {DROPPED_SHARE:.0%}; use the mimo profile, or give --drop-off-diagonals"
-            )
     return replace(plan, settings=tuple(replace(s, value=single(s.value)) for s in plan.settings), profile=profile)
-
-
-def off_diagonal_shares(gains: Gains) -> dict[str, float]:
-    """Code of each non-zero off-diagonal gain -> its size as a share of its row's diagonal; without model following."""
-    shares: dict[str, float] = {}
-    for name in YAW_GAINS:
-        matrix, code = np.abs(getattr(gains, name)), MATRICES[name]
-        for i, j in ((0, 1), (1, 0)):
-            if matrix[i, j] > 0:
-                share = matrix[i, j] / matrix[i, i] if matrix[i, i] > 0 else math.inf
-                shares[f"{code}_{AXIS_LETTERS[i]}{AXIS_LETTERS[j]}"] = float(share)
-    return shares
-
-
-def _diagonal(gains: Gains, axis: int) -> list[float]:
-    """P of the outer loop, then P, I, D and FF of the inner loop, of one axis."""
-    if axis == 2:
-        return [getattr(gains.yaw, name) for name in YAW_GAINS]
-    return [float(getattr(gains, name)[axis, axis]) for name in YAW_GAINS]
-
-
-def _lost_features(gains: Gains) -> tuple[str, ...]:
-    lost = [axis for axis, limit in zip(AXES, gains.limits.moment_max, strict=True) if limit < 1]
-    limits = (f"moment_max ({', '.join(lost)}) has no counterpart and is not set",) if lost else ()
-    model = ("model following has no counterpart: attitude setpoints act directly",) if gains.filters.followed else ()
-    return limits + model
 
 
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.
 _OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
 TABLE = {p.name: p for p in _OURS}
-PREFIXES = {"mimo": (PREFIX,), "px4-stock": ("MC_",), "ardupilot-stock": ("ATC_", "SID_")}
+PREFIXES = {MIMO: (PREFIX,), PX4_STOCK: ("MC_",), ARDUPILOT_STOCK: ("ATC_", "SID_")}
 
 
 def violated_range(name: str, value: float) -> str:
@@ -254,4 +226,4 @@ def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
     )
     profile = next((p for p, prefix in PREFIXES.items() if any(name.startswith(prefix) for name in values)), "")
     held = {name: values[name] for name in values if name in fixed}
-    return UploadPlan(settings, held, (), {}, profile=profile, integers=frozenset(values))
+    return UploadPlan(settings, held, (), profile=profile, integers=frozenset(values))

@@ -93,10 +93,6 @@ def _show_plan(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat) 
         )
     title = f"vehicle {vehicle.system}, component {vehicle.component}, {'armed' if vehicle.armed else 'disarmed'}"
     print_table(title, ["parameter", "unit", "on the vehicle", "new", "change"], rows)
-    for code, share in plan.dropped.items():
-        print(f"dropped: {code}, {share:.1%} of its diagonal")
-    if plan.dropped:
-        print("dropped: the certificate, if any, is for the full matrices")
     for name in (s.name for s in plan.settings if 0 < abs(s.value - held[s.name]) < SMALLEST_CHANGE):
         print(f"note: {name}: PX4 and ArduPilot do not save a change below {SMALLEST_CHANGE:g}")
     for note in plan.notes:
@@ -117,7 +113,6 @@ def _print_json(done: Upload) -> None:
                 s.name: {"unit": s.unit, "before": done.held[s.name], "new": s.value, "held": outcome.held[s.name]}
                 for s in done.plan.settings
             },
-            "dropped": done.plan.dropped,
             "notes": done.plan.notes,
         }
     )

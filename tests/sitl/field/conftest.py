@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import pytest
@@ -73,7 +74,7 @@ class Field:
     link: FieldLink
     user: Answers
     options: AutotuneOptions
-    patch: pytest.MonkeyPatch
+    patch: pytest.MonkeyPatch  # of the fault
 
     def run(self):
         """Run the autotune; returns why it failed, empty: the gains were kept."""
@@ -85,26 +86,25 @@ class Field:
         return ""
 
 
-@pytest.fixture
-def scripted(tmp_path, monkeypatch):
-    """Make a `Field`; keywords are those of the link, `then` and others those of the vehicle or the options."""
-    monkeypatch.setattr(ground_steps, "tune", tune_once)
-    monkeypatch.setattr(ground_steps, "inspect_log", once(inspect_log))
-    monkeypatch.setattr(autotune_run, "read_log", once(read_log))
+@contextmanager
+def scripted_fields(folder):
+    """A function that makes a `Field`; other keywords are attributes of the vehicle."""
+    lasting, patch = pytest.MonkeyPatch(), pytest.MonkeyPatch()
+    lasting.setattr(ground_steps, "tune", tune_once)
+    lasting.setattr(ground_steps, "inspect_log", once(inspect_log))
+    lasting.setattr(autotune_run, "read_log", once(read_log))
 
-    patch = pytest.MonkeyPatch()
-
-    def make(at=None, answers=None, loss=0.0, seed=0, pilot=False, yes=False, arm=False, **changes):
+    def make(answers=None, loss=0.0, seed=0, pilot=False, yes=False, arm=False, **changes):
         vehicle = FieldVehicle()
         for name, value in changes.items():
             assert hasattr(vehicle, name)
             setattr(vehicle, name, value)
-        link = FieldLink(vehicle, at, loss=loss, seed=seed, latency=0.01)
-        monkeypatch.setattr(session, "Connection", link.open)
+        link = FieldLink(vehicle, loss=loss, seed=seed, latency=0.01)
+        lasting.setattr(session, "Connection", link.open)
         options = AutotuneOptions(
             "udpin:127.0.0.1:14550",
-            tmp_path / "out",
-            take_off=None if pilot else 4.0,
+            folder / "out",
+            take_off=None if pilot else 2.0,
             seconds_per_axis=SECONDS,
             amplitude=0.1,
             yes=yes,
@@ -112,5 +112,15 @@ def scripted(tmp_path, monkeypatch):
         )
         return Field(vehicle, link, Answers(answers or {}), options, patch)
 
-    yield make
-    patch.undo()
+    try:
+        yield make
+    finally:
+        patch.undo()
+        lasting.undo()
+
+
+@pytest.fixture
+def scripted(tmp_path):
+    """See `scripted_fields`."""
+    with scripted_fields(tmp_path) as make:
+        yield make

@@ -12,7 +12,7 @@ from mimopilot.tuning.gains_file import load_gains
 from tests.sitl.field.field_vehicle import LANDING
 
 #: Length of an autotune without faults, s of simulated time.
-WHOLE_S = 106.0
+WHOLE_S = 98.0
 
 
 def link_lost(field, at, generator):
@@ -95,8 +95,7 @@ FAULTS = (
 def mend(field):
     """End the fault: the same command is then given again."""
     field.link.up, field.link.loss = True, 0.0
-    field.link.queue = [entry for entry in field.link.queue if entry[2] != "event"]
-    field.link.queue.sort()
+    field.link.events = []
     vehicle = field.vehicle
     vehicle.fault, vehicle.stuck, vehicle.logging, vehicle.mute_until = "", None, True, 0.0
     if vehicle.armed:

@@ -38,6 +38,7 @@ from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
 from tests.sitl.mavlink.log_transfer.logging_vehicle import ScriptedLogs
 from tests.sitl.mavlink.scripted_vehicle import SYSTEM, SimulatedLink
 
+SEA_M = 100.0  # altitude of the ground
 SECONDS = 6.0  # of the excitation of an axis
 HOLD, LANDING, TAKEOFF, OFFBOARD = 4 << 16 | 3 << 24, 4 << 16 | 6 << 24, 4 << 16 | 2 << 24, 6 << 16
 AIRFRAME = load_airframe("adam0")
@@ -53,7 +54,7 @@ def flight_bytes(kind, values, detuned):
     gains = first_gains().with_elements(dict(values))
     body = AIRFRAME.airframe
     if kind == "experiment":
-        flight = ExperimentPlan(body, gains, SECONDS, 0.1, 50.0, 1).fly(1)
+        flight = ExperimentPlan(body, gains, SECONDS, 0.1, 50.0, 1, axes="both").fly(1)
     else:
         Ts = gains.Ts
         plan = DoubletPlan(np.radians(8.0))
@@ -120,6 +121,8 @@ class FieldVehicle(FlyingVehicle):
             return []
         if isinstance(order, FileRequest | RequestLogs | RequestLogData | EndLogs):
             return self.logs.answer(order)
+        if order == RequestMessage(SYSTEM, 1, 1):
+            return [PowerReport(SYSTEM, 1, self.charge)]
         if order == RequestMessage(SYSTEM, 1, 261) and self.free is not None:
             return [StorageReport(SYSTEM, 1, self.free)]
         if isinstance(order, SendCommand):
@@ -137,7 +140,8 @@ class FieldVehicle(FlyingVehicle):
         if command == 400 and params[0] == 1:
             self.armed, self.content = True, ""
         elif command == 22 and self.armed:
-            self.mode, self.target, self.landed = TAKEOFF, params[6], 3
+            above_sea = self.autopilot == 12  # as PX4 takes it
+            self.mode, self.target, self.landed = TAKEOFF, params[6] - (SEA_M if above_sea else 0.0), 3
         elif command == 21 and self.armed:
             self.mode = LANDING
         elif command == 176:
@@ -181,9 +185,8 @@ class FieldVehicle(FlyingVehicle):
         wobble = self.gust * np.sin(7.0 * now)
         streamed = {
             30: AttitudeReport(*at, self.angles[0] + wobble, self.angles[1], now, (self.rotation, 0.0, 0.0), 0.3),
-            74: AltitudeReport(*at, 100.0 + self.height, climb),
+            74: AltitudeReport(*at, SEA_M + self.height, climb),
             83: ThrustReport(*at, 0.49),
-            1: PowerReport(*at, self.charge),
         }
         wanted = self.asked - self.silent
         said, self.text = [StatusText(*at, text) for text in self.text], []
@@ -214,18 +217,17 @@ class FieldVehicle(FlyingVehicle):
 
 
 class FieldLink(SimulatedLink):
-    """A link that can be opened again and again; what happens at a moment (s) is a function of the link."""
+    """A link that can be opened again and again."""
 
     hint = ""
 
-    def __init__(self, vehicle, at=None, **keywords):
+    def __init__(self, vehicle, **keywords):
         super().__init__(vehicle, **keywords)
-        for moment, event in (at or {}).items():
-            self.plan(moment, event)
+        self.events = []
 
     def plan(self, moment, event):
         """Call a function of the link at a moment, s."""
-        self.schedule(moment, "event", event)
+        self.events.append((moment, event))
 
     def open(self, *_):
         self.closed = False
@@ -239,9 +241,8 @@ class FieldLink(SimulatedLink):
         self.queue.sort()
 
     def receive(self, until):
-        events = [entry for entry in self.queue if entry[2] == "event" and entry[0] <= until]
-        for entry in events:
-            self.queue.remove(entry)
-            self.queue.sort()
-            entry[3](self)
+        due = [one for one in self.events if one[0] <= until]
+        self.events = [one for one in self.events if one[0] > until]
+        for _, event in due:
+            event(self)
         return super().receive(until)

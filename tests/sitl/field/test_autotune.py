@@ -65,7 +65,8 @@ def test_without_the_users_yes_the_old_gains_stay_or_go_back(scripted, answers, 
     message = field.run()
     assert reason in message
     assert OLD in message
-    assert field.vehicle.set == field.vehicle.stored_values | old == field.vehicle.stored_values | field.vehicle.set
+    assert field.vehicle.set == old
+    assert field.vehicle.stored_values == field.vehicle.values
     assert len(field.vehicle.logs.files) == flights
     again = field.run()
     assert "ended with the old gains" in again

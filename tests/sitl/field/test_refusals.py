@@ -62,7 +62,7 @@ def test_a_log_that_is_empty_because_the_card_is_full_is_refused_and_the_flight_
 def test_a_vehicle_is_armed_only_after_its_own_question(scripted):
     field = scripted(answers={"Arm": False})
     refused(field, "may not be armed")
-    assert field.user.asked[0].startswith("Arm vehicle 1 and take off to 4 m?")
+    assert field.user.asked[0].startswith("Arm vehicle 1 and take off to 2 m?")
 
 
 @pytest.mark.parametrize(("simulated", "arm"), [(True, False), (False, True)])

@@ -15,6 +15,7 @@ from mimopilot.tuning.design.constraints import (
     Distance,
     MotorLimit,
     NoiseLimit,
+    ParameterRange,
     gain_above_band,
     structural_modes,
 )
@@ -58,13 +59,16 @@ def constraints(plant):
         "above": gain_above_band(plant),
         "integral": Definite("Ki_i", plant.body.B, 1.0),
         "derivative": Definite("Kd_i", np.eye(2), 0.0),
+        "parameter": ParameterRange("Kp_i", np.array([0.2, 0.3])),
         "motors": MotorLimit(
             np.full((2, len(plant.omega)), 1e-3 + 0j), np.array([[0.5, 0.5], [-0.5, 0.5]]), np.full((2, 2), 0.4)
         ),
     }
 
 
-@pytest.mark.parametrize("name", ["torque", "rate", "attitude", "noise", "above", "integral", "derivative", "motors"])
+@pytest.mark.parametrize(
+    "name", ["torque", "rate", "attitude", "noise", "above", "integral", "derivative", "parameter", "motors"]
+)
 def test_the_constraint_of_the_next_step_has_the_sign_of_the_margin(plant, free, name):
     """At a step of zero, for gains that keep the limit and for gains that do not."""
     constraint, flown = constraints(plant)[name], free.vector(free.base)
@@ -103,6 +107,7 @@ def test_margins_are_relative_distances_to_the_limits(plant, free):
     assert limits["noise"].margin(loop) == pytest.approx(1 - loop.noise_rms().max() / 0.008)
     ratio = limits["integral"].margin(loop) * np.abs(plant.body.B).max() * free.units["Ki_i"] + 1.0
     product = plant.body.B @ free.base.Ki_i
+    assert limits["parameter"].margin(loop) == pytest.approx(1 - free.base.Kp_i[0, 0] / 0.2)
     assert ratio == pytest.approx(np.linalg.eigvalsh((product + product.T) / 2)[0])
     sensitivity = np.linalg.norm(np.linalg.inv(np.eye(2) + loop.L_u[: plant.band.stop]), ord=2, axis=(1, 2))
     error = loop.loop_error(whole=True)[: plant.band.stop]

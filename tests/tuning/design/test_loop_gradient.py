@@ -12,6 +12,7 @@ from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import wide_response
+from tests.conftest import stock_gains
 from tests.tuning.analysis.test_certify import experiment
 
 RESPONSES = {"L_i": "dL_i", "L_u": "dL_u", "U": "dU", "T": "dT", "D": "dD", "noise": "dnoise"}
@@ -23,9 +24,12 @@ def plant():
     return wide_response(PlantEstimates(experiment("adam0_boom")))
 
 
-@pytest.fixture(params=[0.0, 9.0], ids=["without a model", "model following"])
+@pytest.fixture(params=[0.0, 9.0, None], ids=["without a model", "model following", "stock"])
 def gains(request):
-    """Full matrices everywhere, so that no derivative vanishes."""
+    """Full matrices everywhere, so that no derivative vanishes; None: the stock law with the most filters."""
+    if request.param is None:
+        stock = stock_gains("ardupilot-stock")
+        return dataclasses.replace(stock, filters=dataclasses.replace(stock.filters, Ts=0.004))
     generator = np.random.default_rng(3)
     base = load_airframe("adam0_boom").default_gains()
     moved = {
@@ -41,8 +45,12 @@ def gains(request):
     return dataclasses.replace(base, filters=dataclasses.replace(base.filters, model_omega=request.param), **moved)
 
 
+def free_of(gains, plant):
+    return free_gains(gains, plant.body, full=gains.filters.law.coupled)
+
+
 def test_the_responses_are_those_of_the_law(plant, gains):
-    free = free_gains(gains, plant.body)
+    free = free_of(gains, plant)
     loop = LoopGradient(plant, free, free.vector(gains))
     response = PlantResponse(
         omega=plant.omega,
@@ -64,10 +72,10 @@ def test_the_responses_are_those_of_the_law(plant, gains):
 
 
 def test_the_derivatives_are_those_of_finite_differences(plant, gains):
-    free = free_gains(gains, plant.body)
+    free = free_of(gains, plant)
     vector = free.vector(gains)
     loop = LoopGradient(plant, free, vector)
-    assert len(vector) == (28 if gains.filters.model_omega else 20)
+    assert len(vector) == (28 if gains.filters.model_omega else 20 if gains.filters.law.coupled else 10)
     for place in range(len(vector)):
         step = STEP * np.eye(len(vector))[place]
         after, before = (LoopGradient(plant, free, vector + sign * step) for sign in (1, -1))
@@ -85,7 +93,9 @@ def test_the_noise_of_the_torque_is_the_integral_of_its_spectrum(plant, gains):
         G_o=0 * plant.G_o,
         noise=np.diag([0.01, 0.01, 0, 0]) * np.ones((len(plant.omega), 1, 1)),
     )
-    plain = dataclasses.replace(gains, Kp_i=0.15 * np.eye(2), Ki_i=np.zeros((2, 2)), Kd_i=np.zeros((2, 2)))
-    free = free_gains(plain, plant.body)
+    plain = dataclasses.replace(
+        gains.for_our_law(), Kp_i=0.15 * np.eye(2), Ki_i=np.zeros((2, 2)), Kd_i=np.zeros((2, 2))
+    )
+    free = free_of(plain, plant)
     # The grid begins at 0.1 rad/s and ends just below the Nyquist frequency.
     assert LoopGradient(silent, free, free.vector(plain)).noise_rms() == pytest.approx(0.15 * 0.01, rel=1e-3)

@@ -1,5 +1,6 @@
 """Gains of stock controllers from parameter files, logs and a vehicle: numbers computed by hand, and refusals."""
 
+import dataclasses
 import json
 import math
 
@@ -9,12 +10,11 @@ import pytest
 from mimopilot.common.errors import Error
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
-from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.imported_gains import DEFAULTS, import_gains, needed_names, read_source
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.logs.stock_controllers import ARDUPILOT, PX4
-from tests.conftest import assert_one_clear_line
+from tests.conftest import assert_one_clear_line, stock_gains
 from tests.tuning.logs.flights import (
     ardupilot_messages,
     dataflash_bytes,
@@ -209,14 +209,16 @@ def test_a_log_gives_the_gains_that_its_reader_says_flew(tmp_path, flight):
     logged = PX4_VALUES | {"IMU_GYRO_RATEMAX": 250.0}
     path = write_ulog(tmp_path / "x.ulg", px4_topics(flight, debug_vect=injected(flight)), logged)
     found, flown = import_gains(read_source(path)), read_log(path).flown
-    assert found.gains.elements() == flown.elements()
+    assert found.gains.elements() == flown.for_our_law().elements()
+    exact = import_gains(read_source(path), profile="px4-stock").gains
+    assert exact.filters == dataclasses.replace(flown.filters, Ts=exact.Ts)
     assert [text for text in found.warnings if "logged every" in text] == []
     values = ARDUPILOT_VALUES | {"SCHED_LOOP_RATE": 1 / read_log(path).Ts}
     parm = ("PARM", "QNf", ("TimeUS", "Name", "Value"))
     rows = [microseconds([9.0] * len(values)), [name.encode() for name in values], list(values.values())]
     (tmp_path / "x.bin").write_bytes(dataflash_bytes([(*parm, rows), *ardupilot_messages(flight)]))
     assert import_gains(read_source(tmp_path / "x.bin")).gains.elements() == (
-        read_log(tmp_path / "x.bin").flown.elements()
+        read_log(tmp_path / "x.bin").flown.for_our_law().elements()
     )
 
 
@@ -230,26 +232,35 @@ def test_stock_gains_are_imported_beside_those_of_our_module_and_after_a_change(
     assert any("logged every 0.004 s, IMU_GYRO_RATEMAX is 400 Hz" in text for text in found.warnings)
 
 
-def test_gains_of_our_profiles_come_back_and_fly_as_before(tmp_path, mimopilot):
-    """What upload writes into the stock controllers is what import reads from them: on the bench, the same flight."""
-    body = load_airframe("adam0_nominal")
-    gains = body.default_gains()
-    for profile, rate in (("px4-stock", "IMU_GYRO_RATEMAX"), ("ardupilot-stock", "SCHED_LOOP_RATE")):
-        values = make_plan(gains, profile).values | {rate: 250.0}
-        values |= {"MC_YAW_WEIGHT": 0.4} if profile == "px4-stock" else {}
-        (tmp_path / "x.parm").write_text(parameter_text("mavproxy", values))
-        result = mimopilot("import-params", "x.parm", "--airframe", "adam0_nominal", "--out", f"{profile}.gains.toml")
-        assert result.returncode == 0, result.stderr
-        back = load_gains(tmp_path / f"{profile}.gains.toml")
-        for code, value in gains.elements().items():
-            assert back.elements()[code] == pytest.approx(value, rel=1e-6), code
-        assert back.moment_scale == body.airframe.moment_scale()
-    flown = [
-        json.loads(mimopilot("fly", "adam0_nominal", *extra, "--json").stdout)
-        for extra in ((), ("--gains", "px4-stock.gains.toml"))
-    ]
-    assert flown[1]["J_M_o"] == pytest.approx(flown[0]["J_M_o"], rel=1e-4)
-    assert flown[1]["effort_rms"] == pytest.approx(flown[0]["effort_rms"], rel=1e-3)
+@pytest.mark.parametrize(
+    ("profile", "rate"), [("px4-stock", "IMU_GYRO_RATEMAX"), ("ardupilot-stock", "SCHED_LOOP_RATE")]
+)
+def test_what_an_upload_writes_is_what_an_import_reads(tmp_path, profile, rate):
+    gains = stock_gains(profile)
+    values = make_plan(gains, profile).values | {rate: 400.0}
+    back = from_file(tmp_path / "x.parm", values, profile=profile).gains
+    assert back.controller == profile
+    for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i"):
+        assert getattr(back, name) == pytest.approx(getattr(gains, name), rel=1e-6)
+        assert getattr(back.yaw, name) == pytest.approx(getattr(gains.yaw, name), rel=1e-6)
+    found, wanted = (dataclasses.asdict(one.filters.stock) for one in (back, gains))
+    assert {name: found[name] for name in found if name != "controller"} == {
+        name: pytest.approx(wanted[name], rel=1e-6) for name in wanted if name != "controller"
+    }
+    other = {"px4-stock": "ardupilot-stock", "ardupilot-stock": "px4-stock"}[profile]
+    with pytest.raises(Error, match=f"--profile: got '{other}', but x.parm is of .*: give mimo or {profile}"):
+        from_file(tmp_path / "x.parm", values, profile=other)
+
+
+def test_a_stock_set_needs_the_parameters_of_its_filters(tmp_path):
+    complete = dict.fromkeys(ARDUPILOT.filter_names, 20.0) | ARDUPILOT_VALUES
+    assert from_file(tmp_path / "z.parm", complete, profile="ardupilot-stock").gains.controller == "ardupilot-stock"
+    lacking = {name: value for name, value in complete.items() if name != "ATC_RAT_PIT_FLTE"}
+    assert from_file(tmp_path / "x.parm", lacking).gains.controller == "mimo"
+    with pytest.raises(Error, match="lacks ATC_RAT_PIT_FLTE; no gain gets"):
+        from_file(tmp_path / "x.parm", lacking, profile="ardupilot-stock")
+    older = {name: value for name, value in PX4_VALUES.items() if name != "MC_YAW_TQ_CUTOFF"}
+    assert from_file(tmp_path / "y.parm", older, profile="px4-stock").gains.filters.stock.torque_hz == (0.0, 0.0, 0.0)
 
 
 def test_the_command_writes_a_file_shows_both_sides_and_refuses_to_overwrite(tmp_path, mimopilot):

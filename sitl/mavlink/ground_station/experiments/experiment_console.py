@@ -43,11 +43,12 @@ class _Snapshot:
 
     def __call__(self, values: Mapping[str, float]) -> None:
         assert self.session is not None
+        first = self.path is None
         self.path = self.path or snapshot_path(self.options)
         vehicle = self.session.vehicle
         text = parameter_text("qgc", values, vehicle.system, vehicle.component, integers=self.integers)
         write_atomically(self.path, text)
-        if not self.options.as_json:
+        if first and not self.options.as_json:
             print(f"old values saved: {self.path}")
 
 

@@ -8,20 +8,20 @@ import pytest
 
 from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, make_restore_plan, off_diagonal_shares
+from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, make_restore_plan
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.logs.flown_gains import flown_gains
-from mimopilot.tuning.parameters import MATRICES, PARAMETERS, ROWS, YAW_GAINS
-from tests.conftest import coupled_gains, following_gains
+from mimopilot.tuning.parameters import PARAMETERS, ROWS, YAW_GAINS
+from tests.conftest import coupled_gains, stock_gains
+
+STOCK = ("px4-stock", "ardupilot-stock")
 
 
-@pytest.fixture
-def diagonal(gains):
-    """The gains without their off-diagonals."""
-    matrices = {name: np.diag(np.diag(getattr(gains, name))) for name in MATRICES}
-    return dataclasses.replace(gains, **matrices)
+def set_for(profile):
+    """A set that the profile uploads."""
+    return stock_gains(profile) if profile in STOCK else coupled_gains()
 
 
 def test_our_module_receives_every_writable_parameter_bit_identical_to_the_struct(gains):
@@ -29,61 +29,49 @@ def test_our_module_receives_every_writable_parameter_bit_identical_to_the_struc
     array = {p.name: float(v) for p, v in zip(PARAMETERS, to_array(gains), strict=True)}
     assert plan.fixed == {"MIMO_TS": array.pop("MIMO_TS")}
     assert plan.values == array
-    assert plan.dropped == {}
     assert plan.scale == ("MIMO_SCALE_R", "MIMO_SCALE_P", "MIMO_SCALE_Y")
 
 
-def test_px4s_parameters_describe_the_same_controller(diagonal):
-    """The log reader, whose table is independent of the profiles, recovers the gains."""
-    plan = make_plan(diagonal, "px4-stock")
-    found = flown_gains(plan.values, diagonal.Ts)
-    for code, value in diagonal.elements().items():
-        if not code.startswith("UMAX"):
-            assert found.elements()[code] == pytest.approx(value, rel=1e-6), code
+def test_px4s_parameters_describe_the_same_controller():
+    """The log reader, whose table is independent of the profiles, recovers the set."""
+    gains = stock_gains("px4-stock")
+    plan = make_plan(gains, "px4-stock")
+    found = flown_gains(plan.values, gains.Ts)
+    for code, value in gains.for_our_law().elements().items():
+        assert found.for_our_law().elements()[code] == pytest.approx(value, rel=1e-6), code
+    assert found.filters.stock == gains.filters.stock
     assert plan.values["MC_ROLLRATE_MAX"] == single(math.degrees(5.0))
     assert plan.values["MC_YAWRATE_K"] == 1.0
-    assert plan.values["IMU_DGYRO_CUTOFF"] == 30.0
-    assert any("moment_max (pitch, yaw)" in note for note in plan.notes)
+    assert (plan.values["IMU_DGYRO_CUTOFF"], plan.values["MC_YAW_TQ_CUTOFF"]) == (30.0, 2.0)
 
 
-def test_ardupilots_parameters_are_the_diagonal_gains_in_its_units(diagonal):
-    values = make_plan(diagonal, "ardupilot-stock").values
+def test_ardupilots_parameters_are_the_gains_in_its_units():
+    gains, profile = stock_gains("ardupilot-stock"), "ardupilot-stock"
+    values, stock = make_plan(gains, profile).values, gains.filters.stock
     for axis, name in enumerate(("RLL", "PIT", "YAW")):
         if axis == 2:
-            terms = [getattr(diagonal.yaw, matrix) for matrix in YAW_GAINS]
+            terms = [getattr(gains.yaw, matrix) for matrix in YAW_GAINS]
         else:
-            terms = [getattr(diagonal, matrix)[axis, axis] for matrix in YAW_GAINS]
+            terms = [getattr(gains, matrix)[axis, axis] for matrix in YAW_GAINS]
         written = [
             values[f"ATC_{part}"] for part in (f"ANG_{name}_P", *(f"RAT_{name}_{t}" for t in ("P", "I", "D", "FF")))
         ]
         assert written == [single(term) for term in terms]
-        assert values[f"ATC_RAT_{name}_IMAX"] == single(diagonal.limits.integral_max[axis])
-        assert values[f"ATC_RAT_{name}_FLTD"] == 30.0
-        assert values[f"ATC_RATE_{name[0]}_MAX"] == single(math.degrees(diagonal.limits.rate_max[axis]))
-    assert len(values) == 24
+        assert values[f"ATC_RAT_{name}_IMAX"] == single(gains.limits.integral_max[axis])
+        filters = [values[f"ATC_RAT_{name}_{filter}"] for filter in ("FLTT", "FLTE", "FLTD", "D_FF")]
+        held = (stock.setpoint_hz, stock.error_hz, stock.derivative_hz, stock.derivative_feedforward)
+        assert filters == [single(one[axis]) for one in held]
+        assert values[f"ATC_RATE_{name[0]}_MAX"] == single(math.degrees(gains.limits.rate_max[axis]))
+    assert len(values) == 33
 
 
-@pytest.mark.parametrize("profile", ["px4-stock", "ardupilot-stock"])
-def test_large_off_diagonals_are_dropped_only_on_request(gains, profile):
-    with pytest.raises(SitlError, match=rf"R[PD]_RP: the {profile} controller has no off-diagonals, .* 13% of"):
-        make_plan(gains, profile)
-    plan = make_plan(gains, profile, drop=True)
-    assert plan.dropped == off_diagonal_shares(gains)
-    assert plan.dropped["RP_RP"] == pytest.approx(0.02 / 0.15)
-    assert plan.dropped["AP_PR"] == pytest.approx(0.2 / 5.5)
-    assert len(plan.dropped) == 10
-
-
-def test_an_off_diagonal_in_a_row_with_zero_diagonal_has_an_infinite_share(diagonal):
-    odd = dataclasses.replace(diagonal, Kff_i=np.array([[0.0, 0.001], [0.0, 0.0]]))
-    assert off_diagonal_shares(odd) == {"RF_RP": math.inf}
-    with pytest.raises(SitlError, match="RF_RP"):
-        make_plan(odd, "px4-stock")
-
-
-def test_small_off_diagonals_are_dropped_and_reported(diagonal):
-    small = dataclasses.replace(diagonal, Kp_i=np.array([[0.15, 0.003], [0.0, 0.13]]))
-    assert make_plan(small, "px4-stock").dropped == {"RP_RP": pytest.approx(0.02)}
+@pytest.mark.parametrize("profile", PROFILES)
+def test_a_set_for_another_controller_is_refused(profile):
+    for controller, other in zip(PROFILES, (coupled_gains(), *map(stock_gains, STOCK)), strict=True):
+        if controller != profile:
+            message = f"--profile {profile}: the gains are for {controller}; upload them with --profile {controller}"
+            with pytest.raises(SitlError, match=message):
+                make_plan(other, profile)
 
 
 @pytest.mark.parametrize(
@@ -101,31 +89,21 @@ def test_small_off_diagonals_are_dropped_and_reported(diagonal):
         ("betaflight", {}, "--profile: got 'betaflight', expected one of mimo, px4-stock, ardupilot-stock"),
     ],
 )
-def test_values_out_of_range_that_a_vehicle_would_accept_are_refused(diagonal, profile, change, message):
+def test_values_out_of_range_that_a_vehicle_would_accept_are_refused(profile, change, message):
     with pytest.raises((SitlError, TuningError), match=message):
-        make_plan(dataclasses.replace(diagonal, **change), profile)
-
-
-def test_a_stock_controller_flies_without_the_model_and_the_plan_says_so():
-    following = following_gains()
-    plan = make_plan(following, "px4-stock", drop=True)
-    off = dataclasses.replace(following, filters=dataclasses.replace(following.filters, model_omega=0.0))
-    assert plan.values == make_plan(off, "px4-stock", drop=True).values
-    assert plan.dropped == off_diagonal_shares(coupled_gains())
-    assert any("model following has no counterpart" in note for note in plan.notes)
-    assert not any("model" in note for note in make_plan(off, "px4-stock", drop=True).notes)
+        make_plan(dataclasses.replace(set_for(profile), **change), profile)
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_every_name_and_value_fits_a_mavlink_message(diagonal, profile):
-    for name, value in make_plan(diagonal, profile).values.items():
+def test_every_name_and_value_fits_a_mavlink_message(profile):
+    for name, value in make_plan(set_for(profile), profile).values.items():
         assert len(name) <= 16
         assert name == name.upper()
         assert value == single(value)
 
 
-def test_a_snapshot_must_be_complete_and_within_our_ranges(diagonal):
-    values = make_plan(diagonal).values
+def test_a_snapshot_must_be_complete_and_within_our_ranges(gains):
+    values = make_plan(gains).values
     plan = make_restore_plan(values | {"MIMO_TS": 0.004, "SYS_X": 1e9}, "old.params")
     assert plan.values == values | {"SYS_X": 1e9}
     assert (plan.fixed, plan.profile) == ({"MIMO_TS": 0.004}, "mimo")

@@ -13,7 +13,7 @@ from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameters import PARAMETERS
-from tests.conftest import assert_one_clear_line
+from tests.conftest import assert_one_clear_line, stock_gains
 from tests.sitl.mavlink.running import PATIENCE_S, QUICK, Pilot, running_sitl, wait_for
 from tests.sitl.mavlink.scripted_vehicle import (
     FAILING,
@@ -205,22 +205,25 @@ def test_a_vehicle_that_does_not_publish_its_unit_of_torque_needs_moment_scale(m
         assert named(link.vehicle.values, new) == new
 
 
-@pytest.mark.parametrize(("profile", "autopilot", "count"), [("px4-stock", 12, 26), ("ardupilot-stock", 3, 24)])
-def test_a_stock_autopilot_receives_the_diagonal_gains(mimopilot, certified, gains, profile, autopilot, count):
-    wanted = make_plan(gains, profile, drop=True).values
-    assert len(wanted) == count
-    arguments = ("upload", certified, "--yes", "--profile", profile)
+@pytest.mark.parametrize(("profile", "autopilot"), [("px4-stock", 12), ("ardupilot-stock", 3)])
+def test_a_stock_autopilot_receives_its_own_set(mimopilot, certified, tmp_path, profile, autopilot):
+    gains = stock_gains(profile)
+    gains.save(tmp_path / "stock.gains.toml")
+    wanted = make_plan(gains, profile).values
     vehicle = ScriptedVehicle(dict.fromkeys(wanted, 0.25))
     vehicle.autopilot = autopilot
     with UdpVehicle(vehicle) as link:
-        at = ("--connect", link.url)
-        assert_one_clear_line(mimopilot(*arguments, *at), "13% of its diagonal", "--drop-off-diagonals")
-        told = (*arguments, *at, "--drop-off-diagonals")
-        assert_one_clear_line(mimopilot(*told), "--moment-scale")
-        done = mimopilot(*told, "--moment-scale", "flown")
+        arguments = ("--connect", link.url, "--yes", "--profile", profile)
+        assert_one_clear_line(
+            mimopilot("upload", certified, *arguments), "the gains are for mimo", "tune LOG --profile"
+        )
+        arguments = ("upload", "stock.gains.toml", *arguments)
+        assert_one_clear_line(mimopilot(*arguments), "no certificate")
+        refused = mimopilot(*arguments, "--uncertified")
+        assert (refused.returncode, "--moment-scale" in refused.stderr) == (2, True)
+        done = mimopilot(*arguments, "--uncertified", "--moment-scale", "flown")
         assert done.returncode == 0, done.stderr
         assert link.vehicle.values == wanted
-    assert "dropped: RP_RP, 13.3% of its diagonal" in done.stdout
 
 
 def test_an_older_snapshot_is_never_overwritten(mimopilot, certified, old, new, tmp_path):

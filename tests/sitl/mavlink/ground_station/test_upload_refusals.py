@@ -11,7 +11,7 @@ from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.mavlink.wire.signing import read_key
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.parameters import PARAMETERS, ROWS
-from tests.conftest import assert_one_clear_line
+from tests.conftest import assert_one_clear_line, stock_gains
 from tests.sitl.mavlink.running import wait_for
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, UdpVehicle, float32
 
@@ -140,13 +140,17 @@ def test_a_second_vehicle_with_the_same_system_number_is_never_written(mimopilot
     ],
 )
 def test_a_vehicle_that_does_not_fit_the_profile_is_refused_with_the_one_that_fits(
-    mimopilot, certified, old, autopilot, kind, profile, parts
+    mimopilot, certified, old, tmp_path, autopilot, kind, profile, parts
 ):
     vehicle = ScriptedVehicle(old)
     vehicle.autopilot, vehicle.type = autopilot, kind
-    stock = () if profile == "mimo" else ("--profile", profile, "--drop-off-diagonals", "--moment-scale", "flown")
+    stock = () if profile == "mimo" else ("--profile", profile, "--moment-scale", "flown")
+    gains = certified
+    if stock:
+        gains = tmp_path / "stock.gains.toml"
+        stock_gains(profile).with_certificate(Certificate(Verdict.CERTIFIED, "examined")).save(gains)
     with UdpVehicle(vehicle) as link:
-        refused = upload(mimopilot, certified, link, *stock)
+        refused = upload(mimopilot, gains, link, *stock)
     assert_one_clear_line(refused, *parts, "nothing was written")
     assert (vehicle.reads, vehicle.writes) == (0, 0)
 

@@ -1,0 +1,145 @@
+"""Gains for the stock controllers: designed within their law, certified in it, and worth less than full matrices."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from mimopilot.common.errors import Error
+from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+from mimopilot.tuning.analysis.certify import certify
+from mimopilot.tuning.design.advise import advise
+from mimopilot.tuning.design.cascade import certify_from_log, tune
+from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_terms import StockFilters
+from mimopilot.tuning.spec import TuningSpec, load_spec
+from tests.tuning.analysis.loops import MODELS, airframe, defaults, exact, grid
+from tests.tuning.truth import TS, Truth, experiment
+
+VEHICLE = "adam0_boom"
+FILTERS = {
+    "px4-stock": StockFilters("px4-stock", (30.0,) * 3, torque_hz=(0.0, 0.0, 2.0)),
+    "ardupilot-stock": StockFilters("ardupilot-stock", (20.0,) * 3, (20.0,) * 3, (0.0, 0.0, 2.5)),
+}
+
+
+def stock_set(controller, gains=None):
+    """The vehicle's default gains, or other diagonal ones, in a stock law."""
+    gains = gains or defaults(VEHICLE)
+    matrices = {name: np.diag(np.diag(matrix)) for name, matrix in gains.matrices.items()}
+    return dataclasses.replace(gains, certificate=None, filters=Filters(TS, stock=FILTERS[controller]), **matrices)
+
+
+@pytest.fixture(scope="module")
+def log():
+    """A flight on the coupled vehicle, as if PX4's own controllers had flown these gains."""
+    found = experiment(VEHICLE)
+    details = {"loop_rate_hz": 800.0}
+    flown = stock_set("px4-stock")
+    origin = dataclasses.replace(flown.provenance, details=details)
+    return dataclasses.replace(found, flown=dataclasses.replace(flown, provenance=origin))
+
+
+@pytest.fixture(scope="module")
+def tuned(log):
+    return tune(log, load_spec(profile="px4-stock"))
+
+
+def documented(gains, omega):
+    """C_y and C_o of the stock law of both axes, written in z from the autopilots' code."""
+    z, Ts, stock = np.exp(1j * omega * gains.Ts), gains.Ts, gains.filters.stock
+
+    def low_pass(hertz):
+        a = 1.0 if hertz == 0 else Ts / (Ts + 1 / (2 * np.pi * hertz))
+        return a * z / (z - 1 + a)
+
+    slope = (z - 1) / (Ts * z) * low_pass(stock.derivative_hz[0])
+    Kp, Ki, Kd, Kp_o = (np.diag(getattr(gains, n))[None] for n in ("Kp_i", "Ki_i", "Kd_i", "Kp_o"))
+    if stock.controller == "px4-stock":
+        of_r = Kp + Ki * (Ts / (z - 1))[:, None]
+        of_y = of_r + Kd * slope[:, None]
+    else:
+        of_y = Kp + Ki * (Ts * z / (z - 1))[:, None] + Kd * slope[:, None]
+        of_r = of_y * low_pass(stock.setpoint_hz[0])[:, None]
+    return of_y[:, :, None] * np.eye(2), (of_r * Kp_o / z[:, None])[:, :, None] * np.eye(2)
+
+
+@pytest.mark.parametrize("controller", FILTERS)
+def test_the_certificates_margin_is_that_of_the_documented_law(controller):
+    gains, omega = stock_set(controller), grid(600.0)
+    plant = exact(Truth.of(airframe(VEHICLE)).plant, omega)
+    C_y, C_o = documented(gains, omega)
+    smallest = np.linalg.svd(np.eye(2) + C_y @ plant.G_i + C_o @ plant.G_o, compute_uv=False)[:, -1]
+    figures = certify(gains, plant, *MODELS).figures
+    assert figures["Ms"] == pytest.approx(1 / smallest.min(), rel=1e-6)
+    ours = certify(gains.for_our_law(), plant, *MODELS).figures
+    assert abs(ours["Ms"] / figures["Ms"] - 1) > 0.003  # so that the law matters
+
+
+def test_a_stock_set_is_diagonal_certified_at_both_rates_and_in_few_digits(tuned):
+    assert (tuned.controller, tuned.provenance.method, tuned.verdict()[0]) == ("px4-stock", "px4-stock", "certified")
+    certificate = tuned.certificate
+    rates = [certificate.as_table(), *certificate.further]
+    assert len(rates) == 2
+    assert sum("carried from 250 to 800 Hz" in one["reason"] for one in rates) == 1
+    for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i"):
+        for value in np.diag(getattr(tuned, name)):
+            assert value == float(f"{value:.4g}")
+    assert tuned.filters.stock == FILTERS["px4-stock"]
+
+
+def test_what_is_uploaded_is_what_was_certified(log, tuned):
+    values = make_plan(tuned, "px4-stock").values
+    assert values["MC_ROLLRATE_P"] == np.float32(tuned.Kp_i[0, 0])
+    assert values["MC_PITCHRATE_D"] == np.float32(tuned.Kd_i[1, 1])
+    again = certify_from_log(log, tuned)
+    assert again.verdict()[0] == "certified"
+    fields = {name: value for name, value in vars(tuned).items() if name != "filters"}
+    moved = Gains(**fields, filters=dataclasses.replace(tuned.filters, stock=FILTERS["ardupilot-stock"]))
+    assert moved.verdict()[0] == "void"
+
+
+def test_the_worth_of_off_diagonals_is_told(tuned):
+    """The vehicle is coupled: a diagonal controller cannot decouple it, full matrices can."""
+    details = tuned.provenance.details
+    worth = {name: np.hypot(*pairs[0]) for name, pairs in details["worth_of_off_diagonals"].items()}
+    assert set(worth) == {"flown", "tuned", "module"}
+    assert worth["module"] < 0.5 * worth["tuned"]
+    assert details["better_than_flown"] or details["keep_flown"]
+    assert [one["offaxis_deg"] for one in details["predicted"]["module"]] == details["worth_of_off_diagonals"]["module"]
+
+
+def test_a_log_of_another_controller_is_refused(log):
+    for flown, profile, message in (
+        (
+            defaults(VEHICLE),
+            "px4-stock",
+            "it flew mimo gains; gains for px4-stock are designed from a flight with",
+        ),
+        (log.flown, "ardupilot-stock", "it flew px4-stock gains"),
+        (None, "px4-stock", "its parameters hold no complete set"),
+    ):
+        with pytest.raises(TuningError, match=message):
+            tune(dataclasses.replace(log, flown=flown), TuningSpec(profile=profile))
+    with pytest.raises(TuningError, match="profile: got px4-stock, expected mimo"):
+        advise(log, TuningSpec(profile="px4-stock"))
+    lacking = dataclasses.replace(defaults(VEHICLE).provenance, details={"lacking_parameters": ["IMU_DGYRO_CUTOFF"]})
+    flown = dataclasses.replace(defaults(VEHICLE), provenance=lacking)
+    with pytest.raises(TuningError, match="lacks IMU_DGYRO_CUTOFF, filters of the px4-stock controller"):
+        tune(dataclasses.replace(log, flown=flown), TuningSpec(profile="px4-stock"))
+
+
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [
+        ({"method": "siso"}, "method"),
+        ({"inner": (20.0, 0.4, 0)}, "inner, outer"),
+        ({"follow_model": True}, "follow_model"),
+        ({"derivative_cutoff_hz": 20.0}, "derivative_cutoff_hz"),
+    ],
+)
+def test_a_stock_law_is_taken_as_it_is(option, name):
+    with pytest.raises(Error, match=f"{name}: not with profile px4-stock"):
+        load_spec(profile="px4-stock", **option)
