@@ -25,6 +25,17 @@ as-imported:
 	@rm -rf $(AS_IMPORTED) && mkdir -p $(AS_IMPORTED) && ln -s $(CURDIR)/mimopilot/* $(AS_IMPORTED) \
 	&& ln -s $(CURDIR)/tuning $(CURDIR)/codegen $(CURDIR)/sitl $(AS_IMPORTED)
 
+# The package on every Python that there is: built, installed outside of the tree, and used.
+PYTHONS ?= python3.11 python3.12 python3.13
+pythons: $(VENV)/.installed-test
+	@for python in $(PYTHONS); do \
+		if $$python -c "" 2>/dev/null; then $(BIN)/python -m tests.package $$python || exit 1; \
+		else echo "$$python: not here"; fi; done
+
+# The manual as a site, with the reference of commands and API.
+docs: $(VENV)/.installed-test as-imported
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
 lint: $(VENV)/.installed-test as-imported
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -41,10 +52,10 @@ $(VENV)/.installed: pyproject.toml | $(BIN)/python
 	touch $@
 
 $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,docs]'
 	touch $@ $(VENV)/.installed
 
 clean:
 	rm -rf $(VENV) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-.PHONY: demo test lint bench clean cross as-imported
+.PHONY: demo test lint docs bench clean cross as-imported pythons

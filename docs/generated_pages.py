@@ -29,7 +29,8 @@ def _cell(text: object) -> str:
 def _parameter_row(parameter: Any) -> str:
     """One option or argument: its names, help and default."""
     hidden = callable(parameter.default) or parameter.default in (None, False, (), [])
-    default = "" if hidden or parameter.required else f"`{_cell(getattr(parameter.default, 'value', parameter.default))}`"
+    value = getattr(parameter.default, "value", parameter.default)
+    default = "" if hidden or parameter.required else f"`{_cell(value)}`"
     names = parameter.opts if parameter.param_type_name == "option" else [parameter.name]
     needed = "required" if parameter.required else default
     return f"| {', '.join(f'`{name}`' for name in names)} | {_cell(parameter.help)} | {needed} |"
@@ -40,14 +41,15 @@ def commands_page() -> str:
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     parts = [
         "# Commands",
-        "Generated from the commands themselves; `mimopilot COMMAND --help` prints the same. Global options: `--quiet`, "
-        "`--verbose`, `--version`.",
+        "Generated from the commands themselves; `mimopilot COMMAND --help` prints the same. Global options: "
+        "`--quiet`, `--verbose`, `--version`.",
     ]
     for name in sorted(commands):
         command = commands[name]
         parts += [f"## {name}", re.sub(r"\n(?!\n)", " ", command.help or "").replace("<", "&lt;")]
         if command.params:
-            parts.append("\n".join(["| option | what | default |", "|---|---|---|", *map(_parameter_row, command.params)]))
+            rows = map(_parameter_row, command.params)
+            parts.append("\n".join(["| option | what | default |", "|---|---|---|", *rows]))
         examples = (command.epilog or "").removeprefix("Example: ").split("; ")
         parts.append("\n".join(["```", *filter(None, examples), "```"]))
     return "\n\n".join(parts) + "\n"

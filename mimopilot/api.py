@@ -678,7 +678,7 @@ def autotune(
     out : str or Path
         Folder of logs, gains, decisions and report; after an interruption the same one goes on.
     profile : str
-        ``mimo``: our module.
+        ``mimo``: our module. ``px4-stock``, ``ardupilot-stock``: the autopilot's own controllers.
     take_off : float, optional, m
         Arm, take off to this height, and land. None: a pilot does that.
     arm : bool

@@ -3,11 +3,8 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
-import zipfile
-from pathlib import Path
 
 import pytest
 from pyulog import ULog
@@ -18,7 +15,7 @@ from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.ulog_file import open_ulog
 from mimopilot.tuning.reference_model import SecondOrder
 from tests.conftest import assert_one_clear_line, run_here
-from tests.paths import DOCS, PACKAGES, TOP
+from tests.paths import DOCS
 
 COMMANDS = [
     *("demo", "reproduce", "experiment", "inspect", "identify", "tune", "certify", "advise", "generate", "pil"),
@@ -236,37 +233,6 @@ def test_a_full_disk_leaves_the_old_file_whole(tmp_path, monkeypatch):
     assert [p.name for p in tmp_path.iterdir()] == ["x"]
 
 
-def test_the_wheel_holds_every_file_that_is_not_python(tmp_path):
-    copy = tmp_path / "source"
-    copy.mkdir()
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(TOP / name, copy)
-    for folder in PACKAGES.values():
-        shutil.copytree(folder, copy / folder.name, ignore=shutil.ignore_patterns("__pycache__"))
-    build = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "-q",
-        "--no-deps",
-        "--no-build-isolation",
-        "-w",
-        str(tmp_path),
-        str(copy),
-    ]
-    subprocess.run(build, check=True, capture_output=True)
-    (wheel,) = tmp_path.glob("*.whl")
-    held = set(zipfile.ZipFile(wheel).namelist())
-    wanted = {
-        (Path(package.replace(".", "/")) / path.relative_to(folder)).as_posix()
-        for package, folder in PACKAGES.items()
-        for path in folder.rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts
-    }
-    assert wanted <= held
-
-
 def test_the_demo_runs_the_whole_workflow(mimopilot, tmp_path):
     result = mimopilot("demo", "--out", "out", "--seed", "1", "--json")
     assert result.returncode == 0, result.stderr
@@ -341,17 +307,3 @@ def test_help_and_manual_name_every_target_and_airframe(mimopilot):
     for name in known_airframes():
         assert name in flights
         assert f"`{name}`" in manual
-
-
-def test_the_design_that_readme_shows_is_what_its_commands_print(mimopilot):
-    mimopilot("experiment", "adam0", "--seed", "1", "--out", "flight.ulg")
-    printed = mimopilot("tune", "flight.ulg", "--out", "my.gains.toml").stdout
-    shown = (TOP / "README.md").read_text()
-    for name in ("flown", "SISO", "tuned"):
-        now, then = (re.search(rf"^ {name} .*/.*$", text, re.MULTILINE) for text in (printed, shown))
-        assert now and then, name
-        figures = [[float(figure) for figure in re.findall(r"\d+\.\d+", row[0])] for row in (now, then)]
-        assert len(figures[1]) == 9
-        assert figures[0] == pytest.approx(figures[1], abs=0.01)
-        noise = slice(6, 8)
-        assert figures[0][noise] == pytest.approx(figures[1][noise], rel=0.02)

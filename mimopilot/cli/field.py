@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from mimopilot.cli.options import JsonOption, KeyOption, SystemOption, TimeoutOption
+from mimopilot.cli.options import JsonOption, KeyOption, ProfileOption, SystemOption, TimeoutOption
 from mimopilot.cli.vehicle import ConnectOption
 
 
@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
 def autotune(
     connect: ConnectOption,
     out: Annotated[Path, typer.Option(help="Folder of logs, gains, decisions and report; the same one goes on.")],
-    profile: Annotated[str, typer.Option(help="mimo: our module.")] = "mimo",
+    profile: ProfileOption = None,
     take_off: Annotated[
         float | None,
         typer.Option(help="Arm, take off to this height, m, and land; by default a pilot takes off, hovers and lands."),
@@ -56,7 +56,7 @@ def autotune(
     options = AutotuneOptions(
         connect,
         out,
-        profile=profile,
+        profile=profile or "mimo",
         take_off=take_off,
         yes=yes,
         arm=arm,

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from mimopilot.common.charts import STYLES, svg
 from mimopilot.common.html_report import ReportTable, Section, write_report
 from mimopilot.sitl.field.autotune_run import CHECK, FLIGHT, REPORT, AutotuneRun
-from mimopilot.sitl.field.check_flight import AXES, FIGURES, SHARE, CheckResult
+from mimopilot.sitl.field.check_flight import FIGURES, SHARE, CheckResult
 from mimopilot.tuning.gains import Gains
 
 #: Columns of `predicted_rows`, and of `check_rows`.
 PREDICTED = ("", "follows [deg]", "other axis [deg]", "after torque [deg]", "noise of u", "Ms")
-CHECKED = ("roll / pitch", "predicted", "flown", "limit")
+CHECKED = ("roll / pitch / yaw", "predicted", "flown", "limit")
 CHECK_CAPTION = f"Doublets of the check flight; limit: {1 + SHARE:g} times the prediction, and a margin for gusts"
 
 
@@ -34,27 +34,27 @@ def check_rows(result: CheckResult) -> list[list[str]]:
     """Figures of the check flight beside the predicted ones and their limits."""
     rows = []
     for name, (text, unit, floor) in FIGURES.items():
-        pairs = [getattr(figures, name) for figures in (result.predicted, result.flown)]
-        limits = [(1 + SHARE) * value + floor for value in pairs[0]]
-        form = "{:.2f} / {:.2f}" if unit else "{:.4f} / {:.4f}"
-        rows.append([f"{text} [{unit}]" if unit else text, *(form.format(*pair) for pair in (*pairs, limits))])
+        found = [getattr(figures, name) for figures in (result.predicted, result.flown)]
+        limits = [(1 + SHARE) * value + floor for value in found[0]]
+        form = "{:.2f}" if unit else "{:.4f}"
+        cells = (" / ".join(map(form.format, values)) for values in (*found, limits))
+        rows.append([f"{text} [{unit}]" if unit else text, *cells])
     return rows
 
 
 def check_figure(result: CheckResult) -> Figure:
     """Setpoints, angles and predicted angles over time."""
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    panels: Any = figure.subplots(2, 1, sharex=True)
-    for axis, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
-        panel.step(result.times, np.degrees(result.setpoint[:, axis]), color="black", linewidth=1, label="setpoint")
-        for signal, label, (colour, style) in zip(
-            (result.expected, result.angles), ("predicted", "flown"), STYLES[1:], strict=False
-        ):
-            panel.plot(result.times, np.degrees(signal[:, axis]), color=colour, linestyle=style, label=label)
-        panel.set_ylabel(f"{name} [deg]")
+    figure = Figure(figsize=(9, 3 * len(result.axes)), layout="constrained")
+    panels: Any = figure.subplots(len(result.axes), 1)
+    for axis, panel in zip(result.axes, panels, strict=True):
+        panel.step(axis.time, np.degrees(axis.setpoint), color="black", linewidth=1, label="setpoint")
+        lines = (axis.expected, "predicted"), (axis.angle, "flown")
+        for (signal, label), (colour, style) in zip(lines, STYLES[1:], strict=False):
+            panel.plot(axis.time, np.degrees(signal), color=colour, linestyle=style, label=label)
+        panel.set_ylabel(f"{axis.name} [deg]")
         panel.grid(alpha=0.3)
     panels[0].legend(loc="upper right", fontsize=9, ncols=3)
-    panels[1].set_xlabel("time [s]")
+    panels[-1].set_xlabel("time [s]")
     return figure
 
 

@@ -117,7 +117,7 @@ class AutotuneRun:
     @contextmanager
     def vehicle(self, armed: bool = True, integers: Collection[str] = ()) -> Iterator[Session]:
         """A link to the vehicle's parameters; `armed`: also while it flies. After Ctrl-C the autotune ends."""
-        with open_session(self._link(armed), integers) as session:
+        with open_session(self.link(armed), integers) as session:
             session.heeds_interrupts = not self.ending
             yield session
             self._check_interrupt(session)
@@ -125,11 +125,12 @@ class AutotuneRun:
     @contextmanager
     def vehicle_logs(self) -> Iterator[LogSession]:
         """A link to the vehicle's logs, likewise."""
-        with open_logs(self._link(False)) as session:
+        with open_logs(self.link(False)) as session:
             yield session
             self._check_interrupt(session)
 
-    def _link(self, armed: bool) -> LinkOptions:
+    def link(self, armed: bool = True) -> LinkOptions:
+        """How to reach the vehicle; `armed`: also while it flies."""
         given = self.options
         return LinkOptions(given.connect, given.system, given.timeout, given.signing_key, force_armed=armed)
 

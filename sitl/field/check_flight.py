@@ -7,7 +7,7 @@ The closed loop around the measured response gives angles and torque for the set
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.tuning import law
+from mimopilot.tuning.axes import Law, axis_names, law_of, yaw_axis
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
+from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
 
-AXES = ("roll", "pitch")
 # All chosen, see the tests for what healthy and damaged vehicles reach:
 #: Share by which a figure may be worse than predicted.
 SHARE = 0.5
@@ -38,29 +40,43 @@ SILENCE_S = 8.0
 
 Signal = NDArray[np.float64]
 Complex = NDArray[np.complex128]
-NOISELESS: Signal = np.zeros(2)
 
 
 @dataclass(frozen=True)
 class CheckFigures:
-    """Figures of the doublets; pairs are for roll and pitch, over the doublets of that axis and 1 s after each.
+    """Figures of the doublets, a value for each axis, over the doublets of that axis and 1 s after each.
 
     Attributes
     ----------
-    follow_deg : tuple of 2 float, deg
+    follow_deg : tuple of float, deg
         RMS of the angle's distance from the attitude model.
-    offaxis_deg : tuple of 2 float, deg
-        RMS of the other axis' angle.
-    torque : tuple of 2 float
+    offaxis_deg : tuple of float, deg
+        RMS of pitch in roll doublets, and of roll in pitch doublets.
+    torque : tuple of float
         RMS of the axis' torque (normalised).
-    rest_torque : tuple of 2 float
+    rest_torque : tuple of float
         Standard deviation of the torque in level flight: an oscillation is seen there.
     """
 
-    follow_deg: tuple[float, float]
-    offaxis_deg: tuple[float, float]
-    torque: tuple[float, float]
-    rest_torque: tuple[float, float]
+    follow_deg: tuple[float, ...]
+    offaxis_deg: tuple[float, ...]
+    torque: tuple[float, ...]
+    rest_torque: tuple[float, ...]
+
+    def __add__(self, other: CheckFigures) -> CheckFigures:
+        """Of the axes of both."""
+        return CheckFigures(*(getattr(self, name) + getattr(other, name) for name in FIGURES))
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedAxis:
+    """Signals of one axis: time (N,), s; logged setpoint and angle, and predicted angle, (N,), rad."""
+
+    name: str
+    time: Signal
+    setpoint: Signal
+    angle: Signal
+    expected: Signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,18 +88,14 @@ class CheckResult:
     predicted, flown : CheckFigures
     worse : tuple of str
         Figures that are worse than predicted by more than `SHARE`; empty: none is.
-    times : (N,) array, s
-    setpoint, angles, expected : (N, 2) arrays, rad
-        Logged setpoints and angles, and predicted angles.
+    axes : tuple of CheckedAxis
+        The signals.
     """
 
     predicted: CheckFigures
     flown: CheckFigures
     worse: tuple[str, ...]
-    times: Signal
-    setpoint: Signal
-    angles: Signal
-    expected: Signal
+    axes: tuple[CheckedAxis, ...]
 
     def as_table(self) -> dict[str, Any]:
         """The figures, for files."""
@@ -118,68 +130,89 @@ def check_flight(flight: Experiment, experiment: Experiment, gains: Gains) -> Ch
     TuningError
         If the response is known at too few frequencies.
     """
-    plant = wide_response(PlantEstimates(experiment))
-    setpoint, angles, torque = _doublets(flight)
+    measured = PlantEstimates(experiment)
+    models: list[ReferenceModel] = [gains.reference_models(axis)[1] for axis in range(2)]
+    predicted, flown, axes = _compare(flight, measured, gains, models)
+    yaw = yaw_model(gains)
+    if yaw is not None and flight.yaw is not None:
+        more = _compare(yaw_axis(flight), measured.yaw, law_of(gains, 1), [yaw])
+        predicted, flown, axes = predicted + more[0], flown + more[1], axes + more[2]
+    return CheckResult(predicted, flown, _worse(predicted, flown), axes)
+
+
+def yaw_model(gains: Gains) -> ReferenceModel | None:
+    """The model that the heading follows with a set; None: its yaw gains are not tuned."""
+    found = gains.provenance.details.get("yaw", {}).get("attitude_model")
+    return None if found is None else SecondOrder(found["omega"], found["zeta"], found["delay"]).discretise(gains.Ts)
+
+
+def _compare(
+    flight: Experiment, measured: PlantEstimates, gains: Law, models: Sequence[ReferenceModel]
+) -> tuple[CheckFigures, CheckFigures, tuple[CheckedAxis, ...]]:
+    """Predicted and flown figures of n axes, and their signals."""
+    plant = wide_response(measured)
+    names = axis_names(len(models))
+    setpoint, angles, torque = _doublets(flight, names)
     T, U, *noise = _closed_loop(gains, plant)
     expected = _respond(T, setpoint, plant, flight.Ts)
     expected_torque = _respond(U, setpoint, plant, flight.Ts)
-    model = _respond(_attitude_model(gains, plant), setpoint, plant, flight.Ts)
-    parts = [_parts(setpoint[:, axis], flight.Ts) for axis in range(2)]
+    wanted = np.zeros_like(T)
+    for axis, model in enumerate(models):
+        wanted[:, axis, axis] = model.frequency_response(plant.omega)
+    follows = _respond(wanted, setpoint, plant, flight.Ts)
+    parts = [_parts(setpoint[:, axis], flight.Ts) for axis in range(len(names))]
     rest = _rest(setpoint, flight.Ts)
-    predicted = _figures(expected, expected_torque, model, parts, rest, *noise)
-    flown = _figures(angles, torque, model, parts, rest, NOISELESS, NOISELESS)
-    times = np.arange(len(setpoint), dtype=np.float64) * flight.Ts
-    return CheckResult(predicted, flown, _worse(predicted, flown), times, setpoint, angles, expected)
+    none = np.zeros(len(names))
+    predicted = _figures(expected, expected_torque, follows, parts, rest, *noise)
+    flown = _figures(angles, torque, follows, parts, rest, none, none)
+    time = np.arange(len(setpoint), dtype=np.float64) * flight.Ts
+    shown = (
+        CheckedAxis(name, time, *signals)
+        for name, *signals in zip(names, setpoint.T, angles.T, expected.T, strict=True)
+    )
+    return predicted, flown, tuple(shown)
 
 
-def _doublets(flight: Experiment) -> tuple[Signal, Signal, Signal]:
-    """Setpoints, angles and torque, (N, 2) each without their level values, from before the first doublet on."""
+def _doublets(flight: Experiment, names: Sequence[str]) -> tuple[Signal, Signal, Signal]:
+    """Setpoints, angles and torque, (N, n) each without their level values, from before the first doublet on."""
     if flight.r_o is None:
         raise SitlError(f"{flight.source}: no attitude setpoints are logged", exit_code=1)
     start, stop = max(flight.segments, key=lambda part: part[1] - part[0])
     setpoint = flight.r_o[start:stop] - np.median(flight.r_o[start:stop], axis=0)
-    moving = [np.flatnonzero(np.abs(setpoint[:, axis]) > SMALLEST) for axis in range(2)]
-    for axis, rows in zip(AXES, moving, strict=True):
+    moving = [np.flatnonzero(np.abs(column) > SMALLEST) for column in setpoint.T]
+    for axis, rows in zip(names, moving, strict=True):
         if not len(rows):
             raise SitlError(f"{flight.source}: the log does not hold the doublets on {axis}", exit_code=1)
     lead, tail = round(LEAD_S / flight.Ts), round((REST_S + TAIL_S) / flight.Ts)
-    first = max(0, min(rows[0] for rows in moving) - lead)
-    last = min(len(setpoint), max(rows[-1] for rows in moving) + tail)
-    used = slice(first, last)
-    before = slice(start + first, start + min(rows[0] for rows in moving))
+    begin, end = min(rows[0] for rows in moving), max(rows[-1] for rows in moving)
+    used = slice(max(0, begin - lead), min(len(setpoint), end + tail))
+    before = slice(start + used.start, start + begin)
     angles = flight.y_o[start:stop][used] - np.median(flight.y_o[before], axis=0)
     torque = flight.u[start:stop][used] - np.median(flight.u[before], axis=0)
     return setpoint[used], angles, torque
 
 
-def _closed_loop(gains: Gains, plant: WideResponse) -> tuple[Complex, Complex, Signal, Signal]:
-    """T and U, (K, 2, 2), and the RMS of angles and of the torque at hover that noise and gusts cause, (2,) each."""
+def _closed_loop(gains: Law, plant: WideResponse) -> tuple[Complex, Complex, Signal, Signal]:
+    """T and U, (K, n, n), and the RMS of angles and of the torque at hover that noise and gusts cause, (n,) each."""
     C_ref, C_o, C_y = law.cascade_response(gains, plant.omega)
-    S = np.linalg.inv(np.eye(2) + C_y @ plant.G_i + C_o @ plant.G_o)
+    n = plant.G_i.shape[-1]
+    S = np.linalg.inv(np.eye(n) + C_y @ plant.G_i + C_o @ plant.G_o)
     U = S @ C_ref
     N = plant.noise
-    torque = S @ (C_y @ N[:, :2] + C_o @ N[:, 2:])
-    angles = N[:, 2:] - plant.G_o @ torque
+    torque = S @ (C_y @ N[:, :n] + C_o @ N[:, n:])
+    angles = N[:, n:] - plant.G_o @ torque
     rms = [np.sqrt(plant.noise_weight @ np.sum(np.abs(one) ** 2, axis=2)) for one in (angles, torque)]
     return (plant.G_o @ U).astype(np.complex128), U.astype(np.complex128), rms[0], rms[1]
 
 
-def _attitude_model(gains: Gains, plant: WideResponse) -> Complex:
-    """Responses of the attitude models of a set, (K, 2, 2)."""
-    found = np.zeros((len(plant.omega), 2, 2), complex)
-    for axis in range(2):
-        found[:, axis, axis] = gains.reference_models(axis)[1].frequency_response(plant.omega)
-    return found
-
-
 def _respond(response: Complex, signal: Signal, plant: WideResponse, Ts: float) -> Signal:
-    """Response (N, 2) to a signal (N, 2) that begins and ends at zero."""
+    """Response (N, n) to a signal (N, n) that begins and ends at zero."""
     length = len(signal) + round(SILENCE_S / Ts)
     spectrum = np.fft.rfft(signal, length, axis=0)
     omega = 2 * np.pi * np.fft.rfftfreq(length, Ts)
     # Between the frequencies of the plant the response is linear; at rest it is that of the slowest.
-    at = np.empty((len(omega), 2, 2), complex)
-    for i, j in np.ndindex(2, 2):
+    at = np.empty((len(omega), *response.shape[1:]), complex)
+    for i, j in np.ndindex(*response.shape[1:]):
         at[:, i, j] = np.interp(omega, plant.omega, response[:, i, j].real) + 1j * np.interp(
             omega, plant.omega, response[:, i, j].imag
         )
@@ -211,21 +244,22 @@ def _figures(
     angle_noise: Signal,
     torque_noise: Signal,
 ) -> CheckFigures:
-    """Figures of angles and torque; noise (2,) is added to those of a prediction, which has none."""
+    """Figures of angles and torque; noise (n,) is added to those of a prediction, which has none."""
     follow, offaxis, effort, still = [], [], [], []
     for axis, part in enumerate(parts):
-        other = 1 - axis
         follow.append(_degrees(np.hypot(_rms(angles[part, axis] - model[part, axis]), angle_noise[axis])))
-        offaxis.append(_degrees(np.hypot(_rms(angles[part, other] - model[part, other]), angle_noise[other])))
         effort.append(float(np.hypot(_rms(torque[part, axis]), torque_noise[axis])))
         still.append(float(np.hypot(np.std(torque[rest, axis]), torque_noise[axis])))
-    return CheckFigures((follow[0], follow[1]), (offaxis[0], offaxis[1]), (effort[0], effort[1]), (still[0], still[1]))
+        if len(parts) > 1:
+            other = 1 - axis
+            offaxis.append(_degrees(np.hypot(_rms(angles[part, other] - model[part, other]), angle_noise[other])))
+    return CheckFigures(tuple(follow), tuple(offaxis), tuple(effort), tuple(still))
 
 
 def _worse(predicted: CheckFigures, flight: CheckFigures) -> tuple[str, ...]:
     found = []
     for name, (text, unit, floor) in FIGURES.items():
-        for axis, expected, got in zip(AXES, getattr(predicted, name), getattr(flight, name), strict=True):
+        for axis, expected, got in zip(AXES, getattr(predicted, name), getattr(flight, name), strict=False):
             limit = (1 + SHARE) * expected + floor
             if not got <= limit:
                 found.append(

@@ -24,9 +24,9 @@ from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 
 # All chosen, unless a source is given:
-#: Whole length of a doublet (one of `tuning.analysis.manoeuvres.PERIODS`), their number on each axis, and level flight
-#: after each, s.
-DOUBLET_S, DOUBLETS, LEVEL_S = 1.2, 2, 1.8
+#: Whole length of a doublet of roll, pitch (one of `tuning.analysis.manoeuvres.PERIODS`) and yaw, which is slower, s;
+#: their number on each axis, and level flight after each, s.
+DOUBLET_S, DOUBLETS, LEVEL_S = (1.2, 1.2, 4.0), 2, 1.8
 #: Level flight before the first doublet, s: the torque of hover is measured in it.
 BEFORE_S = 4.0
 #: Largest amplitude (rad), that of the predictions; and the least, which noise and gusts do not hide.
@@ -49,42 +49,47 @@ NO_CLIMB = 0.5
 
 @dataclass(frozen=True)
 class DoubletPlan:
-    """Doublets on roll, then on pitch.
+    """Doublets on one axis after the other.
 
     Attributes
     ----------
     amplitude : float, rad
-    axes : tuple of int
-        0 roll, 1 pitch.
+    axes : int
+        2: roll and pitch; 3: and yaw.
     """
 
     amplitude: float
-    axes: tuple[int, ...] = (0, 1)
+    axes: int = 2
 
     @property
     def seconds(self) -> float:
         """Length of the flight, s."""
-        return BEFORE_S + len(self.axes) * DOUBLETS * (DOUBLET_S + LEVEL_S)
+        return BEFORE_S + DOUBLETS * sum(length + LEVEL_S for length in DOUBLET_S[: self.axes])
 
-    def setpoint(self, time: float) -> tuple[float, float]:
-        """Roll and pitch (rad) at a time (s) since the beginning."""
-        number, within = divmod(time - BEFORE_S, DOUBLET_S + LEVEL_S)
-        angles = [0.0, 0.0]
-        if time >= BEFORE_S and number < len(self.axes) * DOUBLETS and within < DOUBLET_S:
-            sign = 1.0 if within < DOUBLET_S / 2 else -1.0
-            angles[self.axes[int(number) // DOUBLETS]] = sign * self.amplitude
-        return angles[0], angles[1]
+    def setpoint(self, time: float) -> tuple[float, float, float]:
+        """Roll, pitch and change of the heading (rad) at a time (s) since the beginning."""
+        angles = [0.0, 0.0, 0.0]
+        begin = BEFORE_S
+        for axis, length in enumerate(DOUBLET_S[: self.axes]):
+            within = (time - begin) % (length + LEVEL_S)
+            end = begin + DOUBLETS * (length + LEVEL_S)
+            if begin <= time < end and within < length:
+                angles[axis] = self.amplitude if within < length / 2 else -self.amplitude
+            begin = end
+        return angles[0], angles[1], angles[2]
 
 
-def doublet_plan(flown: float | None) -> DoubletPlan:
+def doublet_plan(flown: float | None, yaw: bool) -> DoubletPlan:
     """Doublets within what an experiment has flown.
 
     Parameters
     ----------
     flown : float or None, rad
         Size of its manoeuvres; None: not known.
+    yaw : bool
+        Also of the heading.
     """
-    return DoubletPlan(min(LARGEST, max(LEAST, flown or LEAST)))
+    return DoubletPlan(min(LARGEST, max(LEAST, flown or LEAST)), 3 if yaw else 2)
 
 
 def fly_doublets(watch: FlightWatch, plan: DoubletPlan) -> Exchange[tuple[str, bool]]:
@@ -111,9 +116,9 @@ def fly_doublets(watch: FlightWatch, plan: DoubletPlan) -> Exchange[tuple[str, b
         send: list[Outgoing] = []
         if client.now >= send_at:
             send_at = client.now + SETPOINT_S
-            roll, pitch = (0.0, 0.0) if late or started is None else plan.setpoint(time)
+            roll, pitch, turn = (0.0, 0.0, 0.0) if late or started is None else plan.setpoint(time)
             thrust = NO_CLIMB if guided else _collective(watch, hover, height)
-            send.append(AttitudeTarget(*address, roll, pitch, yaw, thrust))
+            send.append(AttitudeTarget(*address, roll, pitch, yaw + turn, thrust))
         if started is None and client.now >= ask_at:
             ask_at = client.now + TRY_S
             parameters = (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *mode)

@@ -100,7 +100,7 @@ def wait_for(
     client = watch.client
     deadline = client.now + seconds
     while not condition():
-        reason = watch.link_problem()
+        reason = watch.contact_problem()
         if careful and client.interrupted:
             reason = "interrupted"
         elif client.now > deadline:

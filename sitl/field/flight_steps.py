@@ -9,7 +9,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.autopilot.flight_modes import Mode
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.field.autotune_run import FLIGHT, AutotuneOptions, AutotuneRun, Decided
+from mimopilot.sitl.field.autotune_run import FLIGHT, GAINS, AutotuneOptions, AutotuneRun, Decided
+from mimopilot.sitl.field.check_flight import yaw_model
 from mimopilot.sitl.field.doublet_flight import doublet_plan, fly_doublets
 from mimopilot.sitl.field.flight_commands import land, send_command, take_off, wait_until_disarmed, wait_until_hovering
 from mimopilot.sitl.field.flight_watch import POLL_S, FlightWatch, start_watch
@@ -22,6 +23,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
 from mimopilot.sitl.mavlink.ground_station.session import Session
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
+from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameters import ENABLE
 
 # All chosen:
@@ -94,7 +96,8 @@ def fly_check(run: AutotuneRun) -> Found:
         If the flight was ended for another reason.
     """
     before = list_logs(run)
-    plan = doublet_plan(run.experiment(FLIGHT).amplitude)
+    gains = load_gains(run.file(GAINS))
+    plan = doublet_plan(run.experiment(FLIGHT).amplitude, yaw_model(gains) is not None)
     with run.vehicle(integers={ENABLE.name}) as session:
         if compare_set(run, session) != NEW:
             raise SitlError("the vehicle does not hold the new gains", exit_code=1)

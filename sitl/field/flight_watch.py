@@ -116,6 +116,15 @@ class FlightWatch:
         """Those of some streams without a message for more than `seconds`."""
         return [kind for kind in streams if self.client.now - self.seen.get(kind, -math.inf) > seconds]
 
+    def contact_problem(self) -> str:
+        """Why the vehicle cannot be reached any more; empty: it can, or may be busy, as with writing its log."""
+        client = self.client
+        if client.closed:
+            return "the link was lost"
+        if client.failure:
+            return client.failure
+        return f"no message from the vehicle for {client.timeout:g} s" if client.lost else ""
+
     def link_problem(self) -> str:
         """Why the flight cannot be followed any more; empty: it can."""
         client = self.client

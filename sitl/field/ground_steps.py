@@ -11,9 +11,9 @@ from mimopilot.common.files import sha256
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_report import write_autotune_report
 from mimopilot.sitl.field.autotune_run import ANSWER_S, CHECK, FLIGHT, GAINS, SNAPSHOT, AutotuneRun, Decided
-from mimopilot.sitl.field.check_flight import check_flight
+from mimopilot.sitl.field.check_flight import check_flight, yaw_model
 from mimopilot.sitl.field.flight_watch import start_watch
-from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, save_snapshot, set_names, write_set
+from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, old_plan, save_snapshot, write_set
 from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
     FLIGHT_STREAMS,
     request_status,
@@ -21,6 +21,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
     supplies_problem,
 )
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import check_kind
 from mimopilot.sitl.mavlink.log_transfer.log_session import LogSession
 from mimopilot.sitl.mavlink.log_transfer.vehicle_logs import VehicleLog
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
@@ -30,7 +31,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.logs.inspection import inspect_log
-from mimopilot.tuning.parameters import IDENTITY
+from mimopilot.tuning.spec import load_spec
 
 # All chosen:
 #: Time (s) in which a vehicle closes its log after disarming, and the pause between two looks.
@@ -47,7 +48,7 @@ def check_vehicle(run: AutotuneRun) -> Found:
     """Check vehicle, battery, gains and logs before anything is flown."""
     options = run.options
     with run.vehicle() as session:
-        session.read(set_names(options.profile), options.profile)
+        check_kind(session.run(session.client.await_heartbeat()), options.profile)
         watch = session.run(start_watch(session.client))
         if not watch.flying and options.take_off is None:
             raise SitlError(
@@ -169,7 +170,7 @@ def tune_gains(run: AutotuneRun) -> Found:
         If the flown gains are better.
     """
     try:
-        gains = tune([run.experiment(FLIGHT)])
+        gains = tune([run.experiment(FLIGHT)], load_spec(profile=run.options.profile))
         warning = check_verdict(gains, allow=False)
     except TuningError as error:
         run.decisions.forget_from("experiment")
@@ -198,8 +199,12 @@ def upload_gains(run: AutotuneRun) -> Found:
     if held_set(run) != OLD:
         raise SitlError("the vehicle's gains are no longer those of the snapshot: somebody changed them", exit_code=1)
     with run.vehicle() as session:
-        fixed = session.read([*plan.fixed, *(p.name for p in IDENTITY)], run.options.profile)
-        check_moment_scale(gains, [fixed[p.name] for p in IDENTITY], "the vehicle")
+        fixed = session.read([*plan.fixed, *plan.scale], run.options.profile)
+    if plan.scale:
+        check_moment_scale(gains, [fixed[name] for name in plan.scale], "the vehicle")
+    unknown = plan.values.keys() - old_plan(run).values.keys()
+    if unknown:
+        raise SitlError(f"{SNAPSHOT}: lacks {', '.join(sorted(unknown))}, which could not be taken back", exit_code=1)
     for name, value in plan.fixed.items():
         if fixed[name] != value:
             raise SitlError(f"{name}: the vehicle has {fixed[name]:.6g}, the gains are for {value:.6g}", exit_code=1)
@@ -223,6 +228,9 @@ def judge(run: AutotuneRun) -> Found:
     """
     flight, gains = run.experiment(CHECK), load_gains(run.file(GAINS))
     _check_flown(run, flight)
+    if yaw_model(gains) is not None and flight.yaw is None:
+        why = "; ".join(flight.warnings) or "it is not logged"
+        run.dialogue.tell(f"yaw is not compared with its prediction: {why}")
     result = check_flight(flight, run.experiment(FLIGHT), gains)
     run.dialogue.show_check(result)
     write_autotune_report(run, gains, result)

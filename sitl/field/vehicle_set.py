@@ -11,22 +11,39 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import GAINS, SNAPSHOT, AutotuneRun
 from mimopilot.sitl.field.flight_commands import wait_until_disarmed
 from mimopilot.sitl.field.flight_watch import start_watch
-from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, make_plan, make_restore_plan
+from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, UploadPlan, make_plan, make_restore_plan
 from mimopilot.sitl.mavlink.ground_station.session import Session
+from mimopilot.sitl.mavlink.ground_station.stock_parameters import read_stock_parameters
 from mimopilot.sitl.mavlink.ground_station.transaction import Upload
 from mimopilot.sitl.mavlink.ground_station.upload import write_and_verify
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.tuning.gains_file import load_gains
+from mimopilot.tuning.law_terms import MIMO
+from mimopilot.tuning.logs.imported_gains import import_gains
 from mimopilot.tuning.parameters import PARAMETERS
 
 OLD, NEW, NEITHER = "old", "new", "neither"
 
 
-def set_names(profile: str) -> list[str]:
-    """Parameters of a set of gains."""
-    if profile != "mimo":
-        raise SitlError(f"--profile: got {profile!r}, expected mimo")
-    return [parameter.name for parameter in PARAMETERS if parameter.writable]
+def check_profile(profile: str) -> None:
+    """Refuse an unknown profile.
+
+    Raises
+    ------
+    SitlError
+        Naming those that are known.
+    """
+    if profile not in PROFILES:
+        raise SitlError(f"--profile: got {profile!r}, expected one of {', '.join(PROFILES)}")
+
+
+def _set_names(run: AutotuneRun) -> list[str]:
+    """Parameters of a set of gains; those of a stock controller differ between versions of its firmware."""
+    profile = run.options.profile
+    if profile == MIMO:
+        return [parameter.name for parameter in PARAMETERS if parameter.writable]
+    flown = import_gains(read_stock_parameters(run.link()), profile=profile).gains
+    return list(make_plan(flown, profile).values)
 
 
 def save_snapshot(run: AutotuneRun) -> dict[str, float]:
@@ -37,8 +54,9 @@ def save_snapshot(run: AutotuneRun) -> dict[str, float]:
     SitlError
         If it cannot be read, or is not what the file holds afterwards.
     """
+    names = _set_names(run)
     with run.vehicle() as session:
-        held = session.read(set_names(run.options.profile), run.options.profile)
+        held = session.read(names, run.options.profile)
         vehicle = session.vehicle
     path = run.file(SNAPSHOT)
     write_atomically(path, parameter_text("qgc", held, vehicle.system, vehicle.component))

@@ -29,7 +29,7 @@ from mimopilot.sitl.field.ground_steps import (
     tune_gains,
     upload_gains,
 )
-from mimopilot.sitl.field.vehicle_set import NEITHER, NEW, OLD, held_set, old_plan, set_names, write_set
+from mimopilot.sitl.field.vehicle_set import NEITHER, NEW, OLD, check_profile, held_set, old_plan, write_set
 
 
 class AutotuneStep(NamedTuple):
@@ -80,7 +80,7 @@ def autotune(options: AutotuneOptions, dialogue: AutotuneDialogue) -> Decisions:
     SitlError
         If not: with the reason, and the set that the vehicle holds.
     """
-    set_names(options.profile)
+    check_profile(options.profile)
     run = AutotuneRun(options, load_decisions(options.folder, options.profile), dialogue)
     if run.decisions.result == "old":
         raise SitlError(

@@ -27,7 +27,12 @@ from mimopilot.sitl.studies.attitude_study import (
 
 #: Methods in the plots; method -> (colour, line style) and marker.
 TUNED = (SISO_THESIS, MIMO_THESIS, SISO, MIMO)
-LOOK = dict(zip(TUNED, zip(STYLES, "so^v", strict=False), strict=False))
+LOOK = {
+    SISO_THESIS: (("#E69F00", ":"), "s"),
+    MIMO_THESIS: (STYLES[3], "o"),
+    SISO: (STYLES[1], "^"),
+    MIMO: (STYLES[2], "v"),
+}
 PRINTED = {"color": "black", "marker": "x", "markersize": 7, "markeredgewidth": 1.6, "linestyle": "none"}
 MATRICES = {"Kp_o": "1/s", "Kp_i": "s", "Ki_i": "-", "Kd_i": "s^2"}
 ELEMENTS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")

@@ -2,10 +2,10 @@
 
 An HTML comment on the line above a block says what the language does not:
 
-    <!-- vehicle -->            it needs a vehicle (or a ground station, or an autopilot): its commands are only parsed
+    <!-- vehicle -->            it needs a vehicle, a ground station or an autopilot: its commands are only parsed
     <!-- test: FILE::NAME -->   that test runs it, because it takes long or needs more than a folder
     <!-- run: A => B; C => D -->  run with B in place of A: fewer runs
-    <!-- toml: KIND -->         a file of that kind; it is read by the reader of that kind, and is KIND.toml for commands
+    <!-- toml: KIND -->         a file of that kind, read by its reader; commands find it as KIND.toml
 
 Languages: none or `sh` for commands, `console` for commands (after `$`) with lines of their output, `toml`, `python`, and
 `text` for what is neither: equations, trees, columns.
@@ -20,7 +20,9 @@ from pathlib import Path
 from tests.paths import DOCS, TOP
 
 LANGUAGES = ("", "sh", "console", "toml", "python", "text")
-BLOCK = re.compile(r"(?:^<!-- (?P<mark>[^\n]*?) -->\n)?^ *```(?P<language>\w*)\n(?P<text>.*?)^ *```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(
+    r"(?:^<!-- (?P<mark>[^\n]*?) -->\n)?^ *```(?P<language>\w*)\n(?P<text>.*?)^ *```$", re.MULTILINE | re.DOTALL
+)
 
 
 @dataclass(frozen=True)

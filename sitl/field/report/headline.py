@@ -65,9 +65,10 @@ def _without_certificate(flights: Sequence[ReportedFlight], cases: Sequence[Gain
         sentence = f"{before}Gains cannot be tuned from {refused.label}: {reason}."
         steps = ["What the log does show is below. For gains, mend this and fly again; mimopilot inspect checks a log."]
         return Headline(sentence, steps, "bad" if before else "doubt")
+    tone = "bad" if before else "doubt"
     if cases:
         problem = next(case for case in cases if case.problem or not case.gains.certificate)
-        return Headline(f"{before}No certificate for '{problem.label}': {problem.problem}.", (), "doubt")
+        return Headline(f"{before}No certificate for '{problem.label}': {problem.problem}.", (), tone)
     names = " and ".join(flight.label for flight in flights)
     step = f"Find gains: mimopilot tune {flights[0].recording.path.name} --out my.gains.toml, then report --gains."
-    return Headline(f"{before}Gains can be tuned from {names}, which does not hold those that flew.", [step])
+    return Headline(f"{before}Gains can be tuned from {names}, which does not hold those that flew.", [step], tone)

@@ -22,10 +22,10 @@ from tests.sitl.field.field_vehicle import SECONDS, FieldLink, FieldVehicle
 TUNED = {}
 
 
-def tune_once(experiments):
+def tune_once(experiments, spec):
     (one,) = experiments
     if one.sha256 not in TUNED:
-        TUNED[one.sha256] = tune(experiments)
+        TUNED[one.sha256] = tune(experiments, spec)
     return TUNED[one.sha256]
 
 

@@ -60,7 +60,7 @@ def flight_bytes(kind, values, detuned):
         plan = DoubletPlan(np.radians(8.0))
         times = np.arange(round(plan.seconds / Ts)) * Ts
         setpoint = np.zeros((len(times), 3))
-        setpoint[:, :2] = [plan.setpoint(time) for time in times]
+        setpoint[:] = [plan.setpoint(time) for time in times]
         level = np.zeros_like(setpoint)
         flown = gains.with_elements({"RD_RR": detuned, "RD_PP": detuned}) if detuned else gains
         scenario = Scenario("doublet", Ts, setpoint, level, 0, (0, len(times)))

@@ -134,7 +134,7 @@ def test_ctrl_c_while_tuning_goes_on_from_there(scripted, monkeypatch):
     old = dict(field.vehicle.set)
     tune = ground_steps.tune
 
-    def interrupted(_):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(ground_steps, "tune", interrupted)

@@ -33,13 +33,13 @@ INNER, OUTER = second_order(20.0, 0.7, 0, TS), second_order(5.0, 0.7, 0, TS)
 
 @cache
 def flights():
-    return VEHICLE.fly(calm(), count=6, seconds=12.0)
+    return VEHICLE.fly(calm(), count=5, seconds=12.0)
 
 
 @cache
 def designs():
     """Of yaw alone, from some of the flights; without a derivative, which is at its bound in some of them only."""
-    return [tune_yaw([PlantEstimates(one)], PI, calm(), FASTEST) for one in flights()[:4]]
+    return [tune_yaw([PlantEstimates(one)], PI, calm(), FASTEST) for one in flights()[:3]]
 
 
 @cache
@@ -78,7 +78,7 @@ def test_the_fitted_acceleration_of_yaw_is_that_of_the_vehicle():
 
 
 def test_the_certificate_has_the_exact_margin_of_yaw():
-    for flight in flights()[:3]:
+    for flight in flights()[:2]:
         found, _ = yaw_certificate(calm(), PlantEstimates(flight), [INNER], [OUTER], Thresholds())
         exact = VEHICLE.peak(calm(), YAW)
         assert found.figures["Ms"] == pytest.approx(exact, abs=found.figures["Ms_error"] + 0.02)
@@ -102,8 +102,9 @@ def test_the_gains_of_repeated_flights_spread_as_predicted():
     values = {name: [getattr(one.gains, name) for one in designs()] for name in MATRICES}
     for name in ("Kp_o", "Kp_i", "Ki_i"):
         predicted = np.mean([one.deviations[name] for one in designs()])
-        # That of four values is within a quarter and twice the true one (95 %).
-        assert 0.25 * predicted < np.std(values[name], ddof=1) < 3 * predicted, name
+        # That of three values is within a sixth and twice the true one (95 %), which is up to twice the predicted one:
+        # the noise that limits the gains is itself measured, with an error that is alike at neighbouring frequencies.
+        assert predicted / 6 < np.std(values[name], ddof=1) < 4 * predicted, name
 
 
 def test_the_design_does_not_depend_on_the_unit_of_torque():
@@ -161,15 +162,11 @@ def test_at_another_rate_nothing_that_was_predicted_of_yaw_remains():
     assert set(carried.provenance.details["yaw"]) == {"excited_by", "logs", "attitude_model", "flown_bandwidth"}
 
 
-def test_the_other_log_may_be_the_one_that_excites_yaw():
-    first, second = flights()[:2]
-    found = tune_yaw([PlantEstimates(still(first)), PlantEstimates(second)], PI, calm(), FASTEST)
-    assert found.details["logs"] == [second.source]
-
-
-def test_yaw_from_two_logs_is_designed_for_both():
-    both = [PlantEstimates(one) for one in flights()[:2]]
-    found = tune_yaw(both, PI, calm(), FASTEST)
+def test_yaw_is_designed_for_all_logs_that_excite_it():
+    first, second, third = flights()[:3]
+    logs = [PlantEstimates(one) for one in (still(first), second, third)]
+    found = tune_yaw(logs, PI, calm(), FASTEST)
+    assert found.details["logs"] == [second.source, third.source]
     assert [len(found.details["predicted"][name]) for name in ("tuned", "flown")] == [2, 2]
 
 

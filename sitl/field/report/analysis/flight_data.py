@@ -135,11 +135,13 @@ class ReportedFlight:
         }
 
     def _excited(self) -> tuple[Interval, ...]:
-        for name in ("u_bar", "r_bar"):
-            series = self.signal(name)
-            if series is not None and series.values.any():
-                return self._inside(bridged(intervals(series.time, np.any(series.values != 0, axis=1)), BRIDGE))
-        return ()
+        parts: tuple[Interval, ...] = ()
+        for signals in (self.recording.signals, self.recording.yaw):
+            for name in ("u_bar", "r_bar"):
+                if name in signals:
+                    series = self.since_begin(signals[name])
+                    parts += intervals(series.time, np.any(series.values != 0, axis=1))
+        return self._inside(bridged(tuple(sorted(parts)), BRIDGE))
 
     def _saturated(self) -> tuple[Interval, ...]:
         parts: tuple[Interval, ...] = ()

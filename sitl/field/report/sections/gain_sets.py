@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from mimopilot.tuning.design.prediction import Prediction, predict
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.inspection import AXES
 from mimopilot.tuning.parameter_row import Shape
-from mimopilot.tuning.parameters import rows
+from mimopilot.tuning.parameters import YAW_GAINS, rows
 from mimopilot.tuning.plant.frequency_response import SAME_PERIOD
 
 ELEMENTS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
@@ -53,6 +54,7 @@ def gains_section(cases: Sequence[GainCase]) -> Section:
     columns = ["", *(case.label for case in cases)]
     cells = {(row[0], row[1]): row[2] for row in table}
     body = [[element, *(cells.get((element, case.label), "") for case in cases)] for element in order]
+    body += _yaw_rows(cases)
     body.append(["derivative filter", *(_hertz(case.gains.derivative_cutoff_hz) for case in cases)])
     body.append(["control rate", *(f"{1 / case.gains.Ts:g} Hz" for case in cases)])
     caption = (
@@ -64,6 +66,23 @@ def gains_section(cases: Sequence[GainCase]) -> Section:
         charts=[Chart("gains", caption, panels, linked=False)],
         tables=[ReportTable("Gains (+- two standard deviations)", columns, body)],
     )
+
+
+def _yaw_rows(cases: Sequence[GainCase]) -> list[list[str]]:
+    """The gains of yaw that any set uses, with their deviations where they were estimated."""
+    found = []
+    for name in YAW_GAINS:
+        values = [float(getattr(case.gains.yaw, name)) for case in cases]
+        deviations = [_yaw_deviation(case, name) for case in cases]
+        if any(values):
+            pairs = zip(values, deviations, strict=True)
+            found.append([f"{name} yaw", *(_with_error(value, 2 * deviation) for value, deviation in pairs)])
+    return found
+
+
+def _yaw_deviation(case: GainCase, name: str) -> float:
+    table: Any = case.gains.provenance.standard_deviation.get("yaw", {})
+    return float(np.ravel(table[name])[0]) if name in table else float("nan")
 
 
 def _used(case: GainCase, name: str) -> bool:

@@ -113,6 +113,10 @@ def stability_section(cases: Sequence[GainCase], thresholds: Thresholds) -> Sect
     if yaws:
         panels = [_sensitivity(yaws, thresholds), _nyquist(yaws, 0, thresholds, "yaw loop")]
         charts.append(Chart("stability-yaw", "Sensitivity and loop of yaw.", panels, linked=False))
+    if yaws:
+        reasons.append(
+            "The curves of both axes are of roll and pitch alone; the margins below count the coupling to yaw."
+        )
     return Section(HEADING, charts=charts, tables=[margin_table([one.case for one in found])], points=reasons)
 
 

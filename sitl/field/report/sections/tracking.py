@@ -66,34 +66,33 @@ def tracking_charts(flight: ReportedFlight, number: int, count: int, model: Gain
 
 
 def yaw_charts(flight: ReportedFlight, number: int, count: int) -> list[Chart]:
-    """Heading, yaw rate and yaw torque of the used part; none if the log lacks one of them."""
-    experiment = flight.found.experiment
-    yaw = experiment.yaw if experiment else None
-    if experiment is None or yaw is None:
+    """Heading, yaw rate and yaw torque in the air; none if the log holds none of them."""
+    yaw, parts = flight.recording.yaw, flight.airborne
+    if not parts:
         return []
-    time: Signal = np.asarray(np.arange(len(yaw.u)) * experiment.Ts, np.float64)
-    used = np.zeros(len(time), bool)
-    for start, stop in experiment.segments:
-        used[start:stop] = True
     panels = []
     for title, unit, setpoint, response, injected, factor in (
-        ("heading", "[deg]", yaw.r_o, yaw.y_o, None, 180 / np.pi),
-        ("yaw rate", "[deg/s]", yaw.r_i, yaw.y_i, yaw.r_bar, 180 / np.pi),
-        ("yaw torque", "(normalised)", None, yaw.u, yaw.u_bar, 1.0),
+        ("heading", "[deg]", "r_o", "y_o", "", 180 / np.pi),
+        ("yaw rate", "[deg/s]", "r_i", "y_i", "r_bar", 180 / np.pi),
+        ("yaw torque", "(normalised)", "", "u", "u_bar", 1.0),
     ):
         lines = []
-        for values, label, look in (
+        for name, label, look in (
             (setpoint, "setpoint", {"colour": SETPOINT_COLOUR, "width": 1.0, "step": True}),
-            (response, "response" if unit.startswith("[") else "torque u", {"colour": flight.colour, "width": 1.3}),
+            (response, "torque u" if response == "u" else "response", {"colour": flight.colour, "width": 1.3}),
             (injected, "injected", {"colour": FURTHER, "width": 0.9, "step": True}),
         ):
-            if values is not None:
-                x, y = thinned(time, np.where(used, factor * values, np.nan), flight.samples)
-                lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
-        panels.append(Panel(title, "time [s]", unit, lines, height=230))
+            if name in yaw:
+                series = flight.since_begin(yaw[name])
+                inside = (series.time >= parts[0][0]) & (series.time <= parts[-1][1])
+                x, y = thinned(series.time[inside], factor * series.values[inside, 0], flight.samples)
+                if len(y) > 1 and (name != injected or y.any()):
+                    lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
+        if response in yaw and lines:
+            panels.append(Panel(title, "time [s]", unit, lines, height=230))
     named = f" in {flight.label}" if count > 1 else ""
-    text = f"Yaw{named}, in the part that gains are tuned from; time from its beginning."
-    return [Chart(f"tracking-yaw-{number + 1}", text, panels, columns=3)]
+    text = f"Yaw{named}, in the air."
+    return [Chart(f"tracking-yaw-{number + 1}", text, panels, columns=len(panels))] if panels else []
 
 
 def busiest(flight: ReportedFlight, whole: Interval) -> Interval | None:

@@ -52,12 +52,13 @@ FAST_LOG = 1 | 2  # fast and medium attitude: SystemID then logs every loop
 #: --axis -> values of SID_AXIS: mixer roll, pitch, yaw.
 AXES = {"roll": (10,), "pitch": (11,), "yaw": (12,), "both": (10, 11), "all": (10, 11, 12)}
 STABILIZE, SYSTEM_ID = 0, 25  # ArduCopter's mode numbers
-DELAY_S = 1.0  # from the mode change to the chirp (SYSTEM_ID_DELAY)
+DELAY_S = 1.0  # s, from the mode change to the chirp (SYSTEM_ID_DELAY)
 # Chosen:
 START_HZ = 0.4  # two cycles of it begin the chirp; attitude loops are slower than their tuned crossover, 1 to 2 Hz
 #: The chirp ends at this multiple of the bandwidth: it has no power beyond, unlike the PRBS of our injector.
 STOP_BANDWIDTHS = 2.0
 FADE_IN_S, FADE_OUT_S = 5.0, 1.0  # the two cycles at the start; a short end without a step
+AFTER_S = 0.5  # s in the mode after the chirp, in which the response fades
 ALTITUDE_BAND = 5.0  # m, above and below the start, that the pilot may drift before the experiment is stopped
 MODE_TIMEOUT_S, SETTLE_S, END_MARGIN_S = (
     5.0,
@@ -98,8 +99,9 @@ class SystemIdentification(ExperimentProfile):
             "SID_T_FADE_OUT": FADE_OUT_S,
         }
         self.wanted = {SID_AXIS: float(self.axes[0])} | {name: single(value) for name, value in values.items()}
-        #: s, from the mode change until ArduCopter reports the end.
-        self.planned = DELAY_S + options.seconds_per_axis + values["SID_T_FADE_IN"] + constant + FADE_OUT_S
+        #: s, from the mode change. ArduCopter reports the end later by the fades and the first two cycles, in which its
+        #: log shows no injection any more.
+        self.planned = DELAY_S + options.seconds_per_axis + AFTER_S
 
     def prepare(self, session: VehicleSession) -> Preparation:
         """Set the chirp's parameters and fast logging; ArduCopter needs no reboot for them."""

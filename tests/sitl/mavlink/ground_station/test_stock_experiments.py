@@ -289,7 +289,7 @@ def test_the_command_is_never_sent_to_a_running_px4_as_a_stop():
 
 def test_the_command_prepares_and_excites_a_stock_px4_whose_log_is_an_experiment(tmp_path, mimopilot):
     log, old = tmp_path / "flight.ulg", tmp_path / "old.params"
-    with running_sitl("--autopilot", "px4-stock", "--speed", "8", "--log", log) as sitl:
+    with running_sitl("--autopilot", "px4-stock", "--speed", "4", "--log", log) as sitl:
         pilot = Pilot(f"udpin:127.0.0.1:{sitl.udp}")
         pilot.ready()
         assert pilot.beat.autopilot == 12
@@ -297,8 +297,7 @@ def test_the_command_prepares_and_excites_a_stock_px4_whose_log_is_an_experiment
         options = ("--profile", "px4-stock", "--runs", 1, "--snapshot", old, "--yes")
         client = start("experiment", *link, *options)
         client.until("4 parameters set, rebooted; take off and hover now")
-        pilot.ready()
-        assert pilot.command(400, 1) == 0
+        pilot.wait(lambda: pilot.command(400, 1) == 0)  # it has just booted
         assert pilot.command(22, 0, 0, 0, 0, 0, 0, 5) == 0
         pilot.wait(lambda: client.process.poll() is not None)
         client.end()
