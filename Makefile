@@ -36,6 +36,14 @@ pythons: $(VENV)/.installed-test
 docs: $(VENV)/.installed-test as-imported
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 
+# The tutorial's pictures, by the commands that it shows.
+PICTURES = timeline-1 frequency-response sensitivity predicted-motion spectra-1
+pictures: $(VENV)/.installed
+	@rm -rf build/pictures && mkdir -p build/pictures && cd build/pictures && export PATH=$(CURDIR)/$(BIN):$$PATH \
+	&& mimopilot experiment adam0 --seed 1 --out flight.ulg && mimopilot tune flight.ulg --out my.gains.toml \
+	&& mimopilot report flight.ulg --gains my.gains.toml --out flight.html --figures figures \
+	&& for name in $(PICTURES); do cp figures/$$name.png $(CURDIR)/docs/images/ || exit 1; done
+
 lint: $(VENV)/.installed-test as-imported
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -58,4 +66,4 @@ $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
 clean:
 	rm -rf $(VENV) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-.PHONY: demo test lint docs bench clean cross as-imported pythons
+.PHONY: demo test lint docs pictures bench clean cross as-imported pythons

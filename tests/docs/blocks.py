@@ -3,12 +3,12 @@
 An HTML comment on the line above a block says what the language does not:
 
     <!-- vehicle -->            it needs a vehicle, a ground station or an autopilot: its commands are only parsed
-    <!-- test: FILE::NAME -->   that test runs it, because it takes long or needs more than a folder
+    <!-- test: FILE::NAME -->   that test runs it: it takes long, or needs more than a folder
     <!-- run: A => B; C => D -->  run with B in place of A: fewer runs
     <!-- toml: KIND -->         a file of that kind, read by its reader; commands find it as KIND.toml
 
-Languages: none or `sh` for commands, `console` for commands (after `$`) with lines of their output, `toml`, `python`, and
-`text` for what is neither: equations, trees, columns.
+Languages: none or `sh` for commands, `console` for commands (after `$`) with lines of their output, `toml`, `python`,
+and `text` for what is neither: equations, trees, columns.
 """
 
 from __future__ import annotations
