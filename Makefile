@@ -32,6 +32,18 @@ pythons: $(VENV)/.installed-test
 		if $$python -c "" 2>/dev/null; then $(BIN)/python -m tests.package $$python || exit 1; \
 		else echo "$$python: not here"; fi; done
 
+# The manual as a site, with the reference of commands and API.
+docs: $(VENV)/.installed-test as-imported
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
+
+# The tutorial's pictures, by the commands that it shows.
+PICTURES = timeline-1 frequency-response sensitivity predicted-motion spectra-1
+pictures: $(VENV)/.installed
+	@rm -rf build/pictures && mkdir -p build/pictures && cd build/pictures && export PATH=$(CURDIR)/$(BIN):$$PATH \
+	&& mimopilot experiment adam0 --seed 1 --out flight.ulg && mimopilot tune flight.ulg --out my.gains.toml \
+	&& mimopilot report flight.ulg --gains my.gains.toml --out flight.html --figures figures \
+	&& for name in $(PICTURES); do cp figures/$$name.png $(CURDIR)/docs/images/ || exit 1; done
+
 lint: $(VENV)/.installed-test as-imported
 	$(BIN)/ruff check .
 	$(BIN)/mypy
@@ -48,10 +60,10 @@ $(VENV)/.installed: pyproject.toml | $(BIN)/python
 	touch $@
 
 $(VENV)/.installed-test: pyproject.toml | $(BIN)/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[test,docs]'
 	touch $@ $(VENV)/.installed
 
 clean:
 	rm -rf $(VENV) demo build *.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
 
-.PHONY: demo test lint bench clean cross as-imported pythons
+.PHONY: demo test lint docs pictures bench clean cross as-imported pythons

@@ -42,7 +42,7 @@ def campaign(
     runs: Annotated[
         int, typer.Option(min=1, help="Number of runs; each is flown with every gain set on every axis.")
     ] = 1000,
-    vary: Annotated[Path | None, typer.Option(help="What varies (TOML), see README; by default the noise.")] = None,
+    vary: Annotated[Path | None, typer.Option(help="What varies: see docs/campaigns.md; else the noise.")] = None,
     scenario: ScenarioOption = "doublet",
     axis: Annotated[str | None, typer.Option(help="roll, pitch or both.", show_default="both")] = None,
     amplitude_deg: AmplitudeOption = None,

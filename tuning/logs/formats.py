@@ -19,7 +19,7 @@ class LogFormat:
     Attributes
     ----------
     name : str
-        As in messages, in the help text and in the README.
+        As in messages, in the help text and in docs/logs.md.
     suffixes : tuple of str
         Usual endings of file names. The content decides, not the name.
     matches : callable

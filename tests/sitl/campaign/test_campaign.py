@@ -42,7 +42,7 @@ from mimopilot.sitl.physics.rigid_body import GRAVITY, checked_inertia
 from mimopilot.sitl.studies.true_plant import optimum_on_true_plant
 from mimopilot.tuning.reference_model import SecondOrder
 from tests.conftest import assert_one_clear_line
-from tests.paths import TOP
+from tests.paths import DOCS
 from tests.sitl.mavlink.running import PATIENCE_S
 
 RUNS = 40 * CHUNK  # enough to interrupt the campaign while it flies
@@ -281,8 +281,8 @@ inertia.yy = { normal = [1.0, 0.02], relative = true }
     assert high > 1.5 * own
 
 
-def test_the_example_of_the_readme_shows_the_benefit_of_decoupling(vehicle, tmp_path):
-    text = (TOP / "README.md").read_text().partition("## Campaigns")[2]
+def test_the_example_of_the_manual_shows_the_benefit_of_decoupling(vehicle, tmp_path):
+    text = (DOCS / "campaigns.md").read_text()
     vary = text.partition("```toml\n")[2].partition("```")[0]
     assert "inertia.xx" in vary
     assert "products" not in vary
@@ -494,9 +494,8 @@ def test_intervals_of_quantiles_have_at_least_their_nominal_coverage(n, p):
     assert inside < 0.95
 
 
-def test_the_specification_in_the_readme_can_be_drawn_from(vehicle):
-    readme = (TOP / "README.md").read_text()
-    section = readme.partition("## Campaigns")[2].partition("\n## ")[0]
+def test_the_specification_in_the_manual_can_be_drawn_from(vehicle):
+    section = (DOCS / "campaigns.md").read_text()
     example = "\n".join(re.findall(r"```toml\n(.*?)```", section, re.DOTALL))
     names = drawn(vehicle, example, 1)[0].values
     assert {"mass", "delay", "inertia.xx", "motors.effectiveness.4", "fault.1.motor", "amplitude_deg"} <= set(names)

@@ -8,14 +8,14 @@ from mimopilot.cli.options import LogArgument
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.formats import FORMATS, known_formats
 from mimopilot.tuning.logs.reader import open_log
-from tests.paths import TOP
+from tests.paths import DOCS
 
 
 @pytest.mark.parametrize("row", FORMATS, ids=lambda row: row.name)
-def test_every_format_has_a_reader_and_is_named_in_the_readme_and_in_the_help(row):
+def test_every_format_has_a_reader_and_is_named_in_the_manual_and_in_the_help(row):
     module, _, function = row.reader.partition(":")
     assert callable(getattr(import_module(module), function))
-    (table,) = re.findall(r"^\| log \|.*\n(?:\|.*\n)+", (TOP / "README.md").read_text(), re.MULTILINE)
+    (table,) = re.findall(r"^\| log \|.*\n(?:\|.*\n)+", (DOCS / "logs.md").read_text(), re.MULTILINE)
     argument = next(part for part in get_args(LogArgument) if hasattr(part, "help"))
     assert row.name in table
     assert row.name in argument.help

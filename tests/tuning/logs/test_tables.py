@@ -11,7 +11,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import load_columns
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.spec import load_spec
-from tests.paths import TOP
+from tests.paths import DOCS
 from tests.tuning.logs.flights import COLUMNS, make_flight, table, write_csv
 
 
@@ -326,9 +326,8 @@ def test_other_variables_of_a_matlab_file_do_not_matter(tmp_path, flight):
     assert_is(read_log(tmp_path / "x.mat"), flight)
 
 
-def test_the_examples_of_the_readme_are_valid_and_all_that_a_csv_log_needs(tmp_path):
-    readme = (TOP / "README.md").read_text()
-    names, spec = re.findall(r"```toml\n(.*?)```", readme.partition("## Tuning from your own log")[2], re.DOTALL)[:2]
+def test_the_examples_of_the_manual_are_valid_and_all_that_a_csv_log_needs(tmp_path):
+    names, spec = re.findall(r"```toml\n(.*?)```", (DOCS / "logs.md").read_text(), re.DOTALL)[:2]
     assert columns(tmp_path, names).t.unit == "us"
     (tmp_path / "spec.toml").write_text(spec)
     task = load_spec(tmp_path / "spec.toml")

@@ -67,7 +67,7 @@ ENABLE, APPLY, AMPLITUDE, START = "MC_AT_EN", "MC_AT_APPLY", "MC_AT_SYSID_AMP", 
 LOG_PROFILE, NEEDED = "SDLOG_PROFILE", 1 | 16  # default and high rate
 NAMES = (ENABLE, APPLY, AMPLITUDE, LOG_PROFILE)
 COMMAND: int = mavlink.MAV_CMD_DO_AUTOTUNE_ENABLE
-#: rad/s; twice PX4's default, as in the flight of the README from which gains were tuned: tilt stayed below 13 degrees.
+#: rad/s; twice PX4's default, as in the flight of docs/logs.md that gave gains: tilt stayed below 13 degrees.
 DEFAULT_AMPLITUDE, AMPLITUDES = 1.5, (0.1, 6.0)  # the range is that of MC_AT_SYSID_AMP
 DEFAULT_RUNS = 4  # one run is too short for a certificate; four gave one up to 50 rad/s
 #: Progress -> the axis that is excited, or was before the pause.
