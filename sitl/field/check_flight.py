@@ -13,8 +13,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import correlate
 
 from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.field.doublet_flight import BEFORE_S, DoubletPlan
 from mimopilot.tuning import law
 from mimopilot.tuning.axes import Law, axis_names, law_of, yaw_axis
 from mimopilot.tuning.experiment import Experiment
@@ -33,6 +35,9 @@ ANGLE_FLOOR_DEG, TORQUE_FLOOR = 0.2, 0.005
 LEAD_S, TAIL_S = 2.0, 1.0
 #: Time after the last motion of the setpoint from which on the vehicle rests, s.
 REST_S = 1.0
+#: Largest share of the doublets' power by which the logged setpoints may differ from the plan: late ones, and those
+#: that an autopilot smooths, differ by a part; other flight, by more than all of it.
+DIFFERENT = 0.5
 #: Least size of a doublet, rad (1 degree).
 SMALLEST = np.radians(1.0)
 #: Time without a setpoint that is added behind the flight, s: its response has come to rest by then.
@@ -111,7 +116,7 @@ FIGURES: Mapping[str, tuple[str, str, float]] = {
 }
 
 
-def check_flight(flight: Experiment, experiment: Experiment, gains: Gains) -> CheckResult:
+def check_flight(flight: Experiment, experiment: Experiment, gains: Gains, plan: DoubletPlan) -> CheckResult:
     """Compare a check flight with what the measured response predicts for its gains.
 
     Parameters
@@ -122,6 +127,8 @@ def check_flight(flight: Experiment, experiment: Experiment, gains: Gains) -> Ch
         The flight with excitation.
     gains : Gains
         The set that flew the check flight.
+    plan : DoubletPlan
+        Its doublets.
 
     Raises
     ------
@@ -132,10 +139,11 @@ def check_flight(flight: Experiment, experiment: Experiment, gains: Gains) -> Ch
     """
     measured = PlantEstimates(experiment)
     models: list[ReferenceModel] = [gains.reference_models(axis)[1] for axis in range(2)]
-    predicted, flown, axes = _compare(flight, measured, gains, models)
+    part = find_doublets(flight, plan)
+    predicted, flown, axes = _compare(flight, part, measured, gains, models)
     yaw = yaw_model(gains)
     if yaw is not None and flight.yaw is not None:
-        more = _compare(yaw_axis(flight), measured.yaw, law_of(gains, 1), [yaw])
+        more = _compare(yaw_axis(flight), part, measured.yaw, law_of(gains, 1), [yaw])
         predicted, flown, axes = predicted + more[0], flown + more[1], axes + more[2]
     return CheckResult(predicted, flown, _worse(predicted, flown), axes)
 
@@ -147,12 +155,12 @@ def yaw_model(gains: Gains) -> ReferenceModel | None:
 
 
 def _compare(
-    flight: Experiment, measured: PlantEstimates, gains: Law, models: Sequence[ReferenceModel]
+    flight: Experiment, part: slice, measured: PlantEstimates, gains: Law, models: Sequence[ReferenceModel]
 ) -> tuple[CheckFigures, CheckFigures, tuple[CheckedAxis, ...]]:
     """Predicted and flown figures of n axes, and their signals."""
     plant = wide_response(measured)
     names = axis_names(len(models))
-    setpoint, angles, torque = _doublets(flight, names)
+    setpoint, angles, torque = _doublets(flight, names, part)
     T, U, *noise = _closed_loop(gains, plant)
     expected = _respond(T, setpoint, plant, flight.Ts)
     expected_torque = _respond(U, setpoint, plant, flight.Ts)
@@ -173,23 +181,52 @@ def _compare(
     return predicted, flown, tuple(shown)
 
 
-def _doublets(flight: Experiment, names: Sequence[str]) -> tuple[Signal, Signal, Signal]:
-    """Setpoints, angles and torque, (N, n) each without their level values, from before the first doublet on."""
-    if flight.r_o is None:
-        raise SitlError(f"{flight.source}: no attitude setpoints are logged", exit_code=1)
-    start, stop = max(flight.segments, key=lambda part: part[1] - part[0])
-    setpoint = flight.r_o[start:stop] - np.median(flight.r_o[start:stop], axis=0)
+def _doublets(flight: Experiment, names: Sequence[str], part: slice) -> tuple[Signal, Signal, Signal]:
+    """Setpoints, angles and torque, (N, n) each without their level values, of the rows that hold the doublets."""
+    assert flight.r_o is not None
+    setpoint = flight.r_o[part] - np.median(flight.r_o[part], axis=0)
     moving = [np.flatnonzero(np.abs(column) > SMALLEST) for column in setpoint.T]
     for axis, rows in zip(names, moving, strict=True):
         if not len(rows):
             raise SitlError(f"{flight.source}: the log does not hold the doublets on {axis}", exit_code=1)
-    lead, tail = round(LEAD_S / flight.Ts), round((REST_S + TAIL_S) / flight.Ts)
-    begin, end = min(rows[0] for rows in moving), max(rows[-1] for rows in moving)
-    used = slice(max(0, begin - lead), min(len(setpoint), end + tail))
-    before = slice(start + used.start, start + begin)
-    angles = flight.y_o[start:stop][used] - np.median(flight.y_o[before], axis=0)
-    torque = flight.u[start:stop][used] - np.median(flight.u[before], axis=0)
-    return setpoint[used], angles, torque
+    before = slice(part.start, part.start + max(1, min(rows[0] for rows in moving)))
+    angles = flight.y_o[part] - np.median(flight.y_o[before], axis=0)
+    torque = flight.u[part] - np.median(flight.u[before], axis=0)
+    return setpoint, angles, torque
+
+
+def find_doublets(flight: Experiment, plan: DoubletPlan) -> slice:
+    """Rows of the planned doublets, from `LEAD_S` before the first one on.
+
+    A log also holds the setpoints of taking off, holding the position and landing. The doublets are where roll's and
+    pitch's setpoints differ least from the plan.
+
+    Raises
+    ------
+    SitlError
+        If they differ too much everywhere.
+    """
+    if flight.r_o is None:
+        raise SitlError(f"{flight.source}: no attitude setpoints are logged", exit_code=1)
+    times = np.arange(BEFORE_S - LEAD_S, plan.seconds, flight.Ts)
+    wanted = np.array([plan.setpoint(time)[:2] for time in times])
+    found, least = 0, np.inf
+    for start, stop in flight.segments:
+        if stop - start < len(wanted):
+            continue
+        differs = np.full(stop - start - len(wanted) + 1, np.sum(wanted**2))
+        for logged, planned in zip(flight.r_o[start:stop].T, wanted.T, strict=True):
+            squares = np.concatenate([[0.0], np.cumsum(logged**2)])
+            differs += squares[len(planned) :] - squares[: -len(planned)]
+            differs -= 2 * correlate(logged, planned, mode="valid", method="fft")
+        place = int(np.argmin(differs))
+        if differs[place] < least:
+            found, least = start + place, differs[place]
+    if not least < DIFFERENT * np.sum(wanted**2):
+        raise SitlError(
+            f"{flight.source}: the log does not hold the doublets of the check flight without a gap", exit_code=1
+        )
+    return slice(found, found + len(wanted))
 
 
 def _closed_loop(gains: Law, plant: WideResponse) -> tuple[Complex, Complex, Signal, Signal]:
