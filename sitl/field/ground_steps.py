@@ -12,6 +12,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_report import write_autotune_report
 from mimopilot.sitl.field.autotune_run import ANSWER_S, CHECK, FLIGHT, GAINS, SNAPSHOT, AutotuneRun, Decided
 from mimopilot.sitl.field.check_flight import check_flight, yaw_model
+from mimopilot.sitl.field.doublet_flight import doublet_plan
 from mimopilot.sitl.field.flight_watch import start_watch
 from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, old_plan, save_snapshot, write_set
 from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
@@ -20,6 +21,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
     request_streams,
     supplies_problem,
 )
+from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import check_kind
 from mimopilot.sitl.mavlink.log_transfer.log_session import LogSession
@@ -199,9 +201,12 @@ def upload_gains(run: AutotuneRun) -> Found:
     if held_set(run) != OLD:
         raise SitlError("the vehicle's gains are no longer those of the snapshot: somebody changed them", exit_code=1)
     with run.vehicle() as session:
-        fixed = session.read([*plan.fixed, *plan.scale], run.options.profile)
-    if plan.scale:
-        check_moment_scale(gains, [fixed[name] for name in plan.scale], "the vehicle")
+        session.run(session.client.await_heartbeat())
+        # PX4 publishes no unit of torque; the gains are from the log of this vehicle, so they are in its own.
+        scale = () if session.vehicle.autopilot == PX4 else plan.scale
+        fixed = session.read([*plan.fixed, *scale], run.options.profile)
+    if scale:
+        check_moment_scale(gains, [fixed[name] for name in scale], "the vehicle")
     unknown = plan.values.keys() - old_plan(run).values.keys()
     if unknown:
         raise SitlError(f"{SNAPSHOT}: lacks {', '.join(sorted(unknown))}, which could not be taken back", exit_code=1)
@@ -231,7 +236,9 @@ def judge(run: AutotuneRun) -> Found:
     if yaw_model(gains) is not None and flight.yaw is None:
         why = "; ".join(flight.warnings) or "it is not logged"
         run.dialogue.tell(f"yaw is not compared with its prediction: {why}")
-    result = check_flight(flight, run.experiment(FLIGHT), gains)
+    experiment = run.experiment(FLIGHT)
+    plan = doublet_plan(experiment.amplitude, yaw_model(gains) is not None)
+    result = check_flight(flight, experiment, gains, plan)
     run.dialogue.show_check(result)
     write_autotune_report(run, gains, result)
     if result.worse:
