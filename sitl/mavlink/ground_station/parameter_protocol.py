@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from mimopilot.sitl.mavlink.ground_station.events import (
     ACCEPTED,
+    ARDUPILOT,
     DENIED,
     DOES_NOT_EXIST,
     FAILED,
@@ -217,7 +218,9 @@ class ParameterClient(VehicleLinkState):
                 until = self.now + quiet
 
     def store(self) -> Exchange[str]:
-        """Command the vehicle to save its parameters.
+        """Command the vehicle to save its parameters, but for ArduPilot, which saves each when it is set.
+
+        ArduPilot denies the command (GCS_Common.cpp: only its erasing of all parameters is accepted).
 
         Returns
         -------
@@ -226,6 +229,9 @@ class ParameterClient(VehicleLinkState):
             vehicle must save by itself; empty: the link closed.
         """
         assert self.vehicle is not None
+        if self.vehicle.autopilot == ARDUPILOT:
+            self._changed_at = self.now
+            return "autosave"
         due, deadline, result = self.now, self.now + AUTOSAVE_S, IN_PROGRESS
         while self.now < deadline and not self.closed and result == IN_PROGRESS:
             send: list[Outgoing] = []

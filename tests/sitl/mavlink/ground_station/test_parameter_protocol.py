@@ -1,6 +1,7 @@
 """The upload over simulated links with loss, faults and interruptions, in simulated time."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import strategies as st
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
+    ARDUPILOT,
     SOLE_PEER,
     CommandAck,
     Heartbeat,
@@ -186,6 +188,17 @@ def test_storage_is_acknowledged_refused_or_left_to_the_vehicle(storage, expecte
     assert run_exchange(client.store(), link) == expected
     assert link.now() - begin == pytest.approx(seconds)
     assert vehicle.stored == asked
+
+
+def test_ardupilot_saves_each_parameter_by_itself_and_is_not_commanded_to():
+    vehicle = ScriptedVehicle(OLD, storage=2)
+    link = SimulatedLink(vehicle)
+    client = ParameterClient(link.now())
+    run_exchange(client.await_heartbeat(), link)
+    assert client.vehicle is not None
+    client.vehicle = replace(client.vehicle, autopilot=ARDUPILOT)
+    assert run_exchange(client.store(), link) == "autosave"
+    assert vehicle.stored == 0
 
 
 def test_a_missing_parameter_stops_the_upload_before_writing():
