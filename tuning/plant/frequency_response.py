@@ -318,7 +318,8 @@ def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
     integral = plant.G_i / s[:, None, None]
     spread = np.linalg.norm(plant.angle_residual(), axis=(1, 2))
     of_rates = np.linalg.norm(plant.rate_residual(), axis=(1, 2)) / plant.omega
-    both = plant.known() & (plant.relative_error() < SURE)
+    # Outside the band that is known, noise alone may look like a response.
+    both = np.isin(np.arange(len(s)), plant.known_run()) & (plant.relative_error() < SURE)
     if np.count_nonzero(both) < MIN_FREQUENCIES:
         return plant
     quotient = np.einsum("kij,kij->k", plant.G_o, integral.conj()) / np.sum(np.abs(integral) ** 2, axis=(1, 2))
@@ -326,7 +327,6 @@ def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
     lead = float(np.clip(omega @ phase / (omega @ omega), -LAG, LAG))
     gain = float(np.median(np.abs(quotient[both])))
     better = of_rates < spread
-    better[: np.flatnonzero(both)[-1] // 2] = False
     change = np.where(better, gain * np.exp(1j * plant.omega * lead) / s, 0)[:, None, None]
     _, rates, angles = np.split(plant.root, 3, axis=1)
     root = plant.root.copy()

@@ -7,7 +7,12 @@ import pytest
 
 from mimopilot.sitl.physics.airframe import Frame, load_airframe
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.plant.frequency_response import PlantResponse, measured_plant, plant_response
+from mimopilot.tuning.plant.frequency_response import (
+    PlantResponse,
+    _angles_from_rates,
+    measured_plant,
+    plant_response,
+)
 from tests.tuning.truth import TS, experiment, linear_plant
 
 AIRFRAMES = ("adam0", "adam0_boom", "adam0_flexible", "adam0_nominal", "adam0_perturbed", "antr", "px4_sih")
@@ -72,6 +77,23 @@ def synthetic(omega, error=0.0, coherence=1.0, K=100.0):
     root[:, 2, 2] = root[:, 3, 3] = error * K / omega
     reach, coherences = np.tile(np.eye(2), (len(omega), 1, 1)), np.full((len(omega), 2), coherence)
     return PlantResponse(omega, G, G / s, root, reach, coherences, TS)
+
+
+def test_noise_beyond_the_band_does_not_change_the_angles_within():
+    omega = np.geomspace(4, 600, 120)
+    plant = synthetic(omega, 0.05)
+    beyond = omega > 100
+    # There the rates are noise that looks known, and the angles are those of another body.
+    coherence = np.where((omega > 60)[:, None] & ~beyond[:, None], 0.0, plant.coherence)
+    unknown = (omega > 60) & ~beyond
+    root = plant.root.astype(complex)
+    root[unknown] *= 100
+    odd = replace(
+        plant, G_o=np.where(beyond[:, None, None], 300 * plant.G_o, plant.G_o), coherence=coherence, root=root
+    )
+    assert odd.known()[beyond].all() and odd.omega[odd.known_run()[-1]] <= 60
+    found = _angles_from_rates(odd)
+    assert found.G_o[~beyond] == pytest.approx(plant.G_o[~beyond])
 
 
 def test_the_deviation_is_that_of_drawn_plants():
