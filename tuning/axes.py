@@ -57,6 +57,9 @@ class AxesLaw:
 #: The law of one, two or three axes.
 Law = Gains | AxesLaw
 
+#: s before and after an excitation of yaw: PX4's autotune pauses as long, and most of the response fades in it.
+AROUND_S = 2.0
+
 
 def axis_names(count: int) -> tuple[str, ...]:
     """Names of the axes of a law, a response or an experiment of `count` axes."""
@@ -129,8 +132,13 @@ def excited_yaw(experiment: Experiment) -> tuple[Experiment, NDArray[np.float64]
         ) from None
     if name == "r_o":
         _check_setpoint(axis)
-    # The noise elsewhere is another: the vehicle's own, or what the excitation of roll and pitch causes.
-    return replace(axis, segments=tuple(excited_segments(axis.segments, signal[:, 0]))), signal
+    # The noise elsewhere is another: the vehicle's own, or what the excitation of roll and pitch causes. A stretch of a
+    # few seconds has too coarse a spectrum without the time around it.
+    around, found = round(AROUND_S / axis.Ts), []
+    for begin, end in excited_segments(axis.segments, signal[:, 0]):
+        start, stop = next(part for part in axis.segments if part[0] <= begin < part[1])
+        found.append((max(start, begin - around), min(stop, end + around)))
+    return replace(axis, segments=tuple(found)), signal
 
 
 def _check_setpoint(axis: Experiment) -> None:

@@ -16,6 +16,8 @@ BEFORE_TUMBLE = 1.0  # s before a tumble that are not used: control is lost with
 MAX_TUMBLES = 3  # as many tumbles mean degrees taken for radians, or aerobatics
 #: s after the excitation in which the response fades: a chirp that ends with the record looks like its transient.
 FADE = 2.0
+#: s between a part of roll and pitch and one of yaw: less than a sample, so that none is in both.
+APART = 1e-4
 SHORT = 0.1  # s on the ground during the excitation that need no warning
 
 
@@ -91,8 +93,9 @@ def flying_parts(recording: Recording) -> tuple[tuple[Interval, ...], tuple[str,
 def yaw_parts(recording: Recording, parts: tuple[Interval, ...]) -> tuple[Interval, ...]:
     """The parts of a log that can be used for yaw.
 
-    Where a torque or a rate is injected into yaw: those stretches in flight, each until its response has faded; nothing
-    from `BEFORE_TUMBLE` before a tumble on. Otherwise those of roll and pitch.
+    Where a torque or a rate is injected into yaw: those stretches in flight, each until its response has faded and from
+    as long before, but behind parts of roll and pitch: the longer a stretch, the finer its spectrum. Nothing from
+    `BEFORE_TUMBLE` before a tumble on. Otherwise those of roll and pitch.
 
     Parameters
     ----------
@@ -107,8 +110,14 @@ def yaw_parts(recording: Recording, parts: tuple[Interval, ...]) -> tuple[Interv
         return parts
     pauses = np.flatnonzero(np.diff(time) > 2 * FADE)
     begins, ends = time[np.append(0, pauses + 1)], time[np.append(pauses, -1)]
-    last = float(injected.time[-1])
-    marked = tuple((float(a), float(min(b + FADE, last))) for a, b in zip(begins, ends, strict=True))
+    first, last = float(injected.time[0]), float(injected.time[-1])
+    marked = tuple(
+        (
+            max(float(a) - FADE, first, *(stop + APART for _, stop in parts if stop <= a)),
+            min(float(b) + FADE, last),
+        )
+        for a, b in zip(begins, ends, strict=True)
+    )
     whole = ((min(parts[0][0], marked[0][0]), max(parts[-1][1], marked[-1][1])),)
     try:
         kept, _ = _before_tumble(recording, whole)

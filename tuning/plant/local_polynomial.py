@@ -25,6 +25,9 @@ NEGLIGIBLE = 3e-3
 #: A window is too wide if its noise exceeds that of narrow windows by this many standard deviations of the ratio.
 HIDDEN = 4.0
 
+#: Relative error of a quotient that is a whole number but for rounding.
+ROUNDING = 1e-9
+
 Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
@@ -98,11 +101,8 @@ def local_response(
     """
     n_w = w.shape[1]
     spectra = [_Spectrum(w[start:stop], v[start:stop], Ts) for start, stop in segments]
-    finest = min(s.step for s in spectra)
-    # The longest segment needs enough bins for the parameters of response and transient.
-    rows = (ORDER + 1) * (n_w + 1) + FREEDOM
     upper = np.pi / Ts if upper is None else upper
-    narrowest = max(rows / 2 * finest, upper / CENTRES)
+    narrowest = max(_narrowest([s.step for s in spectra], n_w), upper / CENTRES)
     fits = _fits(spectra, n_w, narrowest, upper, growth)
     if not fits:
         raise TuningError(
@@ -115,6 +115,29 @@ def local_response(
         explained=np.array([fit.explained for fit in fits]),
         error=np.array([fit.error for fit in fits]),
     )
+
+
+def _narrowest(steps: Sequence[float], n_w: int) -> float:
+    """Half width (rad/s) of the narrowest window with enough bins of all segments together.
+
+    A response has the same polynomials in all segments, a transient its own in each; a segment with too few bins for
+    these adds nothing.
+
+    Parameters
+    ----------
+    steps : sequence of float, rad/s
+        Between two bins of a segment.
+    n_w : int
+        Number of external signals.
+    """
+    needed = (ORDER + 1) * n_w + FREEDOM
+    apart = np.asarray(steps)
+    # The longest segment alone has enough at last.
+    widths = np.unique(np.outer(apart, np.arange(1, needed + ORDER + 2)))
+    widths = widths[widths <= apart.min() * (needed + ORDER + 1) * (1 + ROUNDING)]
+    bins = np.floor(widths[:, None] / apart * (1 + ROUNDING))
+    enough = np.sum(np.maximum(bins - (ORDER + 1), 0), axis=1) >= needed
+    return float(widths[np.argmax(enough)] / 2)
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,3 +99,18 @@ def test_a_smooth_response_keeps_its_wide_windows_whatever_the_noise():
     found = local_response(x, y, 0.004, [(0, 12000)], 700.0, growth=0.08)
     wide = np.diff(found.omega)[found.omega[1:] > 100] / found.omega[1:][found.omega[1:] > 100]
     assert np.mean(wide > 0.07) > 0.9
+
+
+def test_short_segments_of_one_response_are_resolved_better_together():
+    w, y = signals(400)
+    parts = [(k, k + 100) for k in (0, 100, 200, 300)]
+    alone, together = local_response(w, y, 1.0, parts[:1]), local_response(w, y, 1.0, parts)
+    # One segment needs 17 bins for its 17 unknowns and degrees of freedom; of four, each needs 7, 3 for its transient.
+    assert alone.omega[0] == pytest.approx(17 / 2 * 2 * np.pi / 100)
+    assert together.omega[0] == pytest.approx(7 / 2 * 2 * np.pi / 100)
+    assert np.abs(together.response - truth(together.omega)).max() < np.abs(alone.response - truth(alone.omega)).max()
+
+
+def test_a_segment_too_short_for_its_own_transient_changes_no_window():
+    w, y = signals(520)
+    assert local_response(w, y, 1.0, [(0, 500), (510, 520)]).omega[0] == local_response(w, y, 1.0, [(0, 500)]).omega[0]
