@@ -16,6 +16,7 @@ from mimopilot.tuning.logs.resample import Interval, Series, sampling_period
 from mimopilot.tuning.logs.torque_parts import PARTS_TOPIC, torque_parts
 from mimopilot.tuning.logs.ulog_file import UlogFile, open_ulog
 from mimopilot.tuning.logs.vehicle_type import px4_vehicle
+from mimopilot.tuning.parameters import ENABLE
 
 #: Signal -> (topic, fields) that hold it, newest PX4 first.
 LAYOUTS = {
@@ -40,6 +41,8 @@ YAW_LAYOUTS = {
 }
 #: Topic and names of the injected torque: x, y are roll and pitch; x is yaw. Our module publishes one of them a cycle.
 EXCITATION_TOPIC, EXCITATION_NAME, YAW_EXCITATION_NAME = "debug_vect", "MIMO_EXC", "MIMO_EXY"
+#: Cut-off of PX4's low-pass of the yaw torque, Hz.
+YAW_CUTOFF = "MC_YAW_TQ_CUTOFF"
 #: Upward thrust, newest PX4 first: (topic, field, sign).
 THRUSTS = (("vehicle_thrust_setpoint", "xyz[2]", -1.0), ("actuator_controls_0", "control[3]", 1.0))
 QUATERNION = 4  # fields of a quaternion
@@ -70,6 +73,9 @@ def record_ulog(path: Path) -> Recording:
     """
     log = _UlogLog(open_ulog(path))
     signals, yaw = _signals(log, LAYOUTS, slice(0, 2)), _signals(log, YAW_LAYOUTS, slice(2, 3))
+    cutoff = (log.file.parameters | {name: value for _, name, value in log.file.changes}).get(YAW_CUTOFF, 0.0)
+    if "u" in yaw and cutoff > 0 and log.file.parameters.get(ENABLE.name, 0.0) > 0:
+        yaw["u"] = _before_low_pass(yaw["u"], cutoff)
     excitation = _excitation(log)
     if excitation is not None:
         if "u" in signals:
@@ -197,6 +203,20 @@ def _excitation(log: _UlogLog) -> Series | None:
     x, y = series.values[:, :2].T
     values = np.column_stack([np.where(named, x, 0.0), np.where(named, y, 0.0), np.where(yaw, x, 0.0)])[named | yaw]
     return Series(series.time[named | yaw], values, series.topic) if values.any() else None
+
+
+def _before_low_pass(torque: Series, cutoff: float) -> Series:
+    """The yaw torque that our law commanded: our module publishes it behind the autopilot's low-pass (Hz).
+
+    The low-pass, first order by backward differences as in PX4, belongs to what the law flies: it acts in front of the
+    motors, and the excitation is injected before it. Over a lost sample the commanded torque counts as constant.
+    """
+    time = 2 * np.pi * cutoff * sampling_period(torque.time)
+    steps = np.maximum(np.rint(np.diff(torque.time) / sampling_period(torque.time)), 1.0)
+    share = 1 - (1 / (1 + time)) ** steps
+    commanded = torque.values.copy()
+    commanded[1:] = torque.values[:-1] + np.diff(torque.values, axis=0) / share[:, None]
+    return Series(torque.time, commanded, torque.topic)
 
 
 def _zero_when_silent(excitation: Series, cycles: NDArray[np.float64]) -> Series:

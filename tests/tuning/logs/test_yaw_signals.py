@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from mimopilot.sitl.flight.flight_log import quaternions
 from mimopilot.tuning.experiment import external_yaw_signal
@@ -93,10 +94,12 @@ def csv_columns(flight, yaw):
 
 
 def check(log, flight, yaw):
-    """The signals of yaw are those of the flight, in the stretch that excites it and 2 s after."""
+    """The signals of yaw are those of the flight, in the stretch that excites it, 2 s after, and up to 2 s before."""
     ((start, stop),) = log.yaw.segments
-    assert (stop - start) * log.Ts == pytest.approx(END - FROM + 2.0, abs=0.02)
-    first = np.flatnonzero(yaw.u_bar)[0]
+    before = int(np.flatnonzero(log.yaw.u_bar[start:stop])[0])
+    assert before * log.Ts <= 2.0
+    assert (stop - start - before) * log.Ts == pytest.approx(END - FROM + 2.0, abs=0.02)
+    first = np.flatnonzero(yaw.u_bar)[0] - before
     rows = slice(first, first + stop - start)
     np.testing.assert_allclose(log.yaw.u[start:stop], yaw.u[rows], atol=1e-6)
     np.testing.assert_allclose(log.yaw.y_i[start:stop], yaw.y_i[rows], atol=1e-5)
@@ -123,6 +126,22 @@ def test_a_ulog_with_mimo_exy_holds_yaw(flight, yaw, tmp_path):
     assert found.yaw["y_i"].maximum == pytest.approx((yaw.y_i.max(),), abs=1e-5)
 
 
+def test_the_yaw_torque_of_our_module_is_taken_before_the_autopilots_low_pass(flight, yaw, tmp_path):
+    topics = ulog_topics(flight, yaw)
+    share = 1 - 1 / (1 + 2 * np.pi * 2.0 * np.median(np.diff(flight.t)))  # first order, 2 Hz
+    passed = lfilter([share], [1, share - 1], yaw.u)
+    torque = next(fields for name, _, fields in topics if name == "vehicle_torque_setpoint")
+    torque["xyz"] = three(flight.u, passed)
+    settings = {"MIMO_EN": 1, "MC_YAW_TQ_CUTOFF": 2.0}
+    log = read_log(write_ulog(tmp_path / "x.ulg", topics, parameters=settings))
+    ((start, stop),) = log.yaw.segments
+    first = np.flatnonzero(yaw.u_bar)[0] - np.flatnonzero(log.yaw.u_bar[start:stop])[0]
+    np.testing.assert_allclose(log.yaw.u[start:stop], yaw.u[first : first + stop - start], atol=1e-4)
+    # PX4's own controllers: their law has the low-pass.
+    stock = read_log(write_ulog(tmp_path / "y.ulg", topics, parameters={"MIMO_EN": 0, "MC_YAW_TQ_CUTOFF": 2.0}))
+    assert stock.yaw is None or np.abs(stock.yaw.u[start:stop]).max() < np.abs(log.yaw.u[start:stop]).max()
+
+
 def test_a_table_holds_yaw(flight, yaw, tmp_path):
     check(read_log(write_csv(tmp_path / "x.csv", csv_columns(flight, yaw))), flight, yaw)
 
@@ -137,7 +156,7 @@ def test_a_dataflash_log_holds_yaw_and_names_the_axes_of_system_identification(y
         "SID_AXIS 10: injected torque on roll; SID_AXIS 12: injected torque on yaw"
     )
     ((start, stop),) = found.experiment.yaw.segments
-    assert (stop - start) * 0.004 == pytest.approx(END - FROM + 2.0, abs=0.02)
+    assert (stop - start) * 0.004 == pytest.approx(END - UNTIL + 2.0, abs=0.02)
     rate = found.experiment.yaw.y_i[start:stop]
     turned = np.cumsum(rate) * 0.004
     assert np.ptp(found.experiment.yaw.y_o[start:stop]) == pytest.approx(np.ptp(turned), rel=0.1)
