@@ -32,7 +32,8 @@ SYS_STATUS, STORAGE_INFORMATION = 1, 261  # message numbers
 # Times and limits are chosen, unless a source is given.
 FIRST_STREAM_TIMEOUT_S, REPEAT_REQUEST_S = 5.0, 1.0  # until all streams arrive; between their requests
 POLL_S = 0.1  # between two checks of the flight state
-STREAM_TIMEOUT_S = 1.0  # without a message of a stream
+STREAM_TIMEOUT_S = 1.0  # without a message of a stream, and at least so many intervals of it:
+MISSED_MESSAGES = 12  # at 30 % loss a stream at 5 Hz misses as many in a row once in 150 hours
 HEARTBEAT_TIMEOUT_S = 5.0  # HEARTBEAT comes once a second and may be lost
 HOVER_TILT = math.radians(15.0)  # rad; a hovering vehicle tilts less
 HOVER_RATE = 0.5  # rad/s; a hovering vehicle turns slower
@@ -118,8 +119,12 @@ class FlightMonitor:
             self.text = report.text
 
     def overdue(self, seconds: float) -> list[str]:
-        """Streams without a message for more than `seconds`."""
-        return [kind for kind in self.streams if self.client.now - self.seen.get(kind, -math.inf) > seconds]
+        """Streams without a message for more than `seconds`, and `MISSED_MESSAGES` of their intervals."""
+        return [
+            kind
+            for kind, (_, interval) in self.streams.items()
+            if self.client.now - self.seen.get(kind, -math.inf) > max(seconds, 1e-6 * MISSED_MESSAGES * interval)
+        ]
 
 
 def request_streams(client: ParameterClient, streams: Streams) -> Exchange[FlightMonitor]:

@@ -8,7 +8,9 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SendCommand
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
 from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import experiment_profile
+from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.profiles import make_restore_plan
+from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import VehicleLinkState
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.tuning.experiment import external_signal
 from mimopilot.tuning.logs.reader import read_log
@@ -311,3 +313,14 @@ def test_the_command_prepares_and_excites_a_stock_px4_whose_log_is_an_experiment
     assert "MC_AT_EN\t0.0\t6" in old.read_text()
     signal, name = external_signal(read_log(log))
     assert (name, signal.any(axis=0).all()) == ("r_bar", True)
+
+
+def test_a_stream_is_overdue_by_time_and_by_missed_messages():
+    """At 30 % loss a stream at 5 Hz is silent for a second once in a minute."""
+    client = VehicleLinkState(0.0)
+    monitor = FlightMonitor(client, {"ATTITUDE": (30, 50_000), "VFR_HUD": (74, 200_000)})
+    assert monitor.overdue(1.0) == ["ATTITUDE", "VFR_HUD"]
+    monitor.seen = dict.fromkeys(monitor.streams, 0.0)
+    for now, late in ((1.0, []), (1.1, ["ATTITUDE"]), (2.4, ["ATTITUDE"]), (2.5, ["ATTITUDE", "VFR_HUD"])):
+        client.now = now
+        assert monitor.overdue(1.0) == late
