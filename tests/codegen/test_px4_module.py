@@ -243,10 +243,13 @@ def test_the_excitation_runs_once_on_roll_then_pitch_and_is_published(program, g
     assert set(np.abs(y[pitch])) == {amplitude} and not y[np.setdiff1d(np.arange(len(y)), pitch)].any()
     assert set(code) == {-1, 0, 1, 2}
     assert "finished" in last_end(result)
-    # The topic speaks from the request, within a second before the start, to the first sample without.
+    # The topic speaks in each sample from the request, within a second before the start, to the first one without.
     told = np.flatnonzero(result.announced)
-    assert np.ptp(told) + 1 == len(told) and told[-1] == pitch[-1] + 1
-    assert roll[0] - 250 <= told[0] < roll[0] or roll[0] == told[0]
+    first, last = np.searchsorted(told, [roll[0], pitch[-1] + 1])
+    assert told[last] - told[first] == last - first == pitch[-1] + 1 - roll[0]
+    # A ground station hears fifty times a second that this controller flies without.
+    idle = np.concatenate([np.diff(told[told < roll[0] - 250]), np.diff(told[last + 1 :])])
+    assert len(idle) > 20 and set(idle) == {5}
     # The core gets the same excitation.
     inputs = level_inputs(len(x), excitation=np.column_stack([x, y, 0 * x]))
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
@@ -260,7 +263,9 @@ def test_yaw_follows_roll_and_pitch_with_its_own_amplitude_longer_pulses_and_nam
     assert [len(stretch) for stretch in stretches] == [250] * 3 and np.count_nonzero(code == 2) == 500
     assert pitch[0] - roll[-1] == yaw[0] - pitch[-1] == 251
     on_yaw = np.array(result.names) == "MIMO_EXY"
-    assert np.array_equal(np.flatnonzero(on_yaw), np.append(yaw, yaw[-1] + 1))  # and the first sample without
+    said = np.flatnonzero(on_yaw)
+    assert np.array_equal(said[: len(yaw) + 1], np.append(yaw, yaw[-1] + 1))  # and the first sample without
+    assert not x[said[len(yaw) :]].any() and set(code[said[len(yaw) :]]) == {-1}
     assert set(np.abs(x[roll])) == {np.float32(0.1)} and set(np.abs(x[yaw])) == {np.float32(0.25)}
     assert x[yaw[-1] + 1] == 0 and code[yaw[-1] + 1] == -1
     short, long = (pulses(np.sign(values)) for values in (x[roll], x[yaw]))

@@ -304,12 +304,16 @@ void McMimoPid::excite(float (&moment)[3])
 	}
 }
 
-// For the log: the excitation from the request to the first sample without, and what the controller thinks. Roll and
+// For the log and the ground station: the excitation, in each sample from the request to the first one without, else at
+// the rate of what the controller thinks: that there is none shows a ground station that this controller flies. Roll and
 // pitch are x and y of MIMO_EXC; yaw, and how far it has turned, are those of MIMO_EXY. A sample has one of them, because
 // the topic holds only the last message.
 void McMimoPid::log()
 {
-	if (_excitation.phase() != Excitation::Phase::Off || _excitation_logged) {
+	const bool due = ++_unlogged >= kLogSamples;
+	const bool requested = _excitation.phase() != Excitation::Phase::Off;
+
+	if (due || requested || _excitation_logged) {
 		debug_vect_s excitation{};
 		memcpy(excitation.name, kExcitationName, sizeof(kExcitationName));
 		excitation.x = _excited[0];
@@ -324,10 +328,10 @@ void McMimoPid::log()
 		excitation.z = static_cast<float>(_excitation.running() ? static_cast<int>(_excitation.phase()) : -1);
 		excitation.timestamp = hrt_absolute_time();
 		_debug_vect_pub.publish(excitation);
-		_excitation_logged = _excitation.phase() != Excitation::Phase::Off;
+		_excitation_logged = requested;
 	}
 
-	if (++_unlogged >= kLogSamples) {
+	if (due) {
 		_unlogged = 0;
 		debug_array_s parts{};
 		static_assert(sizeof(Contributions) <= sizeof(parts.data), "the array must hold all parts");
