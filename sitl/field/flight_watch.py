@@ -94,7 +94,7 @@ class FlightWatch:
             self.thrust += (1.0 if first else THRUST_SHARE) * (report.thrust - self.thrust)
             self._note("ATTITUDE_TARGET")
         elif isinstance(report, StatusText):
-            self.text = report.text
+            self.text = report.behind(self.text)
 
     def _note(self, stream: str) -> None:
         self.seen[stream] = self.client.now

@@ -110,7 +110,7 @@ def from_mavlink(message: Any, cast: bool = False) -> Incoming | None:
         works = bool(message.onboard_control_sensors_health & LOGGING) if known else None
         return PowerReport(*sender, message.battery_remaining, works)
     if kind == "STATUSTEXT":
-        return StatusText(*sender, message.text)
+        return StatusText(*sender, message.text, message.chunk_seq)
     if kind == "FILE_TRANSFER_PROTOCOL":
         ours = message.target_system in (0, GROUND_SYSTEM) and message.target_component in (0, GROUND_COMPONENT)
         return FileReply(*sender, FtpPacket.unpack(bytes(message.payload))) if ours else None

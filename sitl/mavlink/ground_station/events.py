@@ -150,11 +150,16 @@ class InjectorState(NamedTuple):
 
 
 class StatusText(NamedTuple):
-    """STATUSTEXT."""
+    """STATUSTEXT; a text of more than 50 characters comes in chunks, from number 0 on."""
 
     system: int
     component: int
     text: str
+    chunk: int = 0
+
+    def behind(self, last: str) -> str:
+        """The text so far, with what it holds of the chunks before."""
+        return last + self.text if self.chunk else self.text
 
 
 class FileReply(NamedTuple):

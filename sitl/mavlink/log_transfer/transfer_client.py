@@ -71,7 +71,7 @@ class TransferClient(VehicleLinkState):
 
     def _keep(self, report: FlightReport | TransferReport) -> None:
         if isinstance(report, StatusText):
-            self.said = report.text
+            self.said = report.behind(self.said)
         elif isinstance(report, TransferReport):
             self._inbox.append(report)
 

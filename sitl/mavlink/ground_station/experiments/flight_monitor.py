@@ -116,7 +116,7 @@ class FlightMonitor:
             self.phase, self.stamp = report.phase, report.time
             self.seen["DEBUG_VECT"] = now
         elif isinstance(report, StatusText):
-            self.text = report.text
+            self.text = report.behind(self.text)
 
     def overdue(self, seconds: float) -> list[str]:
         """Streams without a message for more than `seconds`, and `MISSED_MESSAGES` of their intervals."""

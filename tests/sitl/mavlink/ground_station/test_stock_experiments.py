@@ -5,7 +5,7 @@ import re
 import pytest
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import SendCommand
+from mimopilot.sitl.mavlink.ground_station.events import SendCommand, StatusText
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
 from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import experiment_profile
 from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import FlightMonitor
@@ -324,3 +324,10 @@ def test_a_stream_is_overdue_by_time_and_by_missed_messages():
     for now, late in ((1.0, []), (1.1, ["ATTITUDE"]), (2.4, ["ATTITUDE"]), (2.5, ["ATTITUDE", "VFR_HUD"])):
         client.now = now
         assert monitor.overdue(1.0) == late
+
+
+def test_a_long_text_of_the_vehicle_is_joined_from_its_chunks():
+    monitor = FlightMonitor(VehicleLinkState(0.0), {})
+    for text, chunk in (("Disarmed", 0), ("Arming denied: Resolve system health failures firs", 0), ("t", 1)):
+        monitor(StatusText(1, 1, text, chunk))
+    assert monitor.text == "Arming denied: Resolve system health failures first"
