@@ -194,9 +194,9 @@ class GainLimit:
         return controller @ self.G, self.limit - error
 
     def _shapes(self, free: FreeGains) -> dict[str, Complex]:
-        one = np.ones((1, self.G.shape[-1]))
+        one, shape = np.ones((1, self.G.shape[-1])), (len(self.omega), 1, self.G.shape[-1])
         return {
-            name: rate_response({LETTERS[name]: one}, free.base.filters, self.omega)[1]
+            name: np.broadcast_to(rate_response({LETTERS[name]: one}, free.base.filters, self.omega)[1], shape)
             for name in free.units
             if name in LETTERS
         }

@@ -118,6 +118,16 @@ def behind(plant: PlantResponse, old: LoopFilter | None, new: LoopFilter | None)
     return replace(plant, G_i=plant.G_i * ratio, root=root)
 
 
+def with_derivative_filter(gains: Gains, hertz: float) -> Gains:
+    """The gains, also those of a stock controller, with another cut-off of roll's and pitch's derivative filter, Hz."""
+    stock = gains.filters.stock
+    if stock is None:
+        filters = replace(gains.filters, derivative_cutoff_hz=hertz)
+    else:
+        filters = replace(gains.filters, stock=replace(stock, derivative_hz=(hertz, hertz, *stock.derivative_hz[2:])))
+    return replace(gains, filters=filters, certificate=None)
+
+
 def torque_noise(
     gains: Gains, plant: WideResponse, old: LoopFilter | None = None, new: LoopFilter | None = None
 ) -> float:
@@ -178,8 +188,7 @@ def _cutoff(case: GainCase, old: LoopFilter, new: LoopFilter, thresholds: Thresh
     assert measured is not None
     before = torque_noise(gains, wide) if wide else float("nan")
     if old.acts_on == DERIVATIVE:
-        filters = replace(gains.filters, derivative_cutoff_hz=new.hertz)
-        gains = replace(gains, filters=filters, certificate=None)
+        gains = with_derivative_filter(gains, new.hertz)
         found = _examined(gains, measured.response, thresholds)
         after = torque_noise(gains, wide) if wide else float("nan")
     else:

@@ -8,7 +8,13 @@ import pytest
 from scipy.signal import butter, group_delay
 
 import mimopilot as mp
-from mimopilot.sitl.field.report.analysis.filters_advice import behind, filter_changes, least_phase, torque_noise
+from mimopilot.sitl.field.report.analysis.filters_advice import (
+    behind,
+    filter_changes,
+    least_phase,
+    torque_noise,
+    with_derivative_filter,
+)
 from mimopilot.sitl.field.report.analysis.flight_data import PHASES
 from mimopilot.sitl.field.report.analysis.loop_filters import (
     DERIVATIVE,
@@ -25,6 +31,7 @@ from mimopilot.sitl.field.report.flight_report import make_report
 from mimopilot.sitl.field.report.sections.frequency import coherence_band
 from mimopilot.sitl.field.report.sections.tracking import tracking_error
 from mimopilot.tuning.certificate import Thresholds
+from mimopilot.tuning.law_terms import StockFilters
 from mimopilot.tuning.logs.resample import Series
 from mimopilot.tuning.reference_model import second_order
 from tests.tuning.logs.flights import make_flight, px4_topics, write_ulog
@@ -214,6 +221,15 @@ def test_a_lower_derivative_filter_quiets_the_predicted_torque(bench):
     noise = [torque_noise(one, case.flight.wide) for one in cutoffs]
     assert noise[0] < noise[1] < noise[2]
     assert least_phase(case.gains.certificate) == min(case.gains.certificate.figures["phase_margin_deg"].values())
+
+
+def test_the_derivative_filter_of_a_stock_set_is_its_own(gains):
+    stock = StockFilters("px4-stock", derivative_hz=(30.0, 30.0, 30.0))
+    own = replace(gains.filters, derivative_cutoff_hz=0.0, stock=stock)
+    diagonal = {name: np.diag(np.diag(matrix)) for name, matrix in gains.matrices.items()}
+    changed = with_derivative_filter(replace(gains, filters=own, **diagonal), 20.0)
+    assert changed.filters.stock.derivative_hz == (20.0, 20.0, 30.0)
+    assert with_derivative_filter(gains, 20.0).derivative_cutoff_hz == 20.0
 
 
 def test_phases_of_a_flight_are_told_apart(tmp_path):
