@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.plant.frequency_response import GROWTH, MIN_FREQUENCIES, PlantResponse
+from mimopilot.tuning.plant.frequency_response import GROWTH, MIN_FREQUENCIES, SMOOTH, PlantResponse
 from mimopilot.tuning.plant.local_polynomial import FREEDOM
 from mimopilot.tuning.plant.noise_spectrum import noise_root
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
@@ -20,6 +20,8 @@ from mimopilot.tuning.plant.rigid_body_fit import DEVIATION, RigidBody, continue
 STEP = 0.05
 #: Frequencies at the end of the band whose mean ratio to the fitted shape is continued.
 END_ABOVE = 5
+#: Natural logarithm of the ratio of frequencies whose errors are independent: the range of one smoothed value.
+ALIKE = 2 * SMOOTH
 #: Share of the Nyquist frequency at which the grid ends: the integrator's response is real there.
 TOP = 0.999
 
@@ -80,8 +82,7 @@ class WideResponse:
 
     def draw(self, generator: np.random.Generator) -> WideResponse:
         """A plant drawn from the errors of the response, of the fitted body below its band, and of the noise."""
-        shape = (len(self.omega), 3 * self.axes, self.axes)
-        X = (generator.standard_normal(shape) + 1j * generator.standard_normal(shape)) / np.sqrt(2)
+        X = self._alike_at_neighbours(generator, (3 * self.axes, self.axes))
         change = self.body.deviation * generator.spawn(1)[0].standard_normal(self.body.B.shape)
         factor = np.tile(np.eye(self.axes), (len(self.omega), 1, 1))
         factor[: self.band.start] += np.linalg.solve(self.body.B, change)
@@ -91,6 +92,18 @@ class WideResponse:
             G_o=self.G_o @ factor + self.error_o @ X @ self.reach,
             noise=self.noise * _column(1 + self.noise_deviation * generator.standard_normal(len(self.omega))),
         )
+
+    def _alike_at_neighbours(self, generator: np.random.Generator, shape: tuple[int, int]) -> Complex:
+        """Unit complex normals, (K, *shape), that are alike within `ALIKE` and interpolated in between.
+
+        Estimates at neighbouring frequencies come from the same windows, and are smoothed over the same range.
+        """
+        place = (np.log(self.omega) - np.log(self.omega[0])) / ALIKE
+        knots = (int(place[-1]) + 2, *shape)
+        X = (generator.standard_normal(knots) + 1j * generator.standard_normal(knots)) / np.sqrt(2)
+        low, part = place.astype(int), _column(place % 1)
+        found: Complex = ((1 - part) * X[low] + part * X[low + 1]) / np.hypot(part, 1 - part)
+        return found
 
 
 def wide_response(measured: PlantEstimates) -> WideResponse:

@@ -102,9 +102,8 @@ def test_the_gains_of_repeated_flights_spread_as_predicted():
     values = {name: [getattr(one.gains, name) for one in designs()] for name in MATRICES}
     for name in ("Kp_o", "Kp_i", "Ki_i"):
         predicted = np.mean([one.deviations[name] for one in designs()])
-        # That of three values is within a sixth and twice the true one (95 %), which is up to twice the predicted one:
-        # the noise that limits the gains is itself measured, with an error that is alike at neighbouring frequencies.
-        assert predicted / 6 < np.std(values[name], ddof=1) < 4 * predicted, name
+        # That of three values is within a sixth and twice the true one (95 %).
+        assert predicted / 6 < np.std(values[name], ddof=1) < 2 * predicted, name
 
 
 def test_the_design_does_not_depend_on_the_unit_of_torque():
