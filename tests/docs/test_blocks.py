@@ -149,4 +149,3 @@ def test_every_link_within_readme_and_manual_leads_somewhere():
 
 def test_the_readme_is_short():
     assert len((TOP / "README.md").read_text().splitlines()) <= 150
-
