@@ -1,16 +1,17 @@
-"""The page of an autotune: what was predicted, what was flown."""
+"""The page of an autotune: the check flight beside its prediction, then the report of both flights."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from mimopilot.common.charts import STYLES, svg
-from mimopilot.common.html_report import ReportTable, Section, write_report
+from mimopilot.common.charts import MODEL_COLOUR, NEW, SETPOINT_COLOUR
+from mimopilot.common.figures import Chart, Line, Panel, thinned
+from mimopilot.common.html_report import Headline, ReportTable, Section, write_report
 from mimopilot.sitl.field.autotune_run import CHECK, FLIGHT, REPORT, AutotuneRun
 from mimopilot.sitl.field.check_flight import FIGURES, SHARE, CheckResult
+from mimopilot.sitl.field.report.flight_report import make_report
 from mimopilot.tuning.gains import Gains
 
 #: Columns of `predicted_rows`, and of `check_rows`.
@@ -42,39 +43,36 @@ def check_rows(result: CheckResult) -> list[list[str]]:
     return rows
 
 
-def check_figure(result: CheckResult) -> Figure:
+def check_charts(result: CheckResult) -> Sequence[Chart]:
     """Setpoints, angles and predicted angles over time."""
-    figure = Figure(figsize=(9, 3 * len(result.axes)), layout="constrained")
-    panels: Any = figure.subplots(len(result.axes), 1)
-    for axis, panel in zip(result.axes, panels, strict=True):
-        panel.step(axis.time, np.degrees(axis.setpoint), color="black", linewidth=1, label="setpoint")
-        lines = (axis.expected, "predicted"), (axis.angle, "flown")
-        for (signal, label), (colour, style) in zip(lines, STYLES[1:], strict=False):
-            panel.plot(axis.time, np.degrees(signal), color=colour, linestyle=style, label=label)
-        panel.set_ylabel(f"{axis.name} [deg]")
-        panel.grid(alpha=0.3)
-    panels[0].legend(loc="upper right", fontsize=9, ncols=3)
-    panels[-1].set_xlabel("time [s]")
-    return figure
+    panels = []
+    for axis in result.axes:
+        signals = (
+            ("setpoint", axis.setpoint, SETPOINT_COLOUR, ":"),
+            ("flown", axis.angle, NEW, "-"),
+            ("predicted", axis.expected, MODEL_COLOUR, "--"),
+        )
+        lines = [
+            Line(*thinned(axis.time, np.degrees(values)), label, colour, dash)
+            for label, values, colour, dash in signals
+        ]
+        panels.append(Panel(axis.name, "time [s]", "[deg]", lines))
+    return [Chart("check-flight", "The doublets of the check flight, and what was predicted for them.", panels, 1)]
 
 
 def write_autotune_report(run: AutotuneRun, gains: Gains, result: CheckResult) -> None:
     """Write the page to the folder."""
-    verdict, reason = gains.verdict()
-    outcome = f"Worse than predicted: {'; '.join(result.worse)}." if result.worse else "As predicted."
-    caption = "RMS in doublets of 10 degrees, 0.4 to 2 s; after a step of torque; torque at hover. Roll / pitch"
+    flights = make_report([run.log(FLIGHT), run.log(CHECK)], [("new", gains)])
+    outcome = f"worse than predicted: {'; '.join(result.worse)}" if result.worse else "as predicted"
+    check = Section(
+        "Check flight",
+        tables=[ReportTable(CHECK_CAPTION, CHECKED, check_rows(result))],
+        charts=check_charts(result),
+    )
     write_report(
         run.file(REPORT),
-        "Autotune",
-        f"From {run.log(FLIGHT).name} and {run.log(CHECK).name}. {outcome}",
-        [
-            Section(
-                "Gains", f"Certificate: {verdict}, {reason}.", [ReportTable(caption, PREDICTED, predicted_rows(gains))]
-            ),
-            Section(
-                "Check flight",
-                tables=[ReportTable(CHECK_CAPTION, CHECKED, check_rows(result))],
-                figures=[svg(check_figure(result), "check flight")],
-            ),
-        ],
+        "mimopilot autotune",
+        flights.lead,
+        [check, *flights.sections],
+        Headline(f"The check flight was {outcome}.", tone="bad" if result.worse else "good"),
     )

@@ -121,7 +121,11 @@ def test_the_commands_of_a_block_that_is_not_run_here_exist_with_these_options(b
     test = block.value("test")
     if test:
         path, _, function = test.partition("::")
-        assert f"\ndef {function}(" in (TOP / path).read_text(), f"{block.name}: {test}"
+        text = (TOP / path).read_text()
+        assert f"\ndef {function}(" in text, f"{block.name}: {test}"
+        for line, _ in block.commands:
+            name = line.split()[1]
+            assert line.startswith("make ") or re.search(rf'"{name}"|\b{name}\(', text), f"{block.name}: {name}"
 
 
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language == "toml"], ids=lambda block: block.name)
@@ -149,4 +153,3 @@ def test_every_link_within_readme_and_manual_leads_somewhere():
 
 def test_the_readme_is_short():
     assert len((TOP / "README.md").read_text().splitlines()) <= 150
-

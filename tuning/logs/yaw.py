@@ -125,12 +125,12 @@ def _heading_fault(yaw: YawSignals, experiment: Experiment, recording: Recording
             part = slice(begin, begin + window)
             x, y = turned[step:][part] - turned[:-step][part], heading[step:][part] - heading[:-step][part]
             x, y = x - x.mean(), y - y.mean()
-            scale = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))
-            if scale <= 0:
-                continue
-            both, own, moved = both + x @ y / scale, own + x @ x / scale, moved + y @ y / scale
             sizes.append(float(np.sqrt(np.mean(x**2))))
-    if not sizes or np.quantile(sizes, MOST) < MOVES:
+            scale = float(np.sqrt(np.sum(x**2) * np.sum(y**2)))
+            if sizes[-1] < MOVES or scale <= 0:
+                continue  # the noise of a yaw that is still
+            both, own, moved = both + x @ y / scale, own + x @ x / scale, moved + y @ y / scale
+    if not sizes or np.quantile(sizes, MOST) < MOVES or not moved:
         return ""
     factor, explained = both / own, both**2 / (own * moved)
     rates, headings = _name("y_i", recording), _name("y_o", recording)

@@ -11,7 +11,7 @@ import mimopilot.sitl.field.autotune_run as autotune_run
 import mimopilot.sitl.field.ground_steps as ground_steps
 import mimopilot.sitl.mavlink.ground_station.session as session
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.field.autotune_run import AutotuneOptions
+from mimopilot.sitl.field.autotune_run import REPORT, AutotuneOptions
 from mimopilot.sitl.field.workflow import autotune
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.logs.inspection import inspect_log
@@ -86,6 +86,10 @@ class Field:
         return ""
 
 
+def write_no_page(run, gains, result):
+    run.file(REPORT).write_text("")
+
+
 @contextmanager
 def scripted_fields(folder):
     """A function that makes a `Field`; other keywords are attributes of the vehicle."""
@@ -94,7 +98,11 @@ def scripted_fields(folder):
     lasting.setattr(ground_steps, "inspect_log", once(inspect_log))
     lasting.setattr(autotune_run, "read_log", once(read_log))
 
-    def make(answers=None, loss=0.0, seed=0, pilot=False, yes=False, arm=False, **changes):
+    write_page = ground_steps.write_autotune_report
+
+    def make(answers=None, loss=0.0, seed=0, pilot=False, yes=False, arm=False, page=False, **changes):
+        # The whole page takes as long as the rest of a run.
+        lasting.setattr(ground_steps, "write_autotune_report", write_page if page else write_no_page)
         vehicle = FieldVehicle()
         for name, value in changes.items():
             assert hasattr(vehicle, name)

@@ -15,7 +15,7 @@ OLD, NEW = SETS["old"], SETS["new"]
 
 
 def test_an_autotune_from_the_ground_to_the_ground_keeps_the_new_gains(scripted):
-    field = scripted()
+    field = scripted(page=True)
     old = dict(field.vehicle.set)
     assert field.run() == ""
     check_set(field, "", old)
@@ -29,6 +29,8 @@ def test_an_autotune_from_the_ground_to_the_ground_keeps_the_new_gains(scripted)
     found = json.loads((folder / "decisions.json").read_text())
     assert (found["result"], found["new_values_may_be_on_the_vehicle"]) == ("kept", False)
     assert [question.split()[0] for question in field.user.asked] == ["Arm", "Upload", "Arm", "Keep"]
+    page = (folder / "report.html").read_text()
+    assert all(f'id="{part}"' in page for part in ("check-flight", "setpoint-and-response", "stability-and-margins"))
     before = (folder / "decisions.json").read_bytes(), (folder / "report.html").read_bytes()
     assert field.run() == ""  # nothing is left to do
     assert ((folder / "decisions.json").read_bytes(), (folder / "report.html").read_bytes()) == before
