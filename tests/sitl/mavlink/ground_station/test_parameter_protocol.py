@@ -1,7 +1,6 @@
 """The upload over simulated links with loss, faults and interruptions, in simulated time."""
 
 import math
-from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -196,7 +195,7 @@ def test_ardupilot_saves_each_parameter_by_itself_and_is_not_commanded_to():
     client = ParameterClient(link.now())
     run_exchange(client.await_heartbeat(), link)
     assert client.vehicle is not None
-    client.vehicle = replace(client.vehicle, autopilot=ARDUPILOT)
+    client.vehicle = client.vehicle._replace(autopilot=ARDUPILOT)
     assert run_exchange(client.store(), link) == "autosave"
     assert vehicle.stored == 0
 
