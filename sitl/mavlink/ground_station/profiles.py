@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
-from mimopilot.tuning.gains import Gains, Triple
+from mimopilot.tuning.gains import Gains, Limits, Triple
 from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, MIMO, PX4_STOCK, StockFilters
 from mimopilot.tuning.parameter_row import PREFIX, Parameter, Shape
 from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, ROWS, Setting, rows
@@ -100,7 +100,9 @@ def _ardupilot_stock(gains: Gains) -> UploadPlan:
     settings: list[ParameterWrite] = []
     for axis, name in enumerate(("RLL", "PIT", "YAW")):
         names = (f"ATC_ANG_{name}_P", *(f"ATC_RAT_{name}_{term}" for term in ("P", "I", "D", "FF")))
-        limit = math.degrees(gains.limits.rate_max[axis])
+        limit = gains.limits.rate_max[axis]
+        # No limit, 0, was read as that of our law: see `tuning.logs.stock_controllers`.
+        limit = 0.0 if limit == Limits().rate_max[axis] else math.degrees(limit)
         settings += [
             *_gains_of(gains, axis, names, largest),
             ParameterWrite(f"ATC_RAT_{name}_IMAX", "norm", gains.limits.integral_max[axis], 0.0, 1.0),

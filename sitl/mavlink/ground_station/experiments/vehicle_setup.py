@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping, Sequence
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -166,6 +167,8 @@ def reboot(session: VehicleSession, monitor: FlightMonitor) -> FlightMonitor:
         raise SitlError(f"the vehicle refuses to reboot (MAV_RESULT {ack.result}){why}; reboot it by hand", exit_code=1)
     # A firmware that cannot restart itself, as PX4 in simulation, is restarted by the user.
     timeout, phase = (HAND_S, "reboot the vehicle by hand now") if by_hand else (BOOT_S, "rebooting")
+    if by_hand:  # also without a terminal, where no progress is shown
+        print(f"mimopilot: {phase}: it refuses the command", file=sys.stderr)
     while session.client.now < begin + timeout and not session.client.interrupted:
         if session.client.closed:
             session.reconnect()

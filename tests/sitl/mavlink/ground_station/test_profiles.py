@@ -63,6 +63,8 @@ def test_ardupilots_parameters_are_the_gains_in_its_units():
         assert filters == [single(one[axis]) for one in held]
         assert values[f"ATC_RATE_{name[0]}_MAX"] == single(math.degrees(gains.limits.rate_max[axis]))
     assert len(values) == 33
+    free = dataclasses.replace(gains, limits=dataclasses.replace(gains.limits, rate_max=Limits().rate_max))
+    assert [make_plan(free, profile).values[f"ATC_RATE_{axis}_MAX"] for axis in "RPY"] == [0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("profile", PROFILES)
