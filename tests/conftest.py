@@ -14,6 +14,8 @@ from pathlib import Path
 
 # As the command line does, before numpy is loaded: results are compared with printed ones.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = os.environ["MKL_NUM_THREADS"] = "1"
+# Parallel workers of pytest set it; what the tests read is a pipe.
+os.environ.pop("COLUMNS", None)
 
 import numpy as np
 import pytest

@@ -104,4 +104,4 @@ def test_integers_keep_their_bits_in_mavlink_messages(number):
     assert struct.pack("<f", sent.param_value) == struct.pack("<i", number)
     echo = mavlink.MAVLink_param_value_message(b"MIMO_EX_HMIN", sent.param_value, 6, 1, 0)
     (heard,) = codec.parse(codec.pack(echo))
-    assert from_mavlink(heard) == ParameterValue(1, 1, "MIMO_EX_HMIN", number, 6)
+    assert from_mavlink(heard) == ParameterValue(1, 1, "MIMO_EX_HMIN", number, 6, place=0)
