@@ -327,6 +327,8 @@ def _angles_from_rates(plant: PlantResponse) -> PlantResponse:
     lead = float(np.clip(omega @ phase / (omega @ omega), -LAG, LAG))
     gain = float(np.median(np.abs(quotient[both])))
     better = of_rates < spread
+    # At low frequencies the angles as measured, where they are well known, hold more than the integral of the rates.
+    better[: np.flatnonzero(both)[-1] // 2] &= (plant.relative_error() >= SURE)[: np.flatnonzero(both)[-1] // 2]
     change = np.where(better, gain * np.exp(1j * plant.omega * lead) / s, 0)[:, None, None]
     _, rates, angles = np.split(plant.root, 3, axis=1)
     root = plant.root.copy()

@@ -38,8 +38,8 @@ def flights():
 
 @cache
 def designs():
-    """Of yaw alone, from some of the flights; without a derivative, which is at its bound in some of them only."""
-    return [tune_yaw([PlantEstimates(one)], PI, calm(), FASTEST) for one in flights()[:3]]
+    """Of yaw alone; without a derivative, which is at its bound in some of the flights only."""
+    return [tune_yaw([PlantEstimates(one)], PI, calm(), FASTEST) for one in flights()]
 
 
 @cache
@@ -101,11 +101,11 @@ def test_the_design_is_stable_within_the_limit_and_follows_better():
 
 def test_the_gains_of_repeated_flights_spread_as_predicted():
     values = {name: [getattr(one.gains, name) for one in designs()] for name in MATRICES}
-    # (docs/method.md): that of three values is within a sixth and twice the true one (95 %), which is half to twice the
-    # predicted one, for the integral gain down to a tenth.
+    # The true spread is half to twice the predicted one, for the integral gain down to a tenth; that of five values is
+    # within a third and 1.7 times the true one (95 %).
     for name, least in (("Kp_o", 2), ("Kp_i", 2), ("Ki_i", 10)):
         predicted = np.mean([one.deviations[name] for one in designs()])
-        assert predicted / (6 * least) < np.std(values[name], ddof=1) < 4 * predicted, name
+        assert predicted / (3 * least) < np.std(values[name], ddof=1) < 2 * 1.7 * predicted, name
         assert predicted < 0.1 * np.mean(values[name])
 
 
