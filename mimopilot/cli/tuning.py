@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 #: Details of a designed set that `tune --json` has, too.
 SHARED = ("predicted", "better_than_flown", "keep_flown", "worth_of_off_diagonals")
 #: Columns of the tables of predicted figures.
-PREDICTED = ("", "follows [deg]", "other axis [deg]", "after torque [deg]", "noise of u", "Ms")
 PREDICTED_TITLE = (
     "Predicted, roll / pitch. RMS in doublets of 10 degrees, 0.4 to 2 s: to the model\n"
     "({model}) and of the other axis; after a step of torque; of the torque at hover"
@@ -171,18 +170,13 @@ def tune(
 
 def print_comparison(gains: Gains, logs: list[str]) -> None:
     """Predicted figures of a designed set beside those of the flown gains, and the conclusion."""
+    from mimopilot.tuning.design.prediction_rows import PREDICTED, predicted_rows
+
     details = gains.provenance.details
-    predicted = details.get("predicted")
-    if predicted is None or gains.provenance.outer_model is None:
+    if "predicted" not in details or gains.provenance.outer_model is None:
         return
     model = f"{gains.provenance.outer_model[0].bandwidth:g} rad/s"
-    rows = []
-    for place, log in enumerate(logs):
-        for name in ("flown", "siso", "tuned", "module"):
-            if name in predicted:
-                shown = {"siso": "SISO", "module": "our module"}.get(name, name)
-                rows.append([f"{shown}, {log}" if len(logs) > 1 else shown, *prediction_cells(predicted[name][place])])
-    print_table(PREDICTED_TITLE.format(model=model), PREDICTED, rows)
+    print_table(PREDICTED_TITLE.format(model=model), PREDICTED, predicted_rows(gains, logs))
     if details.get("better_than_flown"):
         print("better than the gains that flew: in following and on the other axis, within the limits of Ms and noise")
     worth = details.get("worth_of_off_diagonals", {})
@@ -195,16 +189,6 @@ def print_comparison(gains: Gains, logs: list[str]) -> None:
         print(f"keep what you fly: {reason}")
     if details["limited_by"]:
         print(f"limited by: {', '.join(details['limited_by'])}")
-
-
-def prediction_cells(figures: Mapping[str, Any]) -> list[str]:
-    """Cells of a row of predicted figures, see `PREDICTED`."""
-    pairs = [figures[name] for name in ("follow_deg", "offaxis_deg", "disturbance_deg")]
-    return [
-        *(f"{roll:.2f} / {pitch:.2f}" for roll, pitch in pairs),
-        "{:.4f} / {:.4f}".format(*figures["noise"]),
-        f"{figures['Ms']:.2f}",
-    ]
 
 
 def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Columns | None, as_json: bool) -> None:
@@ -280,6 +264,7 @@ def advise(
     from rich.progress import track
 
     import mimopilot as mp
+    from mimopilot.tuning.design.prediction_rows import PREDICTED, prediction_cells
     from mimopilot.tuning.spec import load_spec
 
     found = mp.advise(

@@ -7,8 +7,10 @@ import sys
 import time
 
 from mimopilot.common.console import print_table
-from mimopilot.sitl.field.autotune_report import CHECK_CAPTION, CHECKED, PREDICTED, check_rows, predicted_rows
+from mimopilot.sitl.field.autotune_report import CHECK_CAPTION, CHECKED, check_rows
+from mimopilot.sitl.field.autotune_run import FLIGHT
 from mimopilot.sitl.field.check_flight import CheckResult
+from mimopilot.tuning.design.prediction_rows import PREDICTED, predicted_rows
 from mimopilot.tuning.gains import Gains
 
 YES, NO = ("y", "yes"), ("n", "no")
@@ -53,7 +55,7 @@ class AutotuneTerminal:
         if self.quiet:
             return
         title = "predicted, roll / pitch: RMS in doublets of 10 degrees, after a step of torque, torque at hover"
-        print_table(title, PREDICTED, predicted_rows(gains))
+        print_table(title, PREDICTED, predicted_rows(gains, [FLIGHT]))
         verdict, reason = gains.verdict()
         print(f"certificate: {verdict}: {reason}", flush=True)
 

@@ -14,21 +14,9 @@ from mimopilot.sitl.field.check_flight import FIGURES, SHARE, CheckResult
 from mimopilot.sitl.field.report.flight_report import make_report
 from mimopilot.tuning.gains import Gains
 
-#: Columns of `predicted_rows`, and of `check_rows`.
-PREDICTED = ("", "follows [deg]", "other axis [deg]", "after torque [deg]", "noise of u", "Ms")
+#: Columns of `check_rows`.
 CHECKED = ("roll / pitch / yaw", "predicted", "flown", "limit")
 CHECK_CAPTION = f"Doublets of the check flight; limit: {1 + SHARE:g} times the prediction, and a margin for gusts"
-
-
-def predicted_rows(gains: Gains) -> list[list[str]]:
-    """Predicted figures of the flown and of the new gains, as `tune` shows them."""
-    rows = []
-    for name, shown in (("flown", "flown"), ("siso", "SISO"), ("tuned", "new")):
-        for figures in gains.provenance.details.get("predicted", {}).get(name, []):
-            pairs = [figures[key] for key in ("follow_deg", "offaxis_deg", "disturbance_deg")]
-            noise = "{:.4f} / {:.4f}".format(*figures["noise"])
-            rows.append([shown, *(f"{a:.2f} / {b:.2f}" for a, b in pairs), noise, f"{figures['Ms']:.2f}"])
-    return rows
 
 
 def check_rows(result: CheckResult) -> list[list[str]]:

@@ -18,13 +18,14 @@ from scipy.signal import correlate
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.doublet_flight import BEFORE_S, DoubletPlan
 from mimopilot.tuning import law
+from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.axes import Law, axis_names, law_of, yaw_axis
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
-from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
+from mimopilot.tuning.reference_model import ReferenceModel, model_from_table
 
 # All chosen, see the tests for what healthy and damaged vehicles reach:
 #: Share by which a figure may be worse than predicted.
@@ -151,7 +152,7 @@ def check_flight(flight: Experiment, experiment: Experiment, gains: Gains, plan:
 def yaw_model(gains: Gains) -> ReferenceModel | None:
     """The model that the heading follows with a set; None: its yaw gains are not tuned."""
     found = gains.provenance.details.get("yaw", {}).get("attitude_model")
-    return None if found is None else SecondOrder(found["omega"], found["zeta"], found["delay"]).discretise(gains.Ts)
+    return None if found is None else model_from_table(found, "yaw attitude model").discretise(gains.Ts)
 
 
 def _compare(
@@ -231,15 +232,13 @@ def find_doublets(flight: Experiment, plan: DoubletPlan) -> slice:
 
 def _closed_loop(gains: Law, plant: WideResponse) -> tuple[Complex, Complex, Signal, Signal]:
     """T and U, (K, n, n), and the RMS of angles and of the torque at hover that noise and gusts cause, (n,) each."""
-    C_ref, C_o, C_y = law.cascade_response(gains, plant.omega)
-    n = plant.G_i.shape[-1]
-    S = np.linalg.inv(np.eye(n) + C_y @ plant.G_i + C_o @ plant.G_o)
-    U = S @ C_ref
-    N = plant.noise
-    torque = S @ (C_y @ N[:, :n] + C_o @ N[:, n:])
+    loop = cascade_loop(gains, plant)
+    _, C_o, C_y = law.cascade_response(gains, plant.omega)
+    n, N = plant.axes, plant.noise
+    torque = np.linalg.solve(np.eye(n) + loop.L_u, C_y @ N[:, :n] + C_o @ N[:, n:])
     angles = N[:, n:] - plant.G_o @ torque
     rms = [np.sqrt(plant.noise_weight @ np.sum(np.abs(one) ** 2, axis=2)) for one in (angles, torque)]
-    return (plant.G_o @ U).astype(np.complex128), U.astype(np.complex128), rms[0], rms[1]
+    return loop.T_o, loop.U_o, rms[0], rms[1]
 
 
 def _respond(response: Complex, signal: Signal, plant: WideResponse, Ts: float) -> Signal:

@@ -24,8 +24,8 @@ from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 
 # All chosen, unless a source is given:
-#: Whole length of a doublet of roll, pitch (one of `tuning.analysis.manoeuvres.PERIODS`) and yaw, which is slower, s;
-#: their number on each axis, and level flight after each, s.
+#: Whole length of a doublet of roll, pitch (of `tuning.analysis.manoeuvres.ROLL_PITCH_FAMILY`) and yaw, slower,
+#: s; their number on each axis, and level flight after each, s.
 DOUBLET_S, DOUBLETS, LEVEL_S = (1.2, 1.2, 4.0), 2, 1.8
 #: Level flight before the first doublet, s: the torque of hover is measured in it.
 BEFORE_S = 4.0

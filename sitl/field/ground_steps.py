@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 from mimopilot.common.blas import reproducible
+from mimopilot.common.errors import Error
 from mimopilot.common.files import sha256
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_report import write_autotune_report
@@ -240,7 +241,10 @@ def judge(run: AutotuneRun) -> Found:
     plan = doublet_plan(experiment.amplitude, yaw_model(gains) is not None)
     result = check_flight(flight, experiment, gains, plan)
     run.dialogue.show_check(result)
-    write_autotune_report(run, gains, result)
+    try:
+        write_autotune_report(run, gains, result)
+    except Error as error:  # a page that cannot be made decides nothing
+        run.dialogue.tell(f"no report: {error}")
     if result.worse:
         raise Decided(f"the check flight is worse than predicted: {'; '.join(result.worse)}")
     return result.as_table()

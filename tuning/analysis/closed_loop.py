@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mimopilot.tuning import law
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.plant.frequency_response import PlantResponse
+from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.statespace import StateSpace
 
 Complex = NDArray[np.complex128]
@@ -38,14 +39,14 @@ class CascadeLoop:
     U_o: Complex
 
 
-def whole_loop(gains: Law, plant: PlantResponse) -> tuple[Complex, Complex, Complex]:
+def whole_loop(gains: Law, plant: PlantResponse | WideResponse) -> tuple[Complex, Complex, Complex]:
     """L_i and L_u as in `CascadeLoop`, and the setpoint's path C_ref, (K, n, n) each."""
     C_ref, C_o, C_y = law.cascade_response(gains, plant.omega)
     L_i = C_y @ plant.G_i
     return L_i, L_i + C_o @ plant.G_o, C_ref
 
 
-def cascade_loop(gains: Law, plant: PlantResponse) -> CascadeLoop:
+def cascade_loop(gains: Law, plant: PlantResponse | WideResponse) -> CascadeLoop:
     """Open and closed loop of a gain set around a measured plant."""
     L_i, L_u, forward = whole_loop(gains, plant)
     U_o: Complex = np.linalg.solve(np.eye(plant.axes) + L_u, forward).astype(np.complex128)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mimopilot.tuning.analysis.certify import certify
+from mimopilot.tuning.analysis.certify_axes import ORDER
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.response_design import Design, ResponseDesign
@@ -90,10 +91,9 @@ def rate_model(bench: ResponseDesign) -> SecondOrder:
 
 def weakest(certificates: Sequence[Certificate]) -> Certificate:
     """The certificate with the worst verdict and the thinnest margin; it holds those of the other logs."""
-    order = list(Verdict)
 
     def badness(one: Certificate) -> tuple[int, float]:
-        return order.index(one.verdict), one.figures.get("Ms", np.inf) + one.figures.get("Ms_error", 0.0)
+        return ORDER.index(one.verdict), one.figures.get("Ms", np.inf) + one.figures.get("Ms_error", 0.0)
 
     found = max(certificates, key=badness)
     return replace(found, further=tuple(one.as_table() for one in certificates if one is not found))

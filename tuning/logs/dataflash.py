@@ -18,6 +18,7 @@ from mimopilot.tuning.logs.flight_phase import intervals
 from mimopilot.tuning.logs.recording import MAX_OUTLIERS, RANGES, Recording
 from mimopilot.tuning.logs.resample import MAX_GAP, MIN_RATE, Interval, Series, monotone, sampling_period
 from mimopilot.tuning.logs.vehicle_type import ardupilot_vehicle
+from mimopilot.tuning.parameter_row import AXES
 
 DEGREE = np.pi / 180
 
@@ -48,7 +49,6 @@ CLOCKS = {"TimeUS": 1e-6, "TimeMS": MILLISECOND}
 INJECTED_AXES = {"u_bar": (1.0, {10: 0, 11: 1, 12: 2}), "r_bar": (DEGREE, {7: 0, 8: 1, 9: 2})}
 #: Those that move the attitude setpoint, and the rest.
 SETPOINT_AXES = {1: "roll", 2: "pitch", 3: "yaw", 4: "roll", 5: "pitch", 6: "yaw"}
-AXIS_NAMES = ("roll", "pitch", "yaw")
 
 #: Event numbers of message EV (AP_Logger, LogEvent).
 EV_DISARMED, EV_LANDED, EV_NOT_LANDED = 11, 18, 28
@@ -240,7 +240,7 @@ def _identification_notes(log: _DataflashLog) -> tuple[str, ...]:
     for axis in [] if runs is None else runs[1].astype(np.int64).tolist():
         kinds = {"u_bar": "injected torque", "r_bar": "injected rate setpoint"}
         text = next(
-            (f"{kinds[name]} on {AXIS_NAMES[axes[axis]]}" for name, (_, axes) in INJECTED_AXES.items() if axis in axes),
+            (f"{kinds[name]} on {AXES[axes[axis]]}" for name, (_, axes) in INJECTED_AXES.items() if axis in axes),
             f"attitude setpoint of {SETPOINT_AXES[axis]}" if axis in SETPOINT_AXES else "not used",
         )
         found.append(f"SID_AXIS {axis}: {text}")
@@ -272,7 +272,7 @@ def _excitation(log: _DataflashLog) -> dict[str, Series]:
     order = np.argsort(time, kind="stable")
     found = {}
     for name, (factor, columns) in INJECTED_AXES.items():
-        values = np.zeros((len(time), len(AXIS_NAMES)))
+        values = np.zeros((len(time), len(AXES)))
         for code, column in columns.items():
             values[: len(axis)][axis == code, column] = factor * waveform.values[axis == code, 0]
         if values.any():

@@ -17,7 +17,7 @@ RESULTS = {State.COMPLETE: mavlink.MAV_RESULT_ACCEPTED, State.FAIL: mavlink.MAV_
 
 
 class AutotuneCommand:
-    """Starts the autotune and tells its progress.
+    """Starts the autotune and reports its progress.
 
     Parameters
     ----------

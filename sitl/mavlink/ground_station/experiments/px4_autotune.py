@@ -4,7 +4,7 @@ What this relies on, of PX4 1.14 to 1.17 (mc_autotune_attitude_control, mavlink_
 
 - The module is started at boot when MC_AT_EN is above 0. A parameter that only it uses has the index 65535 until then.
 - MAV_CMD_DO_AUTOTUNE_ENABLE sets MC_AT_START to 1 when the module is idle, with or without a module, whatever its
-  parameters; it is acknowledged as in progress. Sent again, it tells the axis by its progress: 20 roll, 40 pitch,
+  parameters; it is acknowledged as in progress. Sent again, it reports the axis as its progress: 20 roll, 40 pitch,
   60 yaw. The module sets MC_AT_START to 0 two seconds after its end.
 - Nothing sent ends a run but an amplitude of 0 (MC_AT_SYSID_AMP, read at once), after which it ends by itself. A roll
   or pitch stick ends it. The newest firmware has no MC_AT_START, ends a run when the mode changes, and starts one only
@@ -330,7 +330,7 @@ class Px4Autotune(ExperimentProfile):
                 elif isinstance(answer, ParameterValue) and answer.name == START and run.requested:
                     run.pass_time(monitor.clock)
                     run.ended |= answer.value == 0
-                    if answer.value and not run.over:  # while it runs, the command tells the axis and starts nothing
+                    if answer.value and not run.over:  # while it runs, the command reports the axis and starts nothing
                         send.append(SendCommand(client.vehicle.system, client.vehicle.component, COMMAND, (1.0,)))
 
     def _stop(self, client: ParameterClient, monitor: FlightMonitor) -> Exchange[bool]:
