@@ -20,16 +20,18 @@ from pyulog import ULog
 from scipy.special import ndtri
 from scipy.stats import binom
 
+from mimopilot.common.charts import FLOWN, NEW, SISO
 from mimopilot.common.errors import InputFileError
 from mimopilot.common.intervals import quantile, wilson
 from mimopilot.sitl.autopilot.autopilot import Autopilot
-from mimopilot.sitl.campaign.campaign_figures import choose_map, parse_map
+from mimopilot.sitl.campaign.campaign_figures import choose_map, distribution_chart, parse_map, survival_chart
 from mimopilot.sitl.campaign.draws import RunSampler
 from mimopilot.sitl.campaign.execution import run_campaign
 from mimopilot.sitl.campaign.flights import CHUNK, FlightRunner
 from mimopilot.sitl.campaign.pairs import compare_pairs
 from mimopilot.sitl.campaign.plan import make_plan
 from mimopilot.sitl.campaign.replay import replay_flight
+from mimopilot.sitl.campaign.report import write_campaign_report
 from mimopilot.sitl.campaign.results import CampaignResults
 from mimopilot.sitl.campaign.summary import summarise
 from mimopilot.sitl.campaign.variation import variation_from_toml
@@ -434,6 +436,42 @@ at = 1.1
             SitlError, match=f"--map: got '{wrong}', expected two varied quantities: motors.time_constant"
         ):
             parse_map(plan, wrong)
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_report_says_what_varied_and_has_no_map_of_one_colour(vehicle, tmp_path):
+    default = vehicle.default_gains()
+    tuned = {
+        name: replace(default, provenance=replace(default.provenance, method=name)) for name in ("mimo", "siso", "default")
+    }
+    for folder, vary in (("same", ""), ("varied", "delay = { uniform = [0.5, 2.5] }\nwind.north = { normal = [0, 1] }")):
+        plan = plan_of(vehicle, tuned, vary=vary, runs=6, axes=["roll"], tail_s=0.2)
+        results = CampaignResults(plan, run_campaign(plan, tmp_path / folder, 1))
+        assert results.column("survived", "mimo", "roll").all()
+        page = write_campaign_report(results, summarise(results)).read_text()
+        assert ("Nothing varied but the noise of the sensors" in page) == (not vary)
+        assert ("wind.north [m/s]" in page) == bool(vary)
+        assert ("a map of survival would have one colour" in page) == bool(vary)
+        assert 'id="survival-roll-0"' not in page
+        assert 'id="responses-roll-0"' in page
+    # The same colours as in every other report, whatever the order of the sets.
+    (panel, *_) = distribution_chart(results, "roll").panels
+    assert {line.label: line.colour for line in panel.lines} == {"mimo": NEW, "siso": SISO, "default": FLOWN}
+
+
+def test_a_map_of_survival_has_the_share_of_each_cell(vehicle, tmp_path):
+    plan = plan_of(vehicle, vary="delay = { uniform = [0.5, 2.5] }\nwind.north = { normal = [0, 1] }", runs=4, axes=["roll"])
+
+    class Some(CampaignResults):
+        def column(self, name, gains, axis):
+            columns = {"delay": [1.0, 1.0, 2.0, 2.0], "wind.north": [0.0, 1.0, 0.0, 0.0]}
+            return np.array(columns[name] if name in columns else [True, False, True, False])
+
+    (panel,) = survival_chart(Some(plan, tmp_path), "roll", ("delay", "wind.north")).panels
+    heat, lost = panel.lines
+    assert heat.z == pytest.approx(np.array([[100.0, 50.0], [0.0, np.nan]]), nan_ok=True)
+    assert (list(heat.x), list(heat.y), heat.z_range) == ([1.0, 2.0], [0.0, 1.0], (0.0, 100.0))
+    assert list(zip(lost.x, lost.y, strict=True)) == [(1.0, 1.0), (2.0, 0.0)]
 
 
 def test_another_campaign_in_the_same_folder_is_refused_with_the_difference(vehicle, tmp_path):

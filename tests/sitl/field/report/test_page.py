@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 import mimopilot as mp
-from mimopilot.common.charts import FLOWN, NEW, SISO, STYLES
+from mimopilot.common.charts import AXIS_COLOURS, FLOWN, INJECTED, NEW, SISO, STYLES
+from mimopilot.common.figure_images import chart_figure
 from mimopilot.common.figures import thinned
 from mimopilot.common.plotly_page import charts_json
+from mimopilot.sitl.field.report.analysis.flight_data import PHASES
 from mimopilot.sitl.field.report.flight_report import MOST_LOGS, make_report
 from tests.conftest import assert_one_clear_line
 from tests.sitl.field.report.chromium import Chromium
@@ -110,10 +112,24 @@ def test_the_images_are_those_of_the_page(folder):
     assert FLOWN.lower() in (folder / "pictures" / "tracking-1.svg").read_text().lower()
 
 
+@pytest.mark.parametrize("name", ["timeline-1", "sensitivity", "predicted-motion"])
+def test_legends_of_images_lie_over_no_curve(bench, name):
+    chart = next(one for one in bench[2].charts if one.name == name)
+    figure = chart_figure(chart)
+    figure.canvas.draw()
+    shown = figure.axes[: len(chart.panels)]
+    boxes = [axes.get_window_extent() for axes in shown]
+    legends = [axes.get_legend().get_window_extent() for axes in shown if axes.get_legend()]
+    assert legends
+    # A pixel of an edge that both share does not count.
+    assert not [one for one in legends for box in boxes if one.overlaps(box.shrunk(0.99, 0.98))]
+
+
 def test_one_thing_has_one_colour(bench):
     report = bench[2]
     assert [(case.label, case.colour) for case in report.cases] == [("flown", FLOWN), ("my", NEW)]
     assert [colour for colour, _ in STYLES[:3]] == [FLOWN, SISO, NEW]
+    assert not {colour for colour, _ in STYLES} & {*AXIS_COLOURS, INJECTED, *PHASES.values()}
     for chart in report.charts:
         for panel in chart.panels:
             for line in panel.lines:
@@ -130,7 +146,7 @@ def test_two_flights_are_compared_on_the_same_axes_with_their_difference(folder,
     report = make_report([fast, slow])
     section = next(one for one in report.sections if one.heading == "Before and after")
     rows = {row[0]: row[1:] for row in section.tables[0].rows}
-    before, after, difference, share = rows["roll angle, RMS of the error [deg]"]
+    before, after, difference, share = rows["roll: RMS of the angle's error [deg]"]
     errors = [np.degrees(columns["roll_sp"] - factor * columns["roll"]) for factor in (2.0, 1.0)]
     assert [float(before), float(after)] == pytest.approx([np.sqrt(np.mean(one**2)) for one in errors], rel=1e-3)
     assert float(difference) == pytest.approx(float(after) - float(before), abs=0.01)
