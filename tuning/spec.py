@@ -111,7 +111,7 @@ class TuningSpec(_SpecTable):
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
-    profile: Literal["mimo", "px4-stock", "ardupilot-stock"] = "mimo"
+    profile: Literal["mimo", "px4-stock", "ardupilot-stock", "betaflight"] = "mimo"
     method: Literal["mimo", "siso"] = "mimo"
     inner: Models | None = None
     outer: Models | None = None
