@@ -47,7 +47,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.
 ProfileOption = Annotated[
     str | None,
     typer.Option(
-        help="Controller: mimo (our module), px4-stock or ardupilot-stock (the autopilot's own).", show_default="mimo"
+        help="Controller: mimo (our module), px4-stock, ardupilot-stock (the autopilot's own); tune: also betaflight.",
+        show_default="mimo",
     ),
 ]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]

@@ -1,7 +1,7 @@
 """Reader of blackbox logs of Betaflight and INDIflight that were decoded to CSV.
 
 Betaflight's axes are forward, left, up: pitch and yaw have the opposite sign of ours. Torque is the sum of the PID's
-terms, as it limits it, divided by the mixer's scale (PID_MIXER_SCALING in pid.h); rates and their setpoints are in deg/s.
+terms, as it limits it, divided by the mixer's scale (PID_MIXER_SCALING in pid.h); rates are in deg/s.
 INDIflight has no PID: its torque is the difference of the motor commands, and its attitude is forward, right, down.
 """
 

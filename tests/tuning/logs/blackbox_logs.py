@@ -33,7 +33,7 @@ SETTINGS = {
 
 @dataclass(frozen=True)
 class BetaflightFlight:
-    """Time (N,), s; and (N, 2) in forward, left, up: terms P and I, deg/s, rad, deg/s; the chirp's debug fields (N, 4)."""
+    """Time (N,), s; (N, 2) in forward, left, up: P, I, deg/s, rad, deg/s; the chirp's debug fields (N, 4)."""
 
     t: np.ndarray
     P: np.ndarray
