@@ -41,7 +41,7 @@ def test_a_map_of_survival_has_the_share_of_each_cell(vehicle, tmp_path):
     class Some(CampaignResults):
         def column(self, name, gains, axis):
             columns = {"delay": [1.0, 1.0, 2.0, 2.0], "wind.north": [0.0, 1.0, 0.0, 0.0]}
-            return np.array(columns[name] if name in columns else [True, False, True, False])
+            return np.array(columns.get(name, [True, False, True, False]))
 
     results = Some(plan_of(vehicle, vary=VARY, runs=4, axes=["roll"]), tmp_path)
     (panel,) = survival_chart(results, "roll", ("delay", "wind.north")).panels
