@@ -191,10 +191,11 @@ def survival_chart(results: CampaignResults, axis: str, names: tuple[str, str]) 
         flown, _, _ = np.histogram2d(x, y, edges)
         good, _, _ = np.histogram2d(x[survived], y[survived], edges)
         share = np.divide(100.0 * good, flown, out=np.full_like(good, np.nan), where=flown > 0)
-        middle = [(one[1:] + one[:-1]) / 2 for one in edges]
+        across, along = ((one[1:] + one[:-1]) / 2 for one in edges)
         lost = np.flatnonzero(~survived)[:CROSSES]
         marks = Line(x[lost], y[lost], "lost", LIMIT, width=0, marker="x")
-        lines = [HeatMap(*middle, share.T, "% survived", (0.0, 100.0)), *([marks] if len(lost) else [])]
+        lines: list[HeatMap | Line | Spread] = [HeatMap(across, along, share.T, "% survived", (0.0, 100.0))]
+        lines += [marks] if len(lost) else []
         title = f"{gains}: {int(survived.sum())} of {len(survived)} survived"
         panels.append(Panel(title, label(plan, names[0]), label(plan, names[1]), lines, height=320))
     caption = f"Share of the flights on {axis} that survived; white: not flown. Crosses: lost flights."

@@ -11,7 +11,6 @@ from mimopilot.common.charts import MODEL_COLOUR, SETPOINT_COLOUR
 from mimopilot.common.figures import Chart, Line, Panel, Spread
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.common.text_table import plus_minus
-from mimopilot.sitl.field.check_flight import yaw_model
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
 from mimopilot.sitl.field.report.analysis.predicted_motion import (
     BOTH,
@@ -24,6 +23,7 @@ from mimopilot.sitl.field.report.analysis.predicted_motion import (
 from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, family_of, manoeuvres
 from mimopilot.tuning.axes import axis_names, law_of
 from mimopilot.tuning.design.prediction import Prediction, predict
+from mimopilot.tuning.design.yaw_design import yaw_model
 from mimopilot.tuning.plant.frequency_response import SAME_PERIOD
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.reference_model import ReferenceModel
