@@ -9,7 +9,7 @@ import numpy as np
 
 from mimopilot.common.figures import Chart, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.common.text_table import plus_minus
+from mimopilot.common.text_table import plain_zero, plus_minus
 from mimopilot.sitl.field.report.analysis.filters_advice import torque_rms
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
 from mimopilot.sitl.field.report.analysis.predicted_motion import BOTH
@@ -33,12 +33,21 @@ class Compared:
     doubt: float = float("nan")
 
     def row(self, name: str) -> list[str]:
-        """Both, the difference with as many digits as its error justifies, and the difference in percent."""
+        """Both, the difference with as many digits as its error justifies, and the difference in percent.
+
+        Without errors, three digits of the larger value, and as many decimals of all.
+        """
         change = self.after - self.before
+        if np.isfinite(self.doubt) and self.doubt > 0:
+            values = zip((self.before, self.after), self.errors, strict=True)
+            cells = [*(plus_minus(value, error) for value, error in values), plus_minus(change, self.doubt)]
+        else:
+            size = max(abs(self.before), abs(self.after), 1e-9)
+            decimals = max(0, 2 - int(np.floor(np.log10(size))))
+            cells = [plain_zero(f"{value:.{decimals}f}") for value in (self.before, self.after, change)]
         share = f"{100 * change / self.before:+.0f} %" if self.before else "-"
-        cells = [plus_minus(value, error) for value, error in zip((self.before, self.after), self.errors, strict=True)]
-        text = plus_minus(change, self.doubt)
-        return [name, *cells, text if text.startswith("-") else f"+{text}", share]
+        cells[2] = cells[2] if cells[2].startswith("-") else f"+{cells[2]}"
+        return [name, *cells, plain_zero(share)]
 
 
 def compare_section(found: Sequence[FlightSpectra], cases: Sequence[GainCase]) -> Section | None:
