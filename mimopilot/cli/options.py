@@ -7,6 +7,16 @@ from typing import Annotated
 
 import typer
 
+from mimopilot.common.extras import REPORT
+
+
+def _page(path: Path | None) -> Path | None:
+    """Refuse to begin work whose page could not be written."""
+    if path is not None:
+        REPORT.need()
+    return path
+
+
 AirframeArgument = Annotated[
     str,
     typer.Argument(
@@ -41,7 +51,8 @@ SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast
 LogOutOption = Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")]
 UncertifiedOption = Annotated[bool, typer.Option("--uncertified", help="Accept gains whose stability is in doubt.")]
 ReportOption = Annotated[
-    Path | None, typer.Option(help="Also write a page with figures of the log and of these gains (HTML).")
+    Path | None,
+    typer.Option(callback=_page, help="Also write a page with figures of the log and of these gains (HTML)."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 ProfileOption = Annotated[
