@@ -21,7 +21,7 @@ from mimopilot.cli.options import (
 )
 from mimopilot.common.console import json_text, print_json, print_table, print_text
 from mimopilot.common.errors import check_not_given
-from mimopilot.common.extras import CAMPAIGN
+from mimopilot.common.extras import CAMPAIGN, REPORT
 
 
 def register(app: typer.Typer) -> None:
@@ -62,6 +62,7 @@ def campaign(
 ) -> None:
     """Fly many varied vehicles; report survival and tracking of each gain set."""
     CAMPAIGN.need()
+    REPORT.need()
     from mimopilot.common.files import inside, write_atomically
     from mimopilot.common.parallel import cores
     from mimopilot.sitl.campaign.campaign_figures import parse_map
