@@ -345,8 +345,8 @@ class ResponseDesign:
             name = "range of the motors"
         loop = None if flown is None else _loop_of(flown, plant)
         # The rotors' torque stays within the range. Their command may exceed it for less than their lag.
-        for share, lag in ((RANGE, plant.shape[1]), (PEAK, 0.0)):
-            limit = MotorLimit(doublet_torque(plant, size, lag), mixer, share * room, name)
+        for share, torque in zip((RANGE, PEAK), doublet_torque(plant, size, (plant.shape[1], 0.0)), strict=True):
+            limit = MotorLimit(torque, mixer, share * room, name)
             # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
             used = 1.0 if loop is None else max(1.0, 1 - limit.margin(loop))
             found.append(replace(limit, room=used * limit.room))
