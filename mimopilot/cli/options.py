@@ -24,7 +24,10 @@ AirframeArgument = Annotated[
         "adam0_thesis_flown, adam0_thesis_perturbed, antr, antr_thesis, px4_sih; or a TOML file."
     ),
 ]
-LogArgument = Annotated[Path, typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, CSV or MATLAB file.")]
+LogArgument = Annotated[
+    Path,
+    typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, Betaflight blackbox (CSV), CSV or MATLAB file."),
+]
 GainsArgument = Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")]
 
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
@@ -55,7 +58,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.
 ProfileOption = Annotated[
     str | None,
     typer.Option(
-        help="Controller: mimo (our module), px4-stock or ardupilot-stock (the autopilot's own).", show_default="mimo"
+        help="Controller: mimo (our module), px4-stock, ardupilot-stock (the autopilot's own); tune: also betaflight.",
+        show_default="mimo",
     ),
 ]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]

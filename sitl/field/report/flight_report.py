@@ -14,7 +14,8 @@ from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedF
 from mimopilot.sitl.field.report.headline import headline, lead
 from mimopilot.sitl.field.report.sections.compare import compare_section
 from mimopilot.sitl.field.report.sections.frequency import frequency_section
-from mimopilot.sitl.field.report.sections.gain_sets import gains_section, prediction_section
+from mimopilot.sitl.field.report.sections.gain_sets import gains_section
+from mimopilot.sitl.field.report.sections.prediction import prediction_section
 from mimopilot.sitl.field.report.sections.spectra import filter_section, flight_spectra, spectra_section
 from mimopilot.sitl.field.report.sections.stability import stability_section
 from mimopilot.sitl.field.report.sections.steps import step_section
