@@ -48,7 +48,8 @@ def commands_page() -> str:
         command = commands[name]
         parts += [f"## {name}", re.sub(r"\n(?!\n)", " ", command.help or "").replace("<", "&lt;")]
         if command.params:
-            rows = [_parameter_row(parameter) for parameter in command.params if not getattr(parameter, "hidden", False)]
+            shown = [one for one in command.params if not getattr(one, "hidden", False)]
+            rows = [_parameter_row(parameter) for parameter in shown]
             parts.append("\n".join(["| option | what | default |", "|---|---|---|", *rows]))
         examples = (command.epilog or "").removeprefix("Example: ").split("; ")
         parts.append("\n".join(["```", *filter(None, examples), "```"]))
