@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mimopilot.tuning.analysis.beyond_band import MAX_SENSITIVITY_BELOW_BAND, exceeded_frequencies
 from mimopilot.tuning.analysis.closed_loop import model_spectral_radius
 from mimopilot.tuning.analysis.manoeuvres import doublet_torque, family_of, manoeuvres
-from mimopilot.tuning.axes import Law, flown_law
+from mimopilot.tuning.axes import Law, axes_slice, flown_law
 from mimopilot.tuning.design.constraints import (
     SHARE,
     Constraint,
@@ -326,7 +326,7 @@ class ResponseDesign:
         if TERMS["D"].matrix in free.units:
             found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(plant.axes))]
         largest = free.base.filters.law.largest or {}
-        axes = slice(2, 3) if plant.axes == 1 else slice(0, plant.axes)
+        axes = axes_slice(plant.axes)
         found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
         return found + self._actuators(place)
 
