@@ -10,7 +10,7 @@ import typer
 
 from mimopilot.cli.identification import read_warned
 from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ProfileOption, ReportOption
-from mimopilot.cli.report import check_count, name_of, write_report_of
+from mimopilot.cli.report import check_count, write_report_of
 from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
 from mimopilot.common.console import print_json, print_table, print_text, progress_console
 from mimopilot.common.errors import check_not_given
@@ -98,6 +98,7 @@ def tune(
 ) -> None:
     """Find the best gains of the attitude cascade from one flight, and compare them with those that flew."""
     import mimopilot as mp
+    from mimopilot.tuning.gains_file import set_name
     from mimopilot.tuning.logs.columns import load_columns
     from mimopilot.tuning.spec import load_spec, parse_model
 
@@ -129,7 +130,7 @@ def tune(
         gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
     gains.save(out)
     if report is not None:
-        write_report_of(logs, [(name_of(out), gains)], report, columns, task)
+        write_report_of(logs, [(set_name(out), gains)], report, columns, task)
     known = {warning for experiment in experiments for warning in experiment.warnings}
     warn(logs[0], (warning for warning in gains.provenance.warnings if warning not in known))
     details, deviations = gains.provenance.details, gains.provenance.standard_deviation
@@ -234,13 +235,14 @@ def certify(
     """Check the stability of the closed loop, from a flight with any gains. Exit code 1: not certified."""
     import mimopilot as mp
     from mimopilot.tuning.certificate import ACCEPTED
+    from mimopilot.tuning.gains_file import set_name
     from mimopilot.tuning.spec import load_spec
 
     experiment = read_warned(log, columns)
     with step("examining the loop"):
         examined = mp.certify(experiment, gains, rate=rate, spec=spec)
     if report is not None:
-        write_report_of([log], [(name_of(gains), examined)], report, columns, load_spec(spec))
+        write_report_of([log], [(set_name(gains), examined)], report, columns, load_spec(spec))
     if out is not None:
         examined.save(out)
     if as_json:
