@@ -30,10 +30,10 @@ _LINE = (
 
 
 class ServoPacket(NamedTuple):
-    """Outputs of one frame: frame rate (Hz), frame count, and thrust fractions of motors 1 to 16."""
+    """Outputs of one frame: frame rate (Hz), its number, and thrust fractions of motors 1 to 16."""
 
     rate: int
-    count: int
+    number: int
     controls: list[float]
 
 

@@ -88,14 +88,15 @@ class JsonServer:
                 ready, _, _ = select.select(self.watched, [], [])
                 end_with_parent(ready)
                 if self.link in ready:
-                    self._receive()
+                    self.answer_one()
         except ParentGoneError:
             os._exit(0)  # at once, as `PlantServer`
         finally:
             if self.ignored:
                 self.vehicle.report(f"{self.ignored} packets were ignored")
 
-    def _receive(self) -> None:
+    def answer_one(self) -> None:
+        """Read one packet, and answer it if it is ArduPilot's."""
         try:
             data, peer = self.link.recvfrom(LONGEST + 1)
         except OSError:  # nothing that could be read
@@ -112,10 +113,10 @@ class JsonServer:
                 self._ignore("a second ArduPilot is ignored: this vehicle has one already")
                 return
             self._begin(packet)
-        elif packet.count < self._count:
+        elif packet.number < self._count:
             self._begin(packet)
         self._peer, self._heard = peer, now
-        if packet.count != self._count:
+        if packet.number != self._count:
             self._fly(packet)
         with contextlib.suppress(OSError):  # a lost answer is asked for again
             self.link.sendto(self._answer, peer)
@@ -143,7 +144,7 @@ class JsonServer:
         vehicle = self.vehicle
         if packet.rate != self._rate:  # ArduPilot moves to a new SIM_RATE_HZ by 1 Hz in a frame
             vehicle.change_period(1.0 / packet.rate)
-        self._rate, self._count = packet.rate, packet.count
+        self._rate, self._count = packet.rate, packet.number
         vehicle.fly(packet.controls, ARMED)
         self._seconds += vehicle.Ts
         self._pace.wait(vehicle.Ts)

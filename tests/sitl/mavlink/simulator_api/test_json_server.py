@@ -250,7 +250,7 @@ def test_no_bytes_are_read_as_anything_but_a_whole_packet(data):
     rate = int.from_bytes(data[2:4], "little")
     assert (packet is not None) == (whole and 1 <= rate <= 10_000)
     if packet is not None:
-        assert packet.count == int.from_bytes(data[4:8], "little")
+        assert packet.number == int.from_bytes(data[4:8], "little")
         assert len(packet.controls) == 16
         assert np.all((np.array(packet.controls) >= 0) & (np.array(packet.controls) <= 1))
 
