@@ -73,6 +73,7 @@ def stock_gains(controller: str = "px4-stock") -> Gains:
             setpoint_hz=(20.0, 22.0, 15.0),
             error_hz=(0.0, 30.0, 2.5),
             derivative_feedforward=(0.001, 0.002, 0.003),
+            shaping_s=(0.15, 0.15, 0.15),
         ),
     }
     diagonal = {

@@ -1,6 +1,7 @@
 """The manoeuvres that a gain set is judged by: doublets of several lengths on each axis, and a step of torque.
 
-All figures are energies by Parseval's theorem, so the time after a manoeuvre counts until everything is at rest.
+All figures are energies by Parseval's theorem, so the time after a manoeuvre counts until everything is at rest. Where
+a stock law shapes its setpoints, the doublets are those behind the shaping, as they are logged.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import doublet_spectrum
+from mimopilot.tuning.law import Filters, shaping_response
 from mimopilot.tuning.plant.rigid_body_fit import LOWEST
 from mimopilot.tuning.plant.wide_response import WideResponse, hat_weights
 from mimopilot.tuning.reference_model import ReferenceModel
@@ -115,7 +117,7 @@ class Manoeuvres:
         return weight
 
 
-def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
+def manoeuvres(plant: WideResponse, model: ReferenceModel, filters: Filters) -> Manoeuvres:
     """The doublets and the step of torque of its axes on the frequencies of a plant.
 
     Parameters
@@ -123,10 +125,13 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
     plant : WideResponse
     model : ReferenceModel
         Of the attitude.
+    filters : Filters
+        Of the law whose shaping the setpoints have.
     """
     family = family_of(plant.axes)
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, FINE)
-    spectra = np.array([np.abs(doublet_spectrum(fine, period)) ** 2 / np.pi for period in family.periods])
+    shaped = np.abs(shaping_response(filters, fine)) ** 2 / np.pi
+    spectra = np.array([np.abs(doublet_spectrum(fine, period)) ** 2 * shaped for period in family.periods])
     logarithmic = np.geomspace(LOWEST, fine[-1], FINE)
     step = hat_weights(plant.omega, logarithmic, logarithmic**-2.0 / np.pi)
     torque = family.acceleration / np.abs(np.diag(plant.body.B))
@@ -139,7 +144,7 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
     )
 
 
-def doublet_torque(plant: WideResponse, amplitude: float, lag: float = 0.0) -> Complex:
+def doublet_torque(plant: WideResponse, filters: Filters, amplitude: float, lag: float = 0.0) -> Complex:
     """Weights (T, K) whose product with the response U gives, in its real part, the torque in the doublets.
 
     At the times when it is largest: after the setpoint jumps.
@@ -147,14 +152,17 @@ def doublet_torque(plant: WideResponse, amplitude: float, lag: float = 0.0) -> C
     Parameters
     ----------
     plant : WideResponse
+    filters : Filters
+        Of the law whose shaping the setpoints have.
     amplitude : float, rad
     lag : float, s
         Of the rotors, for the torque behind them; 0: as commanded.
     """
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, COARSE)
+    behind = shaping_response(filters, fine) / np.pi / (1 + 1j * fine * lag)
     rows = []
     for period in family_of(plant.axes).periods:
-        spectrum = amplitude * doublet_spectrum(fine, period) / np.pi / (1 + 1j * fine * lag)
+        spectrum = amplitude * doublet_spectrum(fine, period) * behind
         times = [begin + (k + 0.5) * plant.Ts for begin in (0.0, period / 2, period) for k in AFTER]
         rows.append(hat_weights(plant.omega, fine, spectrum[:, None] * np.exp(1j * np.outer(fine, times))).T)
     return np.concatenate(rows)

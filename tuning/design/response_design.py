@@ -37,7 +37,7 @@ from mimopilot.tuning.design.positive_integral import MIN_INTEGRAL_RATIO
 from mimopilot.tuning.design.prediction import FAST, SLOWEST, bandwidth, sensitivity_peak
 from mimopilot.tuning.experiment import Experiment, manoeuvre_size
 from mimopilot.tuning.gains import Gains, Limits
-from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS
+from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS, Filters
 from mimopilot.tuning.motors import Motors
 from mimopilot.tuning.plant.noise_spectrum import flown_torque_noise
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
@@ -299,7 +299,7 @@ class ResponseDesign:
         return DesignTask(
             _following(free, bandwidth),
             [
-                PlantTask(plant, manoeuvres(plant, model), self._constraints(free, starts, place))
+                PlantTask(plant, manoeuvres(plant, model, free.base.filters), self._constraints(free, starts, place))
                 for place, plant in enumerate(self.plants)
             ],
         )
@@ -328,9 +328,9 @@ class ResponseDesign:
         largest = free.base.filters.law.largest or {}
         axes = slice(2, 3) if plant.axes == 1 else slice(0, plant.axes)
         found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
-        return found + self._actuators(place)
+        return found + self._actuators(place, free.base.filters)
 
-    def _actuators(self, place: int) -> list[Constraint]:
+    def _actuators(self, place: int, filters: Filters) -> list[Constraint]:
         """Limits of the motors in the manoeuvres of the flown size; for yaw those of its torque and its rate."""
         plant, experiment = self.plants[place], self.experiments[place]
         size, flown, found = flown_amplitude(experiment), flown_law(experiment), list[Constraint]()
@@ -346,7 +346,7 @@ class ResponseDesign:
         loop = None if flown is None else _loop_of(flown, plant)
         # The rotors' torque stays within the range. Their command may exceed it for less than their lag.
         for share, lag in ((RANGE, plant.shape[1]), (PEAK, 0.0)):
-            limit = MotorLimit(doublet_torque(plant, size, lag), mixer, share * room, name)
+            limit = MotorLimit(doublet_torque(plant, filters, size, lag), mixer, share * room, name)
             # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
             used = 1.0 if loop is None else max(1.0, 1 - limit.margin(loop))
             found.append(replace(limit, room=used * limit.room))

@@ -12,6 +12,7 @@ from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, ROLL_PITCH_FAMILY
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import shaping_response
 from mimopilot.tuning.plant.frequency_response import SAME_PERIOD
 from mimopilot.tuning.plant.wide_response import WideResponse
 
@@ -54,7 +55,7 @@ def predicted_motion(gains: Gains, plant: WideResponse) -> PredictedMotion | Non
     fine: Signal = np.asarray((np.arange(FREQUENCIES) + 0.5) * (np.pi / plant.Ts * 0.999 / FREQUENCIES), np.float64)
     step = fine[1] - fine[0]
     turn = np.exp(1j * np.outer(time, fine)) * (step / np.pi)
-    sharp = AMPLITUDE * doublet_spectrum(fine, PERIOD)
+    sharp = AMPLITUDE * doublet_spectrum(fine, PERIOD) * shaping_response(gains.filters, fine)
     torque = ROLL_PITCH_FAMILY.acceleration / np.abs(np.diag(plant.body.B))
 
     def motion(around: WideResponse) -> tuple[Signal, Signal]:

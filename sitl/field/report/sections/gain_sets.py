@@ -191,7 +191,7 @@ def predicted(case: GainCase, model: Gains) -> Prediction | None:
     if wide is None or not _is_stable(case) or abs(case.gains.Ts / wide.Ts - 1) > SAME_PERIOD:
         return None
     outer = (model.provenance.outer_model or (None,))[0]
-    task = manoeuvres(wide, outer.discretise(wide.Ts) if outer else model.reference_models(0)[1])
+    task = manoeuvres(wide, outer.discretise(wide.Ts) if outer else model.reference_models(0)[1], model.filters)
     return predict(case.gains, wide, task)
 
 
