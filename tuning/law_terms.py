@@ -185,6 +185,9 @@ class ControlLaw:
         Keys of the parameter table that it does not have.
     largest : mapping
         Gain -> largest value that the autopilot accepts: roll, pitch, yaw. None: the ranges of our parameter table.
+    least_attitude : tuple of 3 float, 1/s
+        Least Kp_o of a design, unless the flown one is less: where the setpoint's rate is fed forward, following asks
+        for none, and the angle's error after a gust would stay long.
     """
 
     terms: Mapping[str, Term]
@@ -195,6 +198,7 @@ class ControlLaw:
     filters: tuple[str, ...] = ()
     lacks: tuple[str, ...] = field(default=("derivative_cutoff_hz", "Kff_o", "Kaff_i", SLEW, "model_damping", MODEL))
     largest: Mapping[str, tuple[float, float, float]] | None = None
+    least_attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def _integral(filters: Filters) -> Chain:
@@ -314,6 +318,8 @@ LAWS = {
             "Kd_i": (0.05, 0.05, 0.02),
             "Kff_i": (0.5, 0.5, 0.5),
         },
+        # The same reference; not for yaw, whose torque is weak.
+        least_attitude=(3.0, 3.0, 0.0),
     ),
 }
 

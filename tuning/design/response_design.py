@@ -319,7 +319,7 @@ class ResponseDesign:
             ),
             gain_above_band(plant),
             structural_modes(plant, self.limited[place]),
-            Definite(ATTITUDE.matrix, np.eye(plant.axes), 0.0),
+            self._least_attitude(free.base, place),
         ]
         if TERMS["I"].matrix in free.units:
             found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
@@ -329,6 +329,15 @@ class ResponseDesign:
         axes = slice(2, 3) if plant.axes == 1 else slice(0, plant.axes)
         found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
         return found + self._actuators(place, free.base.filters)
+
+    def _least_attitude(self, base: Law, place: int) -> Definite:
+        """The law's least attitude gain, or the flown one."""
+        axes, flown = self.plants[place].axes, flown_law(self.experiments[place])
+        least = base.filters.law.least_attitude[2 if axes == 1 else 0]
+        if flown is not None:
+            least = min(least, float(np.diag(getattr(flown, ATTITUDE.matrix)).min()))
+        name = f"the autopilot's range of {ATTITUDE.matrix}" if least else ""
+        return Definite(ATTITUDE.matrix, np.eye(axes), least, name)
 
     def _actuators(self, place: int, filters: Filters) -> list[Constraint]:
         """Limits of the motors in the manoeuvres of the flown size; for yaw those of its torque and its rate."""
