@@ -13,7 +13,7 @@ from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, Gains
-from mimopilot.tuning.law_terms import LATER_FILTERS, LAWS, MIMO, StockFilters
+from mimopilot.tuning.law_terms import LAWS, MIMO, StockFilters
 from mimopilot.tuning.parameter_row import Row, Shape
 from mimopilot.tuning.parameters import ROWS, rows
 from mimopilot.tuning.provenance import Provenance
@@ -88,7 +88,8 @@ def _stock(table: dict[str, Any], controller: str) -> StockFilters | None:
     section, names = _get(table, FILTERS, ""), LAWS[controller].filters
     for key in sorted(set(section) - set(names)) if isinstance(section, dict) else ():
         raise TuningError(f"{FILTERS}.{shown_text(key)}: unknown entry; known: {', '.join(names)}")
-    found = [name for name in names if name not in LATER_FILTERS or name in section]
+    # ArduPilot sets from before the shaping was known have none.
+    found = [name for name in names if name != "shaping_s" or name in section]
     return StockFilters(
         controller, **{name: _triple(_get(section, name, FILTERS), f"{FILTERS}.{name}") for name in found}
     )
