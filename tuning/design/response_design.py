@@ -31,6 +31,7 @@ from mimopilot.tuning.design.constraints import (
     structural_modes,
 )
 from mimopilot.tuning.design.descent import INFEASIBLE, LARGEST_RADIUS, DesignTask, PlantTask, descend
+from mimopilot.tuning.design.disturbance_limit import no_softer_than
 from mimopilot.tuning.design.free_gains import FreeGains, free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.design.positive_integral import MIN_INTEGRAL_RATIO
@@ -296,15 +297,16 @@ class ResponseDesign:
     def task(self, free: FreeGains, starts: Sequence[Law], bandwidth: float) -> DesignTask:
         """Cost and constraints around every plant."""
         model = SecondOrder(bandwidth, DAMPING).discretise(free.base.Ts)
+        asked = [manoeuvres(plant, model, free.base.filters) for plant in self.plants]
         return DesignTask(
             _following(free, bandwidth),
             [
-                PlantTask(plant, manoeuvres(plant, model, free.base.filters), self._constraints(free, starts, place))
-                for place, plant in enumerate(self.plants)
+                PlantTask(plant, one, self._constraints(free, starts, place, one.step))
+                for place, (plant, one) in enumerate(zip(self.plants, asked, strict=True))
             ],
         )
 
-    def _constraints(self, free: FreeGains, starts: Sequence[Law], place: int) -> list[Constraint]:
+    def _constraints(self, free: FreeGains, starts: Sequence[Law], place: int, step: Signal) -> list[Constraint]:
         """The constraints around one of the plants."""
         plant, noise = self.plants[place], self.noise[place]
         B, floor = plant.body.B, 1 / self.limits.Ms
@@ -328,7 +330,11 @@ class ResponseDesign:
         largest = free.base.filters.law.largest or {}
         axes = slice(2, 3) if plant.axes == 1 else slice(0, plant.axes)
         found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
-        return found + self._actuators(place, free.base.filters)
+        found += self._actuators(place, free.base.filters)
+        flown = flown_law(self.experiments[place])
+        if flown is not None and any(free.base.filters.shaping):  # else following asks for stiffness
+            found += no_softer_than(_loop_of(flown, plant), step, found)
+        return found
 
     def _least_attitude(self, base: Law, place: int) -> Definite:
         """The law's least attitude gain, or the flown one."""
