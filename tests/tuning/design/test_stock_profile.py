@@ -12,12 +12,16 @@ from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.design.cascade import certify_from_log, tune
+from mimopilot.tuning.design.disturbance_limit import ROOM
+from mimopilot.tuning.design.prediction import predict
+from mimopilot.tuning.design.response_design import ResponseDesign
 from mimopilot.tuning.design.stock_profile import in_digits
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.law_terms import StockFilters
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.spec import TuningSpec, load_spec
 from tests.tuning.analysis.loops import MODELS, airframe, defaults, exact, grid
 from tests.tuning.truth import TS, Truth, experiment
@@ -130,6 +134,21 @@ def test_arducopters_feed_forward_is_in_the_predicted_following():
     without = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, stock=FILTERS["ardupilot-stock"]))
     slower = cascade_loop(without, exact(truth, omega)).T_o[0]
     assert np.linalg.norm(slower @ setpoint - angle) > 0.2 * np.linalg.norm(angle)
+
+
+def test_a_design_for_arducopter_follows_better_and_is_no_softer_in_gusts(log):
+    """Its setpoint's rate is fed forward, so following alone would ask for next to no angle P."""
+    shaped = dataclasses.replace(FILTERS["ardupilot-stock"], shaping_s=(0.15,) * 3)
+    flown = stock_set("ardupilot-stock")
+    flown = dataclasses.replace(flown, Kp_o=4.5 * np.eye(2), filters=dataclasses.replace(flown.filters, stock=shaped))
+    bench = ResponseDesign.of([PlantEstimates(dataclasses.replace(log, flown=flown))], TuningSpec().design)
+    found = bench.design([flown], "PID", full=False)
+    task = found.task.plants[0].manoeuvres
+    new, old = (predict(gains, bench.plants[0], task) for gains in (found.gains, flown))
+    assert found.feasible
+    assert max(np.divide(new.disturbance_deg, old.disturbance_deg)) < ROOM * 1.01
+    assert np.linalg.norm(new.follow_deg) < np.linalg.norm(old.follow_deg)
+    assert np.diag(found.gains.Kp_o).min() > 3.0 * 0.99
 
 
 def test_a_stock_set_is_diagonal_certified_at_both_rates_and_in_few_digits(tuned):
