@@ -6,6 +6,7 @@ a stock law shapes its setpoints, the doublets are those behind the shaping, as 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -130,8 +131,8 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel, filters: Filters) -> 
     """
     family = family_of(plant.axes)
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, FINE)
-    shaped = np.abs(shaping_response(filters, fine)) ** 2 / np.pi
-    spectra = np.array([np.abs(doublet_spectrum(fine, period)) ** 2 * shaped for period in family.periods])
+    shaped = np.abs(shaping_response(filters, fine)) ** 2
+    spectra = np.array([np.abs(doublet_spectrum(fine, period)) ** 2 * shaped / np.pi for period in family.periods])
     logarithmic = np.geomspace(LOWEST, fine[-1], FINE)
     step = hat_weights(plant.omega, logarithmic, logarithmic**-2.0 / np.pi)
     torque = family.acceleration / np.abs(np.diag(plant.body.B))
@@ -144,8 +145,10 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel, filters: Filters) -> 
     )
 
 
-def doublet_torque(plant: WideResponse, filters: Filters, amplitude: float, lag: float = 0.0) -> Complex:
-    """Weights (T, K) whose product with the response U gives, in its real part, the torque in the doublets.
+def doublet_torque(
+    plant: WideResponse, filters: Filters, amplitude: float, lags: Sequence[float] = (0.0,)
+) -> list[Complex]:
+    """For each lag the weights (T, K) whose product with U gives, in its real part, the torque in the doublets.
 
     At the times when it is largest: after the setpoint jumps.
 
@@ -155,14 +158,16 @@ def doublet_torque(plant: WideResponse, filters: Filters, amplitude: float, lag:
     filters : Filters
         Of the law whose shaping the setpoints have.
     amplitude : float, rad
-    lag : float, s
+    lags : sequence of float, s
         Of the rotors, for the torque behind them; 0: as commanded.
     """
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, COARSE)
-    behind = shaping_response(filters, fine) / np.pi / (1 + 1j * fine * lag)
-    rows = []
+    found: list[list[Complex]] = [[] for _ in lags]
+    shaped = shaping_response(filters, fine)
     for period in family_of(plant.axes).periods:
-        spectrum = amplitude * doublet_spectrum(fine, period) * behind
         times = [begin + (k + 0.5) * plant.Ts for begin in (0.0, period / 2, period) for k in AFTER]
-        rows.append(hat_weights(plant.omega, fine, spectrum[:, None] * np.exp(1j * np.outer(fine, times))).T)
-    return np.concatenate(rows)
+        waves = np.exp(1j * np.outer(fine, times))
+        spectrum = amplitude * doublet_spectrum(fine, period) * shaped / np.pi
+        for rows, lag in zip(found, lags, strict=True):
+            rows.append(hat_weights(plant.omega, fine, (spectrum / (1 + 1j * fine * lag))[:, None] * waves).T)
+    return [np.concatenate(rows) for rows in found]
