@@ -14,7 +14,12 @@ AirframeArgument = Annotated[
         "adam0_thesis_flown, adam0_thesis_perturbed, antr, antr_thesis, px4_sih; or a TOML file."
     ),
 ]
-LogArgument = Annotated[Path, typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, CSV or MATLAB file.")]
+LogArgument = Annotated[
+    Path,
+    typer.Argument(
+        help="Flight log: PX4 ULog, ArduPilot dataflash, Crazyflie uSD or Crazyflie CSV, CSV or MATLAB file."
+    ),
+]
 GainsArgument = Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")]
 
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
