@@ -80,10 +80,7 @@ class LogVariable:
 #: The log variables. Angles are those of roll, pitch, then yaw turned from the axes of earth (z down) to those of the
 #: body (x forward, y right, z down): pitch is positive with the nose up, yaw to the right.
 LOG_VARIABLES: tuple[LogVariable, ...] = (
-    *(
-        LogVariable(f"u{axis}", "float", "", "torque of the controller, normalised, excitation included")
-        for axis in "RPY"
-    ),
+    *(LogVariable(f"u{axis}", "float", "", "torque, normalised, excitation included") for axis in "RPY"),
     *(LogVariable(f"ub{axis}", "float", "", "excitation, normalised torque") for axis in "RPY"),
     *(LogVariable(name, "float", "rad/s", "body rate") for name in "pqr"),
     *(LogVariable(f"{name}Sp", "float", "rad/s", "body rate setpoint that is flown") for name in "pqr"),
