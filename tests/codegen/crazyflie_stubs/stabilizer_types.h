@@ -5,7 +5,9 @@
 #include <stdint.h>
 
 #define RATE_MAIN_LOOP 1000
+#ifndef ATTITUDE_RATE
 #define ATTITUDE_RATE 500
+#endif
 #define POSITION_RATE 100
 #define RATE_DO_EXECUTE(RATE_HZ, TICK) ((TICK % (RATE_MAIN_LOOP / RATE_HZ)) == 0)
 
