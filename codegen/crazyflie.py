@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.literals import float_literal
-from mimopilot.tuning.crazyflie_names import GROUP, LOG_VARIABLES, State, crazyflie_name, crazyflie_parameters
+from mimopilot.tuning.crazyflie_names import (
+    CRAZYFLIE_ENABLE,
+    GROUP,
+    LOG_VARIABLES,
+    SETTINGS,
+    ControllerState,
+    crazyflie_name,
+    crazyflie_parameters,
+)
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameter_row import Parameter
 from mimopilot.tuning.parameters import IDENTITY, Setting
@@ -53,7 +61,10 @@ def crazyflie_context(gains: Gains) -> dict[str, Any]:
     return {
         "crazyflie_group": GROUP,
         "crazyflie_parameters": [_member(one, values) for one in crazyflie_parameters()],
-        "crazyflie_states": list(State),
+        "crazyflie_excitation": [
+            replace(one, name=crazyflie_name(one.name)) for one in SETTINGS if one != CRAZYFLIE_ENABLE
+        ],
+        "crazyflie_states": list(ControllerState),
         "log_variables": LOG_VARIABLES,
         "moment_scale": [float_literal(value) for value in gains.moment_scale],
     }

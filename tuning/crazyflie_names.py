@@ -2,7 +2,7 @@
 
 All parameters are floats, those that are fixed in the firmware (``mimo.TS``, ``mimo.SCALE_*``) are read-only, and
 the others persistent. A Crazyflie flies only a set that it has taken as a whole: it reads them when it starts, and each
-time ``mimo.EN`` goes from 0 to 1 on the ground (`State`).
+time ``mimo.EN`` goes from 0 to 1 on the ground (`ControllerState`).
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ CRAZYFLIE_ENABLE = replace(
     ENABLE, maximum=1, description="1: this controller flies; 0: the stock PID; taken on the ground"
 )
 SETTINGS: tuple[Setting, ...] = (*(one for one in EXCITATION if one.name != _WITHOUT), CRAZYFLIE_ENABLE)
-#: Read-only parameter with the `State`, as an integer of one byte.
+#: Read-only parameter with the `ControllerState`, as an integer of one byte.
 STATE = f"{GROUP}.STATE"
 
 
-class State(IntEnum):
+class ControllerState(IntEnum):
     """What a Crazyflie does with the parameters; its read-only parameter and log variable."""
 
     STOCK = 0  # EN is 0: the stock PID flies
@@ -80,7 +80,10 @@ class LogVariable:
 #: The log variables. Angles are those of roll, pitch, then yaw turned from the axes of earth (z down) to those of the
 #: body (x forward, y right, z down): pitch is positive with the nose up, yaw to the right.
 LOG_VARIABLES: tuple[LogVariable, ...] = (
-    *(LogVariable(f"u{axis}", "float", "", "torque, normalised, excitation included") for axis in "RPY"),
+    *(
+        LogVariable(f"u{axis}", "float", "", "torque of the controller, normalised, excitation included")
+        for axis in "RPY"
+    ),
     *(LogVariable(f"ub{axis}", "float", "", "excitation, normalised torque") for axis in "RPY"),
     *(LogVariable(name, "float", "rad/s", "body rate") for name in "pqr"),
     *(LogVariable(f"{name}Sp", "float", "rad/s", "body rate setpoint that is flown") for name in "pqr"),

@@ -20,7 +20,7 @@ from mimopilot.tuning.crazyflie_names import (
     LOG_VARIABLES,
     NAME_LENGTH,
     STATE,
-    State,
+    ControllerState,
     crazyflie_name,
     crazyflie_parameters,
 )
@@ -234,7 +234,7 @@ def test_torque_that_the_motors_cannot_give_is_noticed_and_does_not_wind_up(host
 
 def state(host):
     assert host.parameters[STATE.split(".")[1]][1][0] == host.log("state")
-    return State(int(host.log("state")))
+    return ControllerState(int(host.log("state")))
 
 
 def torque_against_a_roll_rate(host):
@@ -248,21 +248,21 @@ def test_the_firmwares_pid_flies_while_the_controller_is_off(host):
     host.start()
     host.setpoint.thrust = 32767.5
     control = host.run(20)
-    assert state(host) is State.STOCK and host.firmware.pid_calls == 20 and control.controlMode == 0
+    assert state(host) is ControllerState.STOCK and host.firmware.pid_calls == 20 and control.controlMode == 0
 
 
 def test_a_set_written_while_it_flies_is_taken_as_a_whole_only_by_switching_it_off_and_on_on_the_ground(host):
     before = torque_against_a_roll_rate(host)
     host.write(RP_RR=0.3)
-    assert (host.run(), state(host))[1] is State.CHANGED
+    assert (host.run(), state(host))[1] is ControllerState.CHANGED
     host.write(EN=0.0)
-    assert (host.run(), state(host))[1] is State.WAITING and host.firmware.pid_calls == 0
+    assert (host.run(), state(host))[1] is ControllerState.WAITING and host.firmware.pid_calls == 0
     host.write(EN=1.0)
-    assert (host.run(), state(host))[1] is State.WAITING
+    assert (host.run(), state(host))[1] is ControllerState.WAITING
     assert torque_against_a_roll_rate(host) == pytest.approx(before, rel=0.2)
     host.setpoint.thrust = 0.0
     host.firmware.flying = False
-    assert (host.run(), state(host))[1] is State.FLIES
+    assert (host.run(), state(host))[1] is ControllerState.FLIES
     host.setpoint.thrust = 32767.5
     host.firmware.flying = True
     assert torque_against_a_roll_rate(host) == pytest.approx(2 * before, rel=0.2)
@@ -272,21 +272,23 @@ def test_a_set_written_while_it_flies_is_taken_as_a_whole_only_by_switching_it_o
 def test_a_refused_set_keeps_the_old_gains_and_tells_which_parameter(host, bad, place):
     before = torque_against_a_roll_rate(host)
     host.take_off(**bad, RP_RR=0.3)
-    assert torque_against_a_roll_rate(host) == before and state(host) is State.REFUSED
+    assert torque_against_a_roll_rate(host) == before and state(host) is ControllerState.REFUSED
     assert [one.name for one in PARAMETERS][int(host.log("refused")) - 1] == place
 
 
 def test_a_stored_set_flies_from_the_start(host):
     before = torque_against_a_roll_rate(host)
     host.take_off(RP_RR=0.3)
-    assert torque_against_a_roll_rate(host) == pytest.approx(2 * before, rel=0.2) and state(host) is State.FLIES
+    assert (
+        torque_against_a_roll_rate(host) == pytest.approx(2 * before, rel=0.2) and state(host) is ControllerState.FLIES
+    )
 
 
 def test_gains_for_another_period_are_refused_without_any_torque(built, tmp_path):
     host = Host(GAINS, tmp_path, attitude_rate=250, like=built)
     assert not host.lib.controllerOutOfTreeTest()
     host.take_off()
-    assert state(host) is State.WRONG_PERIOD and host.firmware.pid_calls == 0
+    assert state(host) is ControllerState.WRONG_PERIOD and host.firmware.pid_calls == 0
     assert (host.control.thrustSi, *host.torque) == (0, 0, 0, 0)
 
 

@@ -83,9 +83,9 @@ enum MimoState {
 
 // SI units; body x forward, y right, z down.
 struct MimoLog {
-	float uR;  // torque, normalised, excitation included
-	float uP;  // torque, normalised, excitation included
-	float uY;  // torque, normalised, excitation included
+	float uR;  // torque of the controller, normalised, excitation included
+	float uP;  // torque of the controller, normalised, excitation included
+	float uY;  // torque of the controller, normalised, excitation included
 	float ubR;  // excitation, normalised torque
 	float ubP;  // excitation, normalised torque
 	float ubY;  // excitation, normalised torque
