@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
+from mimopilot.common.extras import CRAZYFLIE
 from mimopilot.sitl.crtp.packets import Packet
 from mimopilot.sitl.errors import SitlError
 
@@ -28,13 +26,18 @@ class CrtpDriver:
 
     Raises
     ------
+    Error
+        When cflib is not installed.
     SitlError
-        When cflib is not installed, or the link cannot be opened.
+        When the link cannot be opened.
     """
 
     def __init__(self, uri: str) -> None:
-        self.closed = False
-        crtp, self._packet = _cflib(uri)
+        CRAZYFLIE.need()
+        import cflib.crtp as crtp
+        from cflib.crtp.crtpstack import CRTPPacket
+
+        self.closed, self._packet = False, CRTPPacket
         if not crtp.CLASSES:
             crtp.init_drivers()
         try:
@@ -75,15 +78,3 @@ class CrtpDriver:
     def close(self) -> None:
         """Close the link."""
         self._driver.close()
-
-
-def _cflib(uri: str) -> tuple[Any, Callable[[], Any]]:
-    """The drivers of cflib, and its class of packets."""
-    try:
-        import cflib.crtp as crtp
-        from cflib.crtp.crtpstack import CRTPPacket
-    except ImportError as error:
-        raise SitlError(
-            f"--connect {uri}: a link to a Crazyflie needs cflib: pip install 'mimopilot[crazyflie]' ({error})"
-        ) from error
-    return crtp, CRTPPacket

@@ -193,8 +193,6 @@ def test_a_link_that_cannot_be_is_refused_with_what_to_do(mimopilot, monkeypatch
     (certified.parent / "key").write_bytes(bytes(32))
     signed = upload(mimopilot, certified, "--signing-key", "key")
     assert_one_clear_line(signed, "--signing-key: a Crazyflie's link cannot be signed")
-    monkeypatch.setitem(sys.modules, "cflib.crtp", None)
-    assert_one_clear_line(upload(mimopilot, certified), "needs cflib: pip install 'mimopilot[crazyflie]'")
 
 
 def test_without_a_dongle_the_message_names_it_and_cflib_is_imported_only_then(tmp_path, certified):
