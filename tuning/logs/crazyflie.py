@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from mimopilot.tuning.crazyflie_names import GROUP, ControllerState
+from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.crazyflie_file import (
     FIXED_FREQUENCY,
     LogBlock,
@@ -122,10 +123,14 @@ def record_cfclient_csv(path: Path) -> Recording:
         When the file is damaged.
     """
     block, damage = read_cfclient_csv(path)
-    blocks, beside = [block], []
+    blocks, beside, warnings = [block], [], []
     for other in sorted(path.parent.glob("*.csv")):
         if other.name != path.name and _is_csv(other):
-            found, cut = read_cfclient_csv(other)
+            try:
+                found, cut = read_cfclient_csv(other)
+            except TuningError as error:
+                warnings.append(f"a file beside it is not read: {str(error).removeprefix(f'{path.parent}/')}")
+                continue
             overlaps = found.time[0] < block.time[-1] and block.time[0] < found.time[-1]
             known = {name for one in blocks for name in one.variables}
             if overlaps and not known.intersection(found.variables):
@@ -134,7 +139,7 @@ def record_cfclient_csv(path: Path) -> Recording:
                 damage = damage or cut
     notes = [RADIO_NOTE]
     notes += [f"read with the log blocks beside it: {', '.join(one.name for one in beside)}"] if beside else []
-    warnings = [damage] if damage else []
+    warnings += [damage] if damage else []
     return _record(path, "Crazyflie CSV (cfclient)", blocks, CSV_ADVICE, notes, warnings, tuple(beside))
 
 

@@ -140,8 +140,10 @@ def test_log_blocks_of_one_connection_are_read_together(flight, tmp_path):
     assert experiment.Ts == pytest.approx(0.01)
     paths[1].write_text(paths[1].read_text().replace("mimo.ubR", "mimo.ubX"))
     assert read_log(paths[0]).sha256 != experiment.sha256
-    paths[1].unlink()
-    assert read_log(paths[0]).u_bar is None
+    paths[1].write_text(paths[1].read_text().replace("\n", "\nx", 1))
+    alone = read_log(paths[0])
+    assert alone.u_bar is None
+    assert any(f"not read: {paths[1].name}, line 2" in warning for warning in alone.warnings)
 
 
 def test_a_slow_or_incomplete_block_is_refused_with_what_to_do(flight, tmp_path):
