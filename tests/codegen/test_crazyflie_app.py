@@ -2,7 +2,7 @@
 
 import difflib
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from operator import attrgetter
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from mimopilot.tuning.crazyflie_names import (
 )
 from mimopilot.tuning.parameter_row import Parameter
 from mimopilot.tuning.parameters import PARAMETERS
+from mimopilot.tuning.spec import load_spec
 from tests.codegen.crazyflie_host import Host, compile_all, crazyflie_gains, emit
 from tests.conftest import coupled_gains
 
@@ -413,6 +414,14 @@ def test_the_app_compiles_for_the_crazyflies_processor_and_is_small(tmp_path, re
     sizes = {Path(line.split()[-1]).stem: sum(map(int, line.split()[:2])) for line in lines}
     record_property("bytes", sizes)
     assert sum(sizes.values()) <= LARGEST, sizes
+
+
+def test_the_emitted_specification_holds_what_a_log_of_the_built_in_gains_lacks(tmp_path):
+    (tmp_path / "flown.spec.toml").write_text(render(GAINS, "crazyflie")["crazyflie/flown.spec.toml"])
+    spec = load_spec(tmp_path / "flown.spec.toml")
+    assert spec.yaw is not None and spec.limits is not None
+    assert (spec.moment_scale, spec.derivative_cutoff_hz) == (GAINS.moment_scale, GAINS.filters.derivative_cutoff_hz)
+    assert spec.yaw.model_dump() == asdict(GAINS.yaw) and spec.limits.model_dump() == asdict(GAINS.limits)
 
 
 def test_the_rendered_files_match_the_golden_files(request):
