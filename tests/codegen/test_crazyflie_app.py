@@ -33,6 +33,8 @@ from tests.conftest import coupled_gains
 GAINS = crazyflie_gains()
 #: Bytes of code, constants and data of the app, the core included.
 LARGEST = 12_000
+#: Bytes of one function's stack. The firmware's stabilizer task has 1,800 for all.
+LARGEST_STACK = 256
 DEGREE = math.pi / 180
 ANGLES, SETPOINTS = ("roll", "pitch", "yaw"), ("rollSp", "pitchSp", "yawSp")
 RATES, RATE_SETPOINTS = ("p", "q", "r"), ("pSp", "qSp", "rSp")
@@ -408,12 +410,18 @@ def test_parameters_and_log_variables_are_those_of_the_table(built):
 
 def test_the_app_compiles_for_the_crazyflies_processor_and_is_small(tmp_path, record_property):
     sources, includes = emit(GAINS, tmp_path)
-    flags = [*CORTEX_M4_FLAGS, "-Os", "-fno-math-errno", "-ffunction-sections", *includes]
+    flags = [*CORTEX_M4_FLAGS, "-Os", "-fno-math-errno", "-ffunction-sections", "-fstack-usage", *includes]
     objects = compile_all((cross_tool("gcc"), cross_tool("g++")), sources, flags, tmp_path)
     lines = run_tool([cross_tool("size"), *objects]).splitlines()[1:]
     sizes = {Path(line.split()[-1]).stem: sum(map(int, line.split()[:2])) for line in lines}
     record_property("bytes", sizes)
     assert sum(sizes.values()) <= LARGEST, sizes
+    stacks = {
+        line.split("\t")[0]: int(line.split("\t")[1])
+        for o in objects
+        for line in o.with_suffix(".su").read_text().splitlines()
+    }
+    assert max(stacks.values()) <= LARGEST_STACK, stacks
 
 
 def test_the_emitted_specification_holds_what_a_log_of_the_built_in_gains_lacks(tmp_path):

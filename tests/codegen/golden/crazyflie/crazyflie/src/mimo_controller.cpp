@@ -174,8 +174,13 @@ void log()
 
 extern "C" void controllerOutOfTreeInit(void)
 {
-	controllerPidInit();
-	flight = Controller{};
+	controllerPidInit();  // members one by one: the firmware's stack has no room for two of the whole
+	flight.input = Input{};
+	flight.setpoint = Setpoint{};
+	flight.excitation = Excitation{};
+	flight.flies = false;
+	memset(&flight.output, 0, sizeof(flight.output));
+	memset(flight.excited, 0, sizeof(flight.excited));
 	flight.take.start(initialise(flight.state, kGains) && kPeriodKept);
 	log();
 }
