@@ -14,6 +14,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from mimopilot.codegen.crazyflie import crazyflie_context
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
 from mimopilot.codegen.literals import float_literal
@@ -83,6 +84,8 @@ def render(gains: Gains, target: str = "native", **options: str) -> dict[str, st
         loader=jinja2.FileSystemLoader(TEMPLATES),
     )
     context = _context(gains, kind) | chosen
+    if "crazyflie" in kind.folders:
+        context |= crazyflie_context(gains)
     files: dict[str, str] = {}
     for folder in kind.folders:
         for path in sorted((TEMPLATES / folder).rglob("*")):

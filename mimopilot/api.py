@@ -613,7 +613,8 @@ def upload(
     ----------
     gains : str, Path or Gains
     connect : str
-        ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
+        ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``DEVICE,BAUD``; of a Crazyflie
+        ``radio://0/80/2M`` or ``usb://0``.
     profile : str
         Controller that the gains are for: ``mimo``, our module, ``px4-stock`` or ``ardupilot-stock``.
     moment_scale : tuple of 3 float (N m), or ``flown``, optional

@@ -24,6 +24,7 @@ LAYERS = (
     "mimopilot.sitl.autopilot",
     "mimopilot.sitl.faults",
     "mimopilot.sitl.flight",
+    "mimopilot.sitl.crtp",
     "mimopilot.sitl.mavlink",
     "mimopilot.sitl.mavlink.wire",
     "mimopilot.sitl.mavlink.simulator_api",

@@ -51,6 +51,7 @@ MISSING = {
     ),
     "pyarrow": ("campaign adam0 --out x",),
     "unicorn": ("pil my.gains.toml",),
+    "cflib": ("params --connect usb://0",),
 }
 
 

@@ -21,12 +21,15 @@ AirframeArgument = Annotated[
     str,
     typer.Argument(
         help="Airframe: adam0, adam0_boom, adam0_flexible, adam0_nominal, adam0_perturbed, adam0_thesis, "
-        "adam0_thesis_flown, adam0_thesis_perturbed, antr, antr_thesis, px4_sih; or a TOML file."
+        "adam0_thesis_flown, adam0_thesis_perturbed, antr, antr_thesis, cf2, cf2_brushless, px4_sih; or a TOML file."
     ),
 ]
 LogArgument = Annotated[
     Path,
-    typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, Betaflight blackbox (CSV), CSV or MATLAB file."),
+    typer.Argument(
+        help="Flight log: PX4 ULog, ArduPilot dataflash, Betaflight blackbox (CSV), Crazyflie uSD or Crazyflie CSV, "
+        "CSV or MATLAB file."
+    ),
 ]
 GainsArgument = Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")]
 

@@ -24,7 +24,12 @@ if TYPE_CHECKING:
     from mimopilot.tuning.logs.imported_gains import ImportedGains
 
 ConnectOption = Annotated[
-    str, typer.Option("--connect", help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyACM0,57600.")
+    str,
+    typer.Option(
+        "--connect",
+        help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or /dev/ttyACM0,57600; for upload, restore and params "
+        "also a Crazyflie's radio://0/80/2M or usb://0.",
+    ),
 ]
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only read and compare.")]
 ForceArmedOption = Annotated[

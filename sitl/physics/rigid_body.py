@@ -16,7 +16,7 @@ from mimopilot.sitl.physics.compiled_step import compiled, inlined
 
 GRAVITY = 9.80665  # m/s^2, standard gravity
 RUNGE_KUTTA_STEP = 1e-3  # s; chosen: a step of 0.1 ms moves half a second of flight by less than 1e-6 (m, m/s, rad/s)
-COMMAND_HISTORY = 256  # control periods of motor commands that are kept: about 1 s at 250 Hz; faults may delay by half
+COMMAND_HISTORY = 512  # control periods of motor commands that are kept: 1 s at 500 Hz; faults may delay by half
 MAX_ROTORS = 16  # HIL_ACTUATOR_CONTROLS carries 16 controls
 
 POSITION, QUATERNION, ROTORS = 0, 6, 13

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.crazyflie_file import is_cfclient_csv, is_usd_log
 
 #: Bytes at the beginning of a file from which its format is detected: enough for the header line of a CSV file.
 HEAD_BYTES = 4096
@@ -92,6 +93,22 @@ FORMATS = (
         "betaflight/blackbox-tools, src/blackbox_decode.c; betaflight/blackbox-log-viewer, src/csv-exporter.js",
     ),
     LogFormat(
+        "Crazyflie uSD",
+        (),  # the deck names its files log00, log01, ...
+        is_usd_log,
+        "mimopilot.tuning.logs.crazyflie:record_usd",
+        False,
+        "crazyflie-firmware, src/deck/drivers/src/usddeck.c: versions 1 and 2",
+    ),
+    LogFormat(
+        "Crazyflie CSV",
+        (".csv",),
+        is_cfclient_csv,
+        "mimopilot.tuning.logs.crazyflie:record_cfclient_csv",
+        False,
+        "cfclient, docs/userguides/userguide_client/logblocks_tab.md",
+    ),
+    LogFormat(
         "CSV",
         (".csv",),
         _is_delimited_text,
@@ -114,7 +131,7 @@ SUFFIXES = tuple(dict.fromkeys(suffix for row in FORMATS for suffix in row.suffi
 
 def known_formats() -> str:
     """All formats with their file endings, for messages and help texts."""
-    return ", ".join(f"{row.name} ({', '.join(row.suffixes)})" for row in FORMATS)
+    return ", ".join(f"{row.name} ({', '.join(row.suffixes) or 'no ending'})" for row in FORMATS)
 
 
 def log_format(path: Path) -> tuple[LogFormat | None, bytes]:

@@ -135,7 +135,7 @@ def _experiment(recording: Recording, warnings: list[str]) -> Experiment:
         Ts=grid.Ts,
         segments=grid.segments,
         source=recording.path.name,
-        sha256=sha256(recording.path.read_bytes()),
+        sha256=sha256(b"".join(path.read_bytes() for path in (recording.path, *recording.beside))),
         flown=flown_gains(parameters, grid.Ts),
         motors=motors,
         amplitude=_amplitude(recording, for_yaw),

@@ -90,6 +90,8 @@ class Recording:
         First and last time in the log, for a log without signals. None: not known.
     columns : Columns or None
         Columns of a table. None: the log names its signals itself.
+    beside : tuple of Path
+        Further files of the same log, read with it.
     """
 
     path: Path
@@ -110,6 +112,7 @@ class Recording:
     published: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     span: Interval | None = None
     columns: Columns | None = None
+    beside: tuple[Path, ...] = ()
 
     def __post_init__(self) -> None:
         signals, warnings = {}, [*self.warnings]

@@ -63,7 +63,10 @@ LOGGING = mavlink.MAV_SYS_STATUS_LOGGING
 EXCITATION, PHASES = ("MIMO_EXC", "MIMO_EXY"), (-1, 0, 1, 2, 3)
 #: SET_ATTITUDE_TARGET.type_mask: ignore the body rates.
 RATES_IGNORED = 7
-FORMS = "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or DEVICE,BAUD such as /dev/ttyACM0,57600"
+FORMS = (
+    "expected udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, DEVICE,BAUD such as /dev/ttyACM0,57600, or for a "
+    "Crazyflie radio://0/80/2M or usb://0"
+)
 #: Timeout of connecting and of a blocking write, s; chosen.
 CONNECT_S = 5.0
 #: Addresses remembered on a UDP link; chosen above the size of any network of vehicles and routers.

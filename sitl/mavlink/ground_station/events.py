@@ -28,16 +28,18 @@ ACCEPTED, DENIED, FAILED, IN_PROGRESS = 0, 2, 4, 5
 HEARTBEAT = 0
 #: MAV_AUTOPILOT_ARDUPILOTMEGA.
 ARDUPILOT = 3
-#: MAV_TYPE_GENERIC.
-GENERIC = 0
+#: MAV_TYPE_GENERIC, MAV_TYPE_QUADROTOR.
+GENERIC, QUADROTOR = 0, 2
+#: In place of a MAV_AUTOPILOT: a Crazyflie, which speaks CRTP.
+CRAZYFLIE = -1
 #: MAV_PARAM_ERROR of PARAM_ERROR, and its text.
-DOES_NOT_EXIST = 1
+DOES_NOT_EXIST, READ_ONLY = 1, 5
 REASONS = {
     DOES_NOT_EXIST: "it does not exist",
     2: "value out of its range",
     3: "permission denied",
     4: "component not found",
-    5: "read only",
+    READ_ONLY: "read only",
     6: "type not supported",
     7: "wrong type",
     8: "it could not be read",
@@ -354,7 +356,9 @@ Exchange = Generator[SendAndWait, LinkEvent, T]
 class Link(Protocol):
     """Carries an exchange."""
 
-    closed: bool
+    @property
+    def closed(self) -> bool:
+        """Whether it is closed for good."""
 
     def now(self) -> float:
         """Monotonic time, s."""

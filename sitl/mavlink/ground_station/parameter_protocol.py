@@ -12,6 +12,7 @@ from typing import NamedTuple
 from mimopilot.sitl.mavlink.ground_station.events import (
     ACCEPTED,
     ARDUPILOT,
+    CRAZYFLIE,
     DENIED,
     DOES_NOT_EXIST,
     FAILED,
@@ -220,7 +221,8 @@ class ParameterClient(VehicleLinkState):
     def store(self) -> Exchange[str]:
         """Command the vehicle to save its parameters, but for ArduPilot, which saves each when it is set.
 
-        ArduPilot denies the command (GCS_Common.cpp: only its erasing of all parameters is accepted).
+        ArduPilot denies the command (GCS_Common.cpp: only its erasing of all parameters is accepted). A Crazyflie saves
+        nothing by itself, and one parameter after the other.
 
         Returns
         -------
@@ -232,7 +234,8 @@ class ParameterClient(VehicleLinkState):
         if self.vehicle.autopilot == ARDUPILOT:
             self._changed_at = self.now
             return "autosave"
-        due, deadline, result = self.now, self.now + AUTOSAVE_S, IN_PROGRESS
+        alone = self.vehicle.autopilot != CRAZYFLIE
+        due, deadline, result = self.now, self.now + (AUTOSAVE_S if alone else self.timeout), IN_PROGRESS
         while self.now < deadline and not self.closed and result == IN_PROGRESS:
             send: list[Outgoing] = []
             if self.now >= due:
@@ -241,7 +244,7 @@ class ParameterClient(VehicleLinkState):
             for message in (yield from self.send_and_wait(send, min(due, deadline))):
                 if isinstance(message, CommandAck) and message.command == STORAGE_COMMAND:
                     result = message.result
-        return "" if self.closed else STORAGE_RESULTS.get(result, "autosave")
+        return "" if self.closed else STORAGE_RESULTS.get(result, "autosave" if alone else "failed")
 
     def wait_for_autosave(self, keep_going: bool = False) -> Exchange[str]:
         """Wait until the vehicle has saved its changes by itself, and for a HEARTBEAT after that.

@@ -37,7 +37,7 @@ def compare(file: Path, options: LinkOptions) -> None:
     """
     plan = make_plan(load_gains(file))
     wanted = plan.values | plan.fixed
-    with open_session(options) as vehicle:
+    with open_session(options, crazyflie=True) as vehicle:
         held = vehicle.read(list(wanted))
     differ = [name for name, value in wanted.items() if held[name] != value]
     if options.as_json:
@@ -81,7 +81,7 @@ def export(file: Path | None, options: LinkOptions, form: str, out: Path | None,
     elif form in from_gains:
         raise SitlError(f"--format {form}: needs a gains file; a vehicle cannot be written in this format")
     else:
-        with open_session(options) as vehicle:
+        with open_session(options, crazyflie=True) as vehicle:
             held = vehicle.read([p.name for p in PARAMETERS if p.writable])
         text = parameter_text(form, held, vehicle.vehicle.system, vehicle.vehicle.component)
     if out is None:

@@ -13,6 +13,7 @@ from typing import Any
 from mimopilot.common.console import progress_console
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.connection import Connection
+from mimopilot.sitl.mavlink.ground_station.crazyflie_link import CrazyflieLink
 from mimopilot.sitl.mavlink.ground_station.events import Exchange, Heartbeat, T, run_exchange
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import NoParametersError, read_values
@@ -49,8 +50,17 @@ class LinkOptions:
     stem: Path = Path("vehicle")
 
 
-def open_link(options: LinkOptions) -> Connection:
-    """Open the link of the options."""
+def open_link(options: LinkOptions, crazyflie: bool = False) -> Connection | CrazyflieLink:
+    """Open the link of the options; `crazyflie`: it may be one of CRTP."""
+    if "://" in options.connect:
+        if not crazyflie:
+            raise SitlError(
+                f"--connect {options.connect}: only upload, restore and params speak to a Crazyflie; start its "
+                "experiment with mimo.EX_AX and log it on the uSD deck (docs/crazyflie.md)"
+            )
+        if options.signing_key is not None:
+            raise SitlError("--signing-key: a Crazyflie's link cannot be signed; leave it out")
+        return CrazyflieLink(options.connect)
     return Connection(options.connect, read_key(options.signing_key) if options.signing_key else None)
 
 
@@ -61,6 +71,8 @@ class LinkSession:
     ----------
     options : LinkOptions
         How to reach the vehicle.
+    crazyflie : bool
+        It may be a Crazyflie.
 
     Attributes
     ----------
@@ -71,9 +83,9 @@ class LinkSession:
     client: VehicleLinkState
     heeds_interrupts = True
 
-    def __init__(self, options: LinkOptions) -> None:
+    def __init__(self, options: LinkOptions, crazyflie: bool = False) -> None:
         self.options = options
-        self.link = open_link(options)
+        self.link = open_link(options, crazyflie)
         self.tries = max(1, round(options.timeout / TRY_S))
 
     def run(self, exchange: Exchange[T]) -> T:
@@ -118,12 +130,14 @@ class Session(LinkSession):
         How to reach it.
     integers : collection of str
         Names of parameters that may be INT32.
+    crazyflie : bool
+        It may be a Crazyflie.
     """
 
     client: ParameterClient
 
-    def __init__(self, options: LinkOptions, integers: Collection[str] = ()) -> None:
-        super().__init__(options)
+    def __init__(self, options: LinkOptions, integers: Collection[str] = (), crazyflie: bool = False) -> None:
+        super().__init__(options, crazyflie)
         self.integers = integers
         self.client = self._new_client()
 
@@ -169,9 +183,9 @@ class Session(LinkSession):
 
 
 @contextmanager
-def open_session(options: LinkOptions, integers: Collection[str] = ()) -> Iterator[Session]:
-    """Open a link and close it again."""
-    opened = Session(options, integers)
+def open_session(options: LinkOptions, integers: Collection[str] = (), crazyflie: bool = False) -> Iterator[Session]:
+    """Open a link and close it again; `crazyflie`: the vehicle may be one."""
+    opened = Session(options, integers, crazyflie)
     try:
         yield opened
     finally:

@@ -13,11 +13,13 @@ from mimopilot.sitl.mavlink.ground_station.events import Heartbeat
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S
 from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, violated_range
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
-from mimopilot.sitl.mavlink.ground_station.upload import UploadOutcome, write_and_verify
+from mimopilot.sitl.mavlink.ground_station.set_switch import SWITCHES
+from mimopilot.sitl.mavlink.ground_station.upload import UploadOutcome, read_values, write_and_verify
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.gains import Gains, Triple
+from mimopilot.tuning.law_terms import MIMO
 
 STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",
@@ -130,8 +132,11 @@ def upload_and_verify(
             "a stock vehicle does not publish how many N m one unit of its torque is; give --moment-scale "
             "ROLL,PITCH,YAW, or --moment-scale flown if the gains come from a log of this vehicle"
         )
-    with open_session(options, plan.integers) as vehicle:
+    with open_session(options, plan.integers, crazyflie=True) as vehicle:
         held = vehicle.read([*plan.values, *plan.fixed, *(plan.scale if ask_scale else ())], plan.profile)
+        switch = SWITCHES.get(vehicle.vehicle.autopilot)
+        if switch is not None and plan.profile == MIMO:
+            held |= vehicle.run(read_values(vehicle.client, [switch.enable]))
         _check_vehicle(plan, held, vehicle, options)
         if ask_scale and gains is not None:
             check_moment_scale(gains, [held[name] for name in plan.scale], "the vehicle")
@@ -153,7 +158,7 @@ def upload_and_verify(
             snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
             if snapshot is not None and dialogue is not None:
                 dialogue.saved(snapshot)
-            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held))
+            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch))
         return Upload(plan, held, vehicle.vehicle, outcome, snapshot, options.connect)
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Exchange
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Answer, ParameterClient
+from mimopilot.sitl.mavlink.ground_station.set_switch import SetSwitch, state_after
 from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import FRESH_S
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 
@@ -70,7 +71,11 @@ def read_values(client: ParameterClient, names: Sequence[str]) -> Exchange[dict[
 
 
 def write_and_verify(
-    client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float], store: bool = True
+    client: ParameterClient,
+    new: Mapping[str, float],
+    old: Mapping[str, float],
+    store: bool = True,
+    switch: SetSwitch | None = None,
 ) -> Exchange[UploadOutcome]:
     """Write the differences, verify all, store, verify all again; on any failure roll back.
 
@@ -84,27 +89,56 @@ def write_and_verify(
         Name -> value on the vehicle, for at least the same names; names that are not in `new` must not change.
     store : bool
         False: the values are for this flight only; do not store, verify once.
+    switch : SetSwitch, optional
+        Of a vehicle that takes a set as a whole; `old` has its value.
     """
     expected = {**old, **new}
+    if all(expected[name] == old[name] for name in old):
+        switch = None
     client.possible = {name: {value} for name, value in old.items()}
     client.check_contradictions(True)
     storage = ""
-    reason = yield from _write(client, new, old)
+    reason = "" if switch is None else (yield from _switch_off(client, switch, store))
     if not reason:
-        reason = yield from _verify(client, expected)
+        reason = yield from _write(client, new, old)
+    if not reason:
+        reason = yield from _verify(client, expected if switch is None else expected | {switch.enable: 0.0})
+    if not reason and switch is not None:
+        reason = yield from _switch_back(client, switch, old[switch.enable])
     if not reason and store:
         storage = yield from client.store()
         reason = (yield from client.wait_for_autosave()) or (yield from _verify(client, expected))
     state = "verified"
     if reason:
-        state, storage = yield from _roll_back(client, new, old, store)
+        state, storage = yield from _roll_back(client, new, old, store, switch)
     client.check_contradictions(False)
     held = {name: tuple(sorted(values)) for name, values in client.possible.items()}
     return UploadOutcome(state, reason, held, storage, client.was_armed)
 
 
+def _switch_off(client: ParameterClient, switch: SetSwitch, store: bool) -> Exchange[str]:
+    """Switch the set off, stored: a vehicle that restarts then flies no part of one. Returns why that failed."""
+    reason = yield from _write(client, {switch.enable: 0.0}, {switch.enable: 1.0})
+    if not reason:
+        reason = yield from _verify(client, {switch.enable: 0.0})
+    if not reason and store and (yield from client.store()) != "acknowledged":
+        reason = f"{switch.enable}: 0 was not stored"
+    return reason
+
+
+def _switch_back(client: ParameterClient, switch: SetSwitch, value: float, keep_going: bool = False) -> Exchange[str]:
+    """Switch as before, and see that the vehicle takes the set. Returns why it does not."""
+    answers = yield from client.write({switch.enable: value}, "switching", keep_going=keep_going)
+    yield from client.wait_until_quiet()
+    return _problem(answers) or (yield from state_after(client, switch, value))
+
+
 def _roll_back(
-    client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float], store: bool
+    client: ParameterClient,
+    new: Mapping[str, float],
+    old: Mapping[str, float],
+    store: bool,
+    switch: SetSwitch | None,
 ) -> Exchange[tuple[str, str]]:
     """Write the old values back; returns the state of the upload and of the storage."""
     if not client.written:
@@ -112,9 +146,14 @@ def _roll_back(
     client.check_contradictions(True)
     yield from client.wait_until_quiet()
     back = {name: old[name] for name in new if name in client.written or client.possible[name] != {old[name]}}
+    if switch is not None:
+        yield from client.write({switch.enable: 0.0}, "switching", keep_going=True)
     yield from client.write(back, "rolling back", keep_going=True)
     if client.lost:
         return "mixed", ""
+    refused = ""
+    if switch is not None:
+        refused = yield from _switch_back(client, switch, old[switch.enable], keep_going=True)
     yield from client.wait_until_quiet()
     storage = ""
     if store:
@@ -122,7 +161,7 @@ def _roll_back(
         yield from client.wait_for_autosave(keep_going=True)
     answers = yield from client.read(list(old), "verifying", keep_going=True)
     restored = all(answers[name].value == old[name] and client.possible[name] == {old[name]} for name in old)
-    return "rolled back" if restored else "mixed", storage
+    return "rolled back" if restored and not refused else "mixed", storage
 
 
 def _write(client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float]) -> Exchange[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import GENERIC, Heartbeat
+from mimopilot.sitl.mavlink.ground_station.events import CRAZYFLIE, GENERIC, Heartbeat
 
 #: MAV_TYPE flown by a multirotor's rate controller; VTOLs in hover included.
 MULTIROTORS = frozenset(
@@ -26,9 +26,10 @@ AUTOPILOTS: dict[int, tuple[str, tuple[str, ...]]] = {
     mavlink.MAV_AUTOPILOT_GENERIC: ("generic autopilot", ("mimo",)),
     mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ("ArduPilot", ("ardupilot-stock",)),
     mavlink.MAV_AUTOPILOT_PX4: ("PX4", ("px4-stock", "mimo")),
+    CRAZYFLIE: ("Crazyflie firmware", ("mimo",)),
 }
 #: MAV_AUTOPILOT that can run our module -> a parameter of its own controller, in every version.
-STOCK_PARAMETERS = {mavlink.MAV_AUTOPILOT_PX4: "MC_ROLL_P"}
+STOCK_PARAMETERS = {mavlink.MAV_AUTOPILOT_PX4: "MC_ROLL_P", CRAZYFLIE: "stabilizer.controller"}
 #: MAV_TYPE -> the usual name, where MAVLink's differs.
 USUAL_NAMES = {
     mavlink.MAV_TYPE_GENERIC: "vehicle",
@@ -79,7 +80,9 @@ def check_kind(vehicle: Heartbeat, profile: str) -> None:
 
 def describe_missing_module(vehicle: Heartbeat) -> str:
     """Message for an autopilot that could run our module, but runs only its stock controllers."""
+    fitting = [name for name in AUTOPILOTS[vehicle.autopilot][1] if name != "mimo"]
+    other = f"the profile that fits is {' or '.join(fitting)}; " if fitting else ""
     return (
-        f"the vehicle is {describe(vehicle)} and its stock controllers, and has none of our parameters; the profile "
-        f"that fits is {AUTOPILOTS[vehicle.autopilot][1][0]}; for mimo, flash the firmware of `mimopilot generate`"
+        f"the vehicle is {describe(vehicle)} and its stock controllers, and has none of our parameters; {other}for "
+        "mimo, flash the firmware of `mimopilot generate`"
     )

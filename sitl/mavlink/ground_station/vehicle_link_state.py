@@ -124,6 +124,11 @@ class VehicleLinkState:
         elif self._agreed is not None:
             self._agreed.pop(name, None)
 
+    def forget(self, name: str) -> None:
+        """Forget what was read of a parameter that the vehicle changes by itself."""
+        self._set_agreed(name, None)
+        self.possible.pop(name, None)
+
     def resume(self, now: float) -> None:
         """Continue after a pause without receiving: writing waits for a new HEARTBEAT."""
         self.now = self._heard_at = now

@@ -129,7 +129,6 @@ WRONG = {
     "gyro-bias=nan@1": ("size", "finite"),
     "gyro-stuck=1@1": ("takes no size",),
     "delay:3=0.01@1": ("takes no target",),
-    "delay=0.9@1": ("at most 0.504 s",),
     "gain:Kp=2@1": ("matrix",),
     "gain:Kp_o=8@1": ("MIMO_AP_RR would be 52", "0.01 to 50"),
     "skip=3@1+1": ("takes no duration",),

@@ -22,7 +22,7 @@ TS = 0.004
 
 KNOWN = [
     *("adam0", "adam0_boom", "adam0_flexible", "adam0_nominal", "adam0_perturbed", "adam0_thesis"),
-    *("adam0_thesis_flown", "adam0_thesis_perturbed", "antr", "antr_thesis", "px4_sih"),
+    *("adam0_thesis_flown", "adam0_thesis_perturbed", "antr", "antr_thesis", "cf2", "cf2_brushless", "px4_sih"),
 ]
 
 

@@ -35,11 +35,13 @@ def test_a_file_matches_one_format_at_most():
         b"\xa3\x95\x80",
         b"MATLAB 5.0 MAT-file, Platform\x00",
         b"loopIteration, time (us), axisP[0]\n0, 1, 2\n",
+        b"\xbc\x02\0\x01\0\xff\xff",
+        b"Timestamp,gyro.x,gyro.y\n10,1,2\n",
         b"t,p,q\n0,1,2\n",
     )
     for head, row in zip(heads, FORMATS, strict=True):
         first = next(one for one in FORMATS if one.matches(head))
         assert first == row
-        # Of decoded blackbox logs, which are CSV files, too, the names of the columns are known.
+        # Of decoded blackbox logs and of cfclient's, which are CSV files, too, the names of the columns are known.
         others = [one.name for one in FORMATS if one.matches(head) and one != row]
-        assert others == (["CSV"] if row.name == "Betaflight blackbox" else [])
+        assert others == (["CSV"] if row.name in ("Betaflight blackbox", "Crazyflie CSV") else [])

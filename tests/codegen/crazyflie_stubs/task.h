@@ -1,0 +1,3 @@
+#pragma once
+
+void vTaskDelay(uint32_t ticks);
