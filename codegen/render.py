@@ -14,6 +14,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from mimopilot.codegen import ardupilot
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
 from mimopilot.codegen.literals import float_literal
@@ -118,6 +119,7 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
         "excitation_settings": EXCITATION,
         "settings": (*EXCITATION, ENABLE),
         "px4_parameters": entries(gains),
+        "ardupilot": ardupilot.context(gains),
         "literal": literal,
         "rows": ROWS,
         "offset": offset,
