@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from mimopilot.codegen.errors import CodegenError
-from mimopilot.common.toml import read_toml
+
+if TYPE_CHECKING:  # the command line reads the table for its help and must start fast
+    from mimopilot.tuning.gains import Gains
 
 TEMPLATES = Path(__file__).resolve().parent.parent / "firmware_templates"
 DESCRIPTION = "target.toml"
+#: Largest relative difference of the vehicle's control rate from that of the gains with which emitted code takes over.
+RATE_TOLERANCE = 0.05
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,10 @@ class Target:
         Its texts in the README of the tree; may be empty.
     options : mapping
         Option -> values, the default first.
+    rates : tuple of float
+        Control rates that the vehicle can run, Hz; empty: any.
+    rate_source : str
+        What sets the rate on the vehicle.
     """
 
     name: str
@@ -41,6 +51,23 @@ class Target:
     contents: str = ""
     usage: str = ""
     options: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    rates: tuple[float, ...] = ()
+    rate_source: str = ""
+
+    def rate(self, gains: Gains) -> float:
+        """The vehicle's control rate that is nearest to that of the gains, Hz."""
+        return min(self.rates, key=lambda hertz: abs(1 / gains.Ts / hertz - 1), default=1 / gains.Ts)
+
+    def rate_warning(self, gains: Gains) -> str:
+        """What to do about gains for a rate that the vehicle does not run; empty if it does."""
+        rate, nearest = 1 / gains.Ts, self.rate(gains)
+        if abs(rate / nearest - 1) <= RATE_TOLERANCE:
+            return ""
+        return (
+            f"Ts: the gains are for {rate:.4g} Hz, but {self.name} runs the controller at {self.rate_source}, "
+            f"{', '.join(f'{hertz:g}' for hertz in self.rates)} Hz, and the emitted code refuses to start; carry the "
+            f"gains to that rate: mimopilot certify LOG --gains FILE --rate {nearest:g}"
+        )
 
     def chosen(self, options: Mapping[str, str]) -> dict[str, str]:
         """Value of every option; the default if it is not given.
@@ -65,12 +92,13 @@ def targets() -> dict[str, Target]:
     """All targets, by name."""
     found: dict[str, Target] = {}
     for path in sorted(TEMPLATES.glob(f"*/{DESCRIPTION}")):
-        table = read_toml(path, "target")
         try:
+            table = tomllib.loads(path.read_text())
             folders, options = tuple(table.pop("folders")), table.pop("options", {})
+            rates = tuple(table.pop("rates", ()))
             choices = {name: tuple(values) for name, values in options.items()}
-            target = Target(**table, folders=folders, folder=path.parent.name, options=choices)
-        except (KeyError, TypeError) as error:
+            target = Target(**table, folders=folders, folder=path.parent.name, options=choices, rates=rates)
+        except (KeyError, TypeError, tomllib.TOMLDecodeError) as error:
             raise CodegenError(f"{path}: not a target: {error}; expected the entries of `Target`") from error
         if target.name in found:
             other = found[target.name].folder

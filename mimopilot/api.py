@@ -357,13 +357,13 @@ class GeneratedTree(NamedTuple):
         All files of the tree, also those that were up to date.
     written : list of Path
         Those that were written.
-    warning : str
-        What is doubtful about the stability of the gains; empty: nothing.
+    warnings : list of str
+        What is doubtful about the stability of the gains, and a control rate that is not the target's.
     """
 
     files: list[Path]
     written: list[Path]
-    warning: str
+    warnings: list[str]
 
 
 def generate(
@@ -383,7 +383,8 @@ def generate(
     out : str or Path
         Folder to write to.
     target : str
-        Name of a target, see `codegen.targets`: ``native``, ``px4``, ``cortex-m4``.
+        Name of a target, `codegen.targets.targets`: ``native``, ``px4``, ``cortex-m4`` ...
+        Gains for another control rate than the target's are emitted with a warning.
     force : bool
         Overwrite files that mimopilot did not generate.
     uncertified : bool
@@ -398,19 +399,20 @@ def generate(
     Raises
     ------
     Error
-        When the target or an option is unknown, a gain is out of its range, the gains are not certified, or are
-        for a control rate that PX4 does not have (target ``px4``), or the folder holds files of somebody else.
+        When the target or an option is unknown, a gain is out of its range, the gains are not certified, or the
+        folder holds files of somebody else.
     """
     from mimopilot.codegen.render import render, write_tree
-    from mimopilot.tuning.acceptance import check_px4_rate, check_verdict
+    from mimopilot.codegen.targets import find_target
+    from mimopilot.tuning.acceptance import check_verdict
 
-    loaded = _gains(gains)
-    warning = check_verdict(loaded, allow=uncertified)
-    if target == "px4":
-        check_px4_rate(loaded)
+    loaded, chosen = _gains(gains), find_target(target)
+    warnings = [check_verdict(loaded, allow=uncertified), chosen.rate_warning(loaded)]
     files = render(loaded, target, **options)
     written = write_tree(files, Path(out), force)
-    return GeneratedTree([Path(out) / name for name in files], [Path(out) / name for name in written], warning)
+    return GeneratedTree(
+        [Path(out) / name for name in files], [Path(out) / name for name in written], list(filter(None, warnings))
+    )
 
 
 def load_airframe(name_or_path: PathLike) -> Airframe:

@@ -99,7 +99,7 @@ def test_code_is_generated_for_a_target(gains, folder):
     assert folder / "cpp" / "core" / "mimo_pid.cpp" in tree.files == tree.written
     assert all(path.is_file() for path in tree.files)
     assert mp.generate(gains, folder / "cpp", target="px4", px4_api="descriptor").written == []
-    assert tree.warning == ""
+    assert tree.warnings == []
     with pytest.raises(mp.Error, match="target: got 'zx81', expected one of cortex-m4, native, px4"):
         mp.generate(gains, folder / "cpp", target="zx81")
 

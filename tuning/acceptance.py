@@ -7,11 +7,6 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import PARAMETERS
 
-#: Values of PX4's parameter IMU_GYRO_RATEMAX (PX4 v1.16, imu_gyro_parameters.c) that the module is made for, Hz.
-PX4_RATES = (250, 400, 800, 1000)
-#: Largest relative difference of the gyro's rate from that of the gains with which the module takes over.
-PX4_RATE_TOLERANCE = 0.05
-
 
 def check_ranges(gains: Gains) -> None:
     """Refuse gains outside the ranges that a vehicle accepts.
@@ -29,29 +24,6 @@ def check_ranges(gains: Gains) -> None:
                 f"{parameter.name}: got {value:.6g} {parameter.unit}".rstrip()
                 + f", expected {parameter.minimum:g} to {parameter.maximum:g} ({parameter.description})"
             )
-
-
-def px4_rate(gains: Gains) -> int:
-    """The gyro rate of PX4 (Hz) that is nearest to the control rate of the gains."""
-    return min(PX4_RATES, key=lambda hertz: abs(1 / gains.Ts / hertz - 1))
-
-
-def check_px4_rate(gains: Gains) -> None:
-    """Refuse gains for a control rate at which PX4's gyro does not run.
-
-    Raises
-    ------
-    TuningError
-        With the rate, and the nearest one that is possible.
-    """
-    rate = 1 / gains.Ts
-    nearest = px4_rate(gains)
-    if abs(rate / nearest - 1) > PX4_RATE_TOLERANCE:
-        raise TuningError(
-            f"Ts: the gains are for {rate:.4g} Hz, but the PX4 module runs at the gyro's rate, IMU_GYRO_RATEMAX "
-            f"{', '.join(map(str, PX4_RATES))} Hz; carry them to one of these: mimopilot certify LOG --gains FILE "
-            f"--rate {nearest}"
-        )
 
 
 def check_verdict(gains: Gains, allow: bool) -> str:

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from mimopilot.cli.options import GainsArgument, JsonOption, UncertifiedOption
+from mimopilot.codegen.targets import targets
 from mimopilot.common.verbosity import warn
 
 
@@ -24,9 +25,7 @@ def generate(
     ],
     target: Annotated[
         str,
-        typer.Option(
-            help="native: this machine, with a C interface and tests; px4: a PX4 module too; cortex-m4: bare STM32F4."
-        ),
+        typer.Option(help="; ".join(f"{name}: {target.help}" for name, target in targets().items()) + "."),
     ] = "native",
     px4_api: Annotated[
         str, typer.Option(help="PX4's module interface: crtp, up to v1.17, or descriptor, later.")
@@ -48,7 +47,7 @@ def generate(
             raise CodegenError(f"--option {text}: expected NAME=VALUE")
         options[name.replace("-", "_")] = value
     tree = mp.generate(gains, out, target=target, force=force, uncertified=uncertified, **options)
-    warn(gains, [tree.warning] if tree.warning else [])
+    warn(gains, tree.warnings)
     count, written = len(tree.files), len(tree.written)
     print(f"{out}: {count} files, {written} written, {count - written} unchanged")
 

@@ -1,6 +1,6 @@
 """Excitation of a vehicle under a ground station: a PRBS torque, requested by one parameter.
 
-The rules are those of the injector in the firmware (`excitation.hpp` of the PX4 module), so one client serves both.
+The rules are those of the injector in the firmware (`vehicle/excitation.hpp`), so one client serves both.
 """
 
 from __future__ import annotations

@@ -119,11 +119,11 @@ def emit(gains, api: str, folder: Path) -> tuple[list[Path], list[str]]:
     write_tree(files, folder / "tree")
     (folder / "generated").mkdir(exist_ok=True)
     (folder / "generated" / "generated_parameters.hpp").write_text(parameters_header(definitions(files)))
-    module, core = folder / "tree/px4/src/modules/mc_mimo_pid", folder / "tree/core"
-    includes = [f"-I{module}", f"-I{core}", '-DMODULE_NAME="mc_mimo_pid"']
+    module, core, vehicle = (folder / "tree" / name for name in ("px4/src/modules/mc_mimo_pid", "core", "vehicle"))
+    includes = [f"-I{module}", f"-I{core}", f"-I{vehicle}", '-DMODULE_NAME="mc_mimo_pid"']
     for path in (folder / "generated", STUBS / api, STUBS / "common"):
         includes += ["-isystem", str(path)]
-    return [core / "mimo_pid.cpp", *sorted(module.glob("*.cpp"))], includes
+    return [core / "mimo_pid.cpp", *sorted(vehicle.glob("*.cpp")), *sorted(module.glob("*.cpp"))], includes
 
 
 def build(gains, api: str, folder: Path) -> Path:

@@ -8,12 +8,12 @@
 namespace mimopilot
 {
 
-// The integrators start with those of PX4's own controller, within their limits. What is still missing to its torque
+// The integrators start with those of the autopilot's own controller, within their limits. What is still missing to its torque
 // is added and fades, so that an error at the moment of the change does not stay in the integrators.
 class Bumpless
 {
 public:
-	// `output`: of a step with the integrators at zero. `integral` and `torque`: of PX4's own controller.
+	// `output`: of a step with the integrators at zero. `integral` and `torque`: of the autopilot's own controller.
 	void start(State &state, const Output &output, const float (&integral)[kAxes], const float (&torque)[kAxes])
 	{
 		const Gains &gains = state.gains;
