@@ -19,7 +19,7 @@ using namespace mimopilot;
 namespace
 {
 
-constexpr float kPeriodTolerance = 0.01F;  // relative; SCHED_LOOP_RATE is a whole number of Hz
+constexpr float kPeriodTolerance = 0.05F;  // relative, as for the gyro of PX4
 constexpr int32_t kUpdateSamples = static_cast<int32_t>(1.0F / kGains.period + 0.5F);  // parameters: once a second
 constexpr float kAllAxes = 7.0F;       // CC_AXIS_MASK: roll, pitch and yaw
 constexpr uint8_t kAcro = 1;           // flight mode ACRO
@@ -105,6 +105,7 @@ void AC_CustomControl_MIMO::reset()
 {
 	_taking_over = true;
 	_excitation = Excitation{};  // a run asked for earlier is none
+	_told = _excitation.phase();
 	_rate_loop_only = (static_cast<uint32_t>(parameter("ACRO_OPTIONS", 0.0F)) & kRateLoopOnly) != 0;
 	memset(_main_integral, 0, sizeof(_main_integral));
 	_wrong = -1;
@@ -267,11 +268,11 @@ void AC_CustomControl_MIMO::excite(bool flying)
 		}
 	}
 
-	const Excitation::Phase before = _excitation.phase();
 	_excitation.step(conditions, _input.excitation);
 	memcpy(_excited, _input.excitation, sizeof(_excited));
 
-	if (_excitation.phase() != before) {
+	if (_excitation.phase() != _told) {
+		_told = _excitation.phase();
 		const bool off = _excitation.phase() == Excitation::Phase::Off;
 		GCS_SEND_TEXT(MAV_SEVERITY_INFO, "MIMO excitation: %s",
 			      off ? describe(_excitation.end()) : describe(_excitation.phase()));

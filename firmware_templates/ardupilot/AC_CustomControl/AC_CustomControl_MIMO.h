@@ -55,6 +55,7 @@ private:
 	mimopilot::Output _output {};
 	mimopilot::Bumpless _bumpless {};
 	mimopilot::Excitation _excitation {};
+	mimopilot::Excitation::Phase _told{mimopilot::Excitation::Phase::Off};  // to the ground station
 	float _excited[mimopilot::kAxes] {};
 	float _main_integral[mimopilot::kAxes] {};  // of the main controller, while it flies in our place
 	const char *_obstacle{nullptr};
