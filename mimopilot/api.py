@@ -613,7 +613,8 @@ def upload(
     connect : str
         ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``DEVICE,BAUD``.
     profile : str
-        Controller that the gains are for: ``mimo``, our module, ``px4-stock`` or ``ardupilot-stock``.
+        Controller that the gains are for: ``mimo``, our module, ``ardupilot-custom``, our custom controller in
+        ArduCopter, ``px4-stock`` or ``ardupilot-stock``.
     moment_scale : tuple of 3 float (N m), or ``flown``, optional
         Unit of torque of a vehicle that does not publish it.
     dry_run, force_armed, uncertified : bool
