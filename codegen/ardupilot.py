@@ -72,8 +72,7 @@ def group(gains: Gains) -> list[GroupEntry]:
 
 
 def _entry(source: Parameter | Setting, index: int, value: float) -> GroupEntry:
-    setting = isinstance(source, Setting)
-    fixed = not setting and not source.writable
+    fixed = isinstance(source, Parameter) and not source.writable
     low, high = (value, value) if fixed else (source.minimum, source.maximum)
     unit = f", {source.unit}" if source.unit not in ("", "norm") else ""
     note = ". Fixed in the firmware, for checking only" if fixed else ""
@@ -86,7 +85,7 @@ def _entry(source: Parameter | Setting, index: int, value: float) -> GroupEntry:
         value=float_literal(value),
         minimum=float_literal(low),
         maximum=float_literal(high),
-        setting=setting,
+        setting=isinstance(source, Setting),
     )
 
 

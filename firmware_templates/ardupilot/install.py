@@ -8,8 +8,9 @@ few lines are added to three files there, each marked at its end. Nothing is cha
 found; a second run changes nothing. Needs Python 3 only.
 """
 
+from __future__ import annotations
+
 import argparse
-import os
 import re
 import sys
 from pathlib import Path
@@ -20,44 +21,46 @@ HEADER, SOURCE, CONFIG = "AC_CustomControl.h", "AC_CustomControl.cpp", "AC_Custo
 CREATE = r"_backend = (.+) AC_CustomControl_PID\(\*this, _ahrs, _att_control, _motors, _dt\);"
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """ArduPilot's source is not as expected; nothing has been changed."""
 
 
 class Text:
     """Lines of a file of ArduPilot, without ours."""
 
-    def __init__(self, path):
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.before = path.read_bytes().decode("utf-8", "surrogateescape")
         self.end = "\r\n" if "\r\n" in self.before else "\n"
         self.lines = [line for line in self.before.split(self.end) if not line.endswith(MARK)]
 
-    def find(self, anchor, start=0):
+    def find(self, anchor: str, start: int = 0) -> int:
         """Index of the first line from `start` on that matches; whitespace does not count."""
         for index in range(start, len(self.lines)):
             if re.fullmatch(anchor, " ".join(self.lines[index].split())):
                 return index
-        raise Refused(f"{self.path}: found no line like {anchor!r}")
+        raise RefusedError(f"{self.path}: found no line like {anchor!r}")
 
-    def insert(self, index, *lines):
+    def insert(self, index: int, *lines: str) -> None:
         """Insert our lines before a line."""
         self.lines[index:index] = [line + MARK for line in lines]
 
-    def after(self):
+    def after(self) -> str:
         """The new content."""
         return self.end.join(self.lines)
 
 
-def edit_header(text):
+def edit_header(text: Text) -> None:
+    """Our number among the controllers."""
     if any("= 3," in line for line in text.lines):
-        raise Refused(f"{text.path}: another custom controller has number 3")
+        raise RefusedError(f"{text.path}: another custom controller has number 3")
     text.find(r"#define CUSTOMCONTROL_MAX_TYPES 2")
     text.insert(text.find(r"#ifndef CUSTOMCONTROL_MAX_TYPES"), "#define CUSTOMCONTROL_MAX_TYPES 3")
     text.insert(text.find(r"CONT_PID = 2,") + 1, "        CONT_MIMO            = 3,")
 
 
-def edit_source(text):
+def edit_source(text: Text) -> None:
+    """Its parameters, and its construction."""
     include = text.find(r'#include "AC_CustomControl_PID\.h"')
     text.insert(include + 1, '#include "AC_CustomControl_MIMO.h"')
     group = text.find(r'AP_SUBGROUPVARPTR\(_backend, "2_", 7, AC_CustomControl, _backend_var_info\[1\]\),')
@@ -68,7 +71,7 @@ def edit_source(text):
         "#endif",
     )
     created = text.find(CREATE)
-    new = re.fullmatch(CREATE, text.lines[created].strip()).group(1)  # differs between versions
+    new = text.lines[created].split("=")[1].split(" AC_")[0].strip()  # differs between versions
     text.insert(
         text.find(r"break;", created) + 1,
         "#if AP_CUSTOMCONTROL_MIMO_ENABLED",
@@ -80,7 +83,8 @@ def edit_source(text):
     )
 
 
-def edit_config(text):
+def edit_config(text: Text) -> None:
+    """The switch that leaves it out of a build."""
     start = text.find(r"#ifndef AP_CUSTOMCONTROL_PID_ENABLED")
     text.insert(
         text.find(r"#endif", start) + 1,
@@ -93,7 +97,7 @@ def edit_config(text):
 EDITS = {HEADER: edit_header, SOURCE: edit_source, CONFIG: edit_config}
 
 
-def our_files(tree):
+def our_files(tree: Path) -> dict[Path, bytes]:
     """Path in the library -> content, of every file of ours."""
     own = tree / "ardupilot" / "AC_CustomControl"
     files = {path.relative_to(own): path for path in own.rglob("*") if path.is_file()}
@@ -102,14 +106,14 @@ def our_files(tree):
     return {name: path.read_bytes() for name, path in sorted(files.items())}
 
 
-def plan(library, tree, remove):
+def plan(library: Path, tree: Path, remove: bool) -> dict[Path, bytes | None]:
     """Path -> new content, None to delete it, of all that must change."""
-    wanted = {}
+    wanted: dict[Path, bytes | None] = {}
     for name, edit in EDITS.items():
         if name == CONFIG and not (library / name).exists():
             continue  # ArduPilot before 4.6
         if not (library / name).is_file():
-            raise Refused(f"{library / name}: no such file; give the folder of ArduPilot's source")
+            raise RefusedError(f"{library / name}: no such file; give the folder of ArduPilot's source")
         text = Text(library / name)
         if not remove:
             edit(text)
@@ -117,13 +121,12 @@ def plan(library, tree, remove):
     for name, content in our_files(tree).items():
         wanted[library / name] = None if remove else content
     return {
-        path: content
-        for path, content in wanted.items()
-        if (path.read_bytes() if path.exists() else None) != content
+        path: content for path, content in wanted.items() if (path.read_bytes() if path.exists() else None) != content
     }
 
 
-def main():
+def main() -> None:
+    """Read the arguments and change the source."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("ardupilot", type=Path, help="folder of ArduPilot's source")
     parser.add_argument("--remove", action="store_true", help="remove the controller again")
@@ -131,7 +134,7 @@ def main():
     library = arguments.ardupilot / LIBRARY
     try:
         changes = plan(library, Path(__file__).resolve().parent.parent, arguments.remove)
-    except Refused as reason:
+    except RefusedError as reason:
         sys.exit(f"{reason}; nothing was changed")
     for path, content in changes.items():
         if content is None:
@@ -140,7 +143,7 @@ def main():
         path.parent.mkdir(exist_ok=True)
         draft = path.with_name(path.name + ".mimopilot")
         draft.write_bytes(content)
-        os.replace(draft, path)
+        draft.replace(path)
     print(f"{library}: {len(changes)} files changed" if changes else f"{library}: nothing to change")
 
 

@@ -12,7 +12,6 @@ from mimopilot.cli.options import (
     GainsArgument,
     JsonOption,
     KeyOption,
-    ProfileOption,
     SystemOption,
     TimeoutOption,
     UncertifiedOption,

@@ -58,6 +58,39 @@ void store(const Vector3f &from, float (&to)[kAxes])
 	to[2] = from.z;
 }
 
+// The law has no input for rates of roll and pitch that the setpoint has. A setpoint that is ahead by Kp_o^-1 times them
+// gives their rate setpoint: Kp_o e_o + rate.
+void lead(const Gains &gains, float roll, float pitch, float (&q)[4])
+{
+	constexpr float kSmallest = 1.0e-6F;  // s^-2; the smallest accepted diagonal gains give 1e-4
+	constexpr float kLargest = 0.25F;     // half angle, rad
+	const float(&kp)[2][2] = gains.kp_o;
+	const float determinant = kp[0][0] * kp[1][1] - kp[0][1] * kp[1][0];
+
+	if (!(__builtin_fabsf(determinant) > kSmallest)) { return; }
+
+	const float scale = 0.5F / determinant;
+	float x = scale * (kp[1][1] * roll - kp[0][1] * pitch);
+	float y = scale * (kp[0][0] * pitch - kp[1][0] * roll);
+	const float half_angle = __builtin_sqrtf(x * x + y * y);
+
+	if (!(half_angle <= kLargest)) {
+		if (!(half_angle < kLargest / kSmallest)) { return; }  // not finite
+
+		x *= kLargest / half_angle;
+		y *= kLargest / half_angle;
+	}
+
+	const float length = 1.0F / __builtin_sqrtf(1.0F + x * x + y * y);
+	const float ahead[4] {
+		length * (q[0] - q[1] * x - q[2] * y),
+		length * (q[1] + q[0] * x - q[3] * y),
+		length * (q[2] + q[0] * y + q[3] * x),
+		length * (q[3] + q[1] * y - q[2] * x),
+	};
+	memcpy(q, ahead, sizeof(ahead));
+}
+
 // Turns the sign of the last torque into that of the torque that the motors could not give.
 int32_t unallocated(bool limited, float torque) { return !limited ? 0 : (torque > 0.0F ? 1 : (torque < 0.0F ? -1 : 0)); }
 
@@ -211,10 +244,18 @@ void AC_CustomControl_MIMO::update_inputs(bool flying)
 	store(_ahrs->get_gyro_latest(), _input.rates);
 	store(_att_control->rate_bf_targets(), _input.rates_setpoint);
 
-	// The target's rate is in its own axes; about earth's z axis it is the rate of the heading.
-	_input.yaw_rate_setpoint = 2.0F * (target.q2 * target.q4 - target.q1 * target.q3) * rate.x
-				   + 2.0F * (target.q3 * target.q4 + target.q1 * target.q2) * rate.y
-				   + (1.0F - 2.0F * (target.q2 * target.q2 + target.q3 * target.q3)) * rate.z;
+	// Earth's z axis in the target's axes, in which its rate is. The rate of the heading is an input of the law.
+	const Vector3f down(2.0F * (target.q2 * target.q4 - target.q1 * target.q3),
+			    2.0F * (target.q3 * target.q4 + target.q1 * target.q2),
+			    1.0F - 2.0F * (target.q2 * target.q2 + target.q3 * target.q3));
+	_input.yaw_rate_setpoint = down.x * rate.x + down.y * rate.y + down.z * rate.z;
+
+	// The attitude model makes its own rates.
+	if (!(_state.gains.model_omega > 0.0F)) {
+		lead(_state.gains, rate.x - down.x * _input.yaw_rate_setpoint, rate.y - down.y * _input.yaw_rate_setpoint,
+		     _input.attitude_setpoint);
+	}
+
 	_input.rate_mode = _rate_loop_only && AP::vehicle()->get_mode() == kAcro ? 1 : 0;
 	_input.armed = flying ? 1 : 0;
 	_input.landed = AP::vehicle()->get_likely_flying() ? 0 : 1;

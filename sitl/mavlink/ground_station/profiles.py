@@ -182,7 +182,6 @@ def law_of(profile: str) -> str:
     return MIMO if profile == ARDUPILOT_CUSTOM else profile
 
 
-
 def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
     """Plan the upload of gains to a vehicle.
 
@@ -221,7 +220,8 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.
 _OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
 TABLE = {p.name: p for p in _OURS}
-TABLE |= {ardupilot_name(p.name): p for p in (*PARAMETERS, *IDENTITY, *ARDUPILOT_EXCITATION)}
+_ON_ARDUPILOT: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *ARDUPILOT_EXCITATION)
+TABLE |= {ardupilot_name(p.name): p for p in _ON_ARDUPILOT}
 PREFIXES = {
     MIMO: (PREFIX,),
     PX4_STOCK: ("MC_",),
@@ -268,7 +268,9 @@ def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
                 f"{f' and {len(lacking) - 1} more' if len(lacking) > 1 else ''}: restore a complete "
                 "set"
             )
-    fixed = {prefix + p.code for p in (*PARAMETERS, *IDENTITY) if not p.writable for prefix in (PREFIX, ARDUPILOT_PREFIX)}
+    fixed = {
+        prefix + p.code for p in (*PARAMETERS, *IDENTITY) if not p.writable for prefix in (PREFIX, ARDUPILOT_PREFIX)
+    }
     settings = tuple(
         ParameterWrite(name, TABLE[name].unit if name in TABLE else "", value, -math.inf, math.inf)
         for name, value in values.items()
