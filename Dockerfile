@@ -5,7 +5,7 @@ RUN apt-get update \
     && rm -rf /var/lib/apt/lists/*
 COPY . /source
 RUN python3 -m venv /opt/mimopilot \
-    && /opt/mimopilot/bin/pip install --no-cache-dir --no-compile "/source[emulator,campaign]"
+    && /opt/mimopilot/bin/pip install --no-cache-dir --no-compile "/source[vehicle,report,emulator,campaign]"
 
 FROM debian:trixie-slim
 # The C++ compiler is needed at run time: gains are flown and tested as compiled code.

@@ -23,6 +23,7 @@ from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows
 from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS, cross_tool, find_tool, run_tool
+from mimopilot.common.extras import EMULATOR
 from mimopilot.tuning.gains import Gains
 
 #: Memory map of the STM32F405 (RM0090): address and size, bytes, of the flash and of the part of the RAM that is used.
@@ -108,18 +109,17 @@ class EmulatedController:
 
     Raises
     ------
+    Error
+        If unicorn is not installed.
     CodegenError
-        If unicorn is not installed, or the controller refuses its gains.
+        If the controller refuses its gains.
     """
 
     def __init__(self, image: FirmwareImage, gains: Gains) -> None:
-        try:
-            import unicorn
-            from unicorn import arm_const as arm
-        except ImportError:
-            raise CodegenError(
-                "the emulator unicorn is not installed; install it: pip install 'mimopilot[emulator]'"
-            ) from None
+        EMULATOR.need()
+        import unicorn
+        from unicorn import arm_const as arm
+
         self.image = image
         self._memory = mmap.mmap(-1, RAM_SIZE)
         self._uc = unicorn.Uc(unicorn.UC_ARCH_ARM, unicorn.UC_MODE_THUMB | unicorn.UC_MODE_MCLASS)

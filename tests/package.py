@@ -15,6 +15,8 @@ from pathlib import Path
 
 from tests.paths import PACKAGES, TOP
 
+#: Largest base installation, MB: what the project allows itself.
+BASE_MB = 600
 #: What an installation's users do first.
 STEPS = (
     ("--version",),
@@ -23,6 +25,7 @@ STEPS = (
     ("tune", "flight.ulg", "--out", "my.gains.toml"),
     ("generate", "my.gains.toml", "--target", "px4", "--out", "firmware"),
     ("fly", "adam0", "--gains", "my.gains.toml"),
+    ("report", "flight.ulg", "--gains", "my.gains.toml", "--out", "flight.html"),
     ("demo", "--out", "demo"),
 )
 
@@ -44,8 +47,8 @@ def build_wheel(folder: Path) -> Path:
     return wheel
 
 
-def install(wheel: Path, folder: Path, python: str | None = None) -> Path:
-    """A virtual environment with the wheel; the folder of its programs.
+def install(wheel: Path, folder: Path, python: str | None = None, extras: str = "") -> Path:
+    """A virtual environment with the wheel and its extras, as ``[NAME]``; the folder of its programs.
 
     Without a Python it is this one, and the dependencies are those of this environment.
     """
@@ -56,7 +59,7 @@ def install(wheel: Path, folder: Path, python: str | None = None) -> Path:
         pip.append("--no-deps")
         # After the environment's own packages: the wheel wins over a project that is installed editable.
         (library / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    subprocess.run([*pip, wheel], check=True, env=_environment())
+    subprocess.run([*pip, f"{wheel}{extras}"], check=True, env=_environment())
     return folder / "bin"
 
 
@@ -77,9 +80,12 @@ def main(python: str) -> None:
     """Build, install with all dependencies on a Python, and use."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        programs = install(build_wheel(folder), folder / "venv", python)
-        size = sum(path.lstat().st_size for path in (folder / "venv").rglob("*"))
-        print(f"{python}: {size / 1e6:.0f} MB installed", flush=True)
+        wheel = build_wheel(folder)
+        for extras in ("", "[vehicle,report]"):
+            programs = install(wheel, folder / "venv", python, extras)
+            size = sum(path.lstat().st_size for path in (folder / "venv").rglob("*")) / 1e6
+            print(f"{python}: {size:.0f} MB with mimopilot{extras}", flush=True)
+            assert extras or size <= BASE_MB, f"the base installation has {size:.0f} MB, at most {BASE_MB} are wanted"
         work = folder / "work"
         work.mkdir()
         for step in STEPS:

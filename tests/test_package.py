@@ -1,14 +1,17 @@
 """The wheel: what it holds, and that it works where it is installed."""
 
+import subprocess
+import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
 
-from mimopilot.cli import campaign
-from mimopilot.common.errors import Error
+from mimopilot.common.extras import EXTRAS
+from tests.conftest import assert_one_clear_line
 from tests.package import build_wheel, install, use
-from tests.paths import PACKAGES
+from tests.paths import PACKAGES, TOP
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +40,39 @@ def test_it_works_outside_of_the_tree(wheel, tmp_path):
     assert "off-axis" in use(programs, tmp_path, "fly", "adam0", "--gains", "my.gains.toml")
 
 
-def test_a_campaign_without_pyarrow_names_the_extra(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
-    with pytest.raises(Error, match=r"pip install 'mimopilot\[campaign\]'"):
-        campaign.campaign("adam0", out=Path("x"))
+MISSING = {
+    "pymavlink": ("autotune --connect udpin:127.0.0.1:14550 --out tuned",),
+    "plotly": (
+        "report x.ulg --out x.html",
+        "tune x.ulg --out x --report x.html",
+        "autotune --connect udpin:127.0.0.1:14550 --out tuned",
+    ),
+    "pyarrow": ("campaign adam0 --out x",),
+    "unicorn": ("pil my.gains.toml",),
+}
+
+
+@pytest.mark.parametrize(
+    ("package", "command"), [(package, command) for package, commands in MISSING.items() for command in commands]
+)
+def test_a_command_without_its_optional_package_names_the_extra_before_it_begins(
+    mimopilot, gains, tmp_path, monkeypatch, package, command
+):
+    gains.save(tmp_path / "my.gains.toml")
+    (extra,) = (one for one in EXTRAS if one.package == package)
+    monkeypatch.setitem(sys.modules, package, None)
+    done = mimopilot(*command.split())
+    assert_one_clear_line(done, f"needs {package}, which is not installed: pip install 'mimopilot[{extra.name}]'")
+    assert {path.name for path in tmp_path.iterdir()} == {"my.gains.toml"}
+
+
+def test_every_use_of_a_link_names_the_extra_without_pymavlink():
+    script = "import sys; sys.modules['pymavlink'] = None; import mimopilot.sitl.mavlink.ground_station.upload"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert "needs pymavlink, which is not installed: pip install 'mimopilot[vehicle]'" in done.stderr
+
+
+def test_every_extra_is_one_of_the_package():
+    extras = tomllib.loads((TOP / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    for one in EXTRAS:
+        assert any(line.startswith((one.package, f"dask[{one.package}]")) for line in extras[one.name])

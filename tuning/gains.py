@@ -206,7 +206,7 @@ class Gains:
 
     @property
     def controller(self) -> str:
-        """Controller that the set is for: ``mimo`` (ours), ``px4-stock`` or ``ardupilot-stock``."""
+        """Controller that the set is for: ``mimo`` (ours), ``px4-stock``, ``ardupilot-stock``, ``betaflight``."""
         return MIMO if self.filters.stock is None else self.filters.stock.controller
 
     def for_our_law(self) -> Gains:

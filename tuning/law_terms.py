@@ -1,4 +1,4 @@
-"""The control laws that gains are made for, as tables of terms: ours, and those of PX4 and ArduPilot.
+"""The control laws that gains are made for, as tables of terms: ours, and those of PX4, ArduPilot and Betaflight.
 
 Each term is a gain matrix, the signal that it acts on and a chain of first-order filters. `tuning.law` derives every
 response from the table of the set's law, so all of tuning holds for each of them.
@@ -15,6 +15,11 @@ The stock laws, in the order of their own code, at the control period:
 Both run the rate controller before the attitude controller in a period, so a rate setpoint acts one period later. The
 logged rate is that behind the gyro's own filters (IMU_GYRO_CUTOFF, INS_GYRO_FILTER): those are part of the measured
 plant.
+
+- Betaflight 2025.12 (pid.c, pid_init.c, filter.c), in angle mode: the rate setpoint passes a third-order low-pass of
+  50 Hz (ATTITUDE_CUTOFF_HZ) and acts in the same period; D is the difference of the gyro's rate behind two first-order
+  low-passes (dterm_lpf1, dterm_lpf2). Its feed-forward follows the sticks' speed in acro mode: it is outside of the
+  loop. Gains are whole numbers in units of pid.h.
 """
 
 from __future__ import annotations
@@ -35,7 +40,7 @@ ERROR, RATE, SETPOINT = "error", "rate", "setpoint"
 #: Signals of the attitude model that a term can act on: outside of the loop.
 MODEL_RATE, MODEL_ACCELERATION = "model rate", "model acceleration"
 #: Names of the laws; those of the stock ones are also the profiles of an upload.
-MIMO, PX4_STOCK, ARDUPILOT_STOCK = "mimo", "px4-stock", "ardupilot-stock"
+MIMO, PX4_STOCK, ARDUPILOT_STOCK, BETAFLIGHT = "mimo", "px4-stock", "ardupilot-stock", "betaflight"
 
 
 @dataclass(frozen=True)
@@ -46,9 +51,9 @@ class StockFilters:
     ----------
     controller : str
         Key of `LAWS`.
-    derivative_hz, setpoint_hz, error_hz, torque_hz : tuple of float, Hz
-        Cut-offs of the first-order low-passes of the derivative, the rate setpoint, the rate error and the torque; 0:
-        no filter.
+    derivative_hz, setpoint_hz, error_hz, torque_hz, derivative2_hz : tuple of float, Hz
+        Cut-offs of the first-order low-passes of the derivative, the rate setpoint, the rate error and the torque, and
+        of a second one of the derivative; 0: no filter.
     derivative_feedforward : tuple of float, s^2
         Torque from the derivative of the rate setpoint.
     """
@@ -59,6 +64,7 @@ class StockFilters:
     error_hz: tuple[float, ...] = (0.0, 0.0, 0.0)
     torque_hz: tuple[float, ...] = (0.0, 0.0, 0.0)
     derivative_feedforward: tuple[float, ...] = (0.0, 0.0, 0.0)
+    derivative2_hz: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         for name in STOCK_FILTERS:
@@ -74,7 +80,14 @@ class StockFilters:
 
 
 #: Names of the filters and fixed gains.
-STOCK_FILTERS = ("derivative_hz", "setpoint_hz", "error_hz", "torque_hz", "derivative_feedforward")
+STOCK_FILTERS = (
+    "derivative_hz",
+    "setpoint_hz",
+    "error_hz",
+    "torque_hz",
+    "derivative_feedforward",
+    "derivative2_hz",
+)
 
 
 @dataclass(frozen=True)
@@ -171,6 +184,10 @@ class ControlLaw:
         Keys of the parameter table that it does not have.
     largest : mapping
         Gain -> largest value that the autopilot accepts: roll, pitch, yaw. None: the ranges of our parameter table.
+    step : mapping
+        Gain -> value of 1 on an autopilot whose gains are whole numbers; empty: they are not.
+    shared : tuple of str
+        Gains that are one number for roll and pitch.
     """
 
     terms: Mapping[str, Term]
@@ -181,6 +198,8 @@ class ControlLaw:
     filters: tuple[str, ...] = ()
     lacks: tuple[str, ...] = field(default=("derivative_cutoff_hz", "Kff_o", "Kaff_i", SLEW, "model_damping", MODEL))
     largest: Mapping[str, tuple[float, float, float]] | None = None
+    step: Mapping[str, float] = field(default_factory=dict)
+    shared: tuple[str, ...] = ()
 
 
 def _integral(filters: Filters) -> Chain:
@@ -257,6 +276,31 @@ _ARDUPILOT_TERMS = {
         filter=lambda f: (Filter(gain=1.0, pole=0.0, difference=True, divisor=f.Ts),),
     ),
 }
+#: Hz: low-pass of the rate setpoint in Betaflight's angle mode, three first-order ones of a cut-off that many times
+#: higher (pid_init.c, ATTITUDE_CUTOFF_HZ; filter.h, CUTOFF_CORRECTION_PT3).
+_ANGLE_MODE_HZ = 50.0 * 1.961459177
+_BETAFLIGHT_TERMS = {
+    "P": Term("Kp_i", ERROR),
+    "I": Term("Ki_i", ERROR, filter=_integral),
+    "D": Term(
+        "Kd_i",
+        RATE,
+        -1,
+        lambda f: (*_low_pass(_stock(f).derivative2_hz, f.Ts), *_difference(_stock(f).derivative_hz, f.Ts)),
+    ),
+    "F": Term("Kff_i", SETPOINT),
+}
+#: Value of 1 on its command line: pid.h, PTERM_SCALE, ITERM_SCALE and DTERM_SCALE for deg/s and a torque of
+#: PID_MIXER_SCALING, 1000; pid_init.c, angleGain. The largest numbers are those of settings.c.
+_PER_RADIAN = 180 / np.pi / 1000
+_BETAFLIGHT_STEP = {
+    "Kp_o": 0.1,
+    "Kp_i": 0.032029 * _PER_RADIAN,
+    "Ki_i": 0.244381 * _PER_RADIAN,
+    "Kd_i": 0.000529 * _PER_RADIAN,
+    "Kff_i": 1.0,
+}
+_BETAFLIGHT_LARGEST = {"Kp_o": 200, "Kp_i": 250, "Ki_i": 250, "Kd_i": 250, "Kff_i": 0}
 _MIMO_TEXT = (
     "# mimopilot gains. Row: output; column: error; roll then pitch. Positive Kd damps.",
     "# r_i = Kp_o (r_o - y_o);  u = Kp_i (r_i - y_i) + I - Kd_i dy_i/dt + Kff_i r_i,  I += Ts Ki_i (r_i - y_i)",
@@ -299,6 +343,21 @@ LAWS = {
             "Kd_i": (0.05, 0.05, 0.02),
             "Kff_i": (0.5, 0.5, 0.5),
         },
+    ),
+    BETAFLIGHT: ControlLaw(
+        _BETAFLIGHT_TERMS,
+        (
+            "# mimopilot gains for Betaflight's own controller in angle mode; diagonal, roll then pitch.",
+            "# r_i = Kp_o (r_o - y_o), low-passed at 50 Hz;  u = Kp_i (r_i - y_i) + I - Kd_i dy_i/dt,",
+            "# dy_i/dt low-passed at derivative_hz and at derivative2_hz",
+        ),
+        setpoint=lambda f: 3 * _low_pass((_ANGLE_MODE_HZ,), f.Ts),
+        delay=0,
+        filters=("derivative_hz", "derivative2_hz"),
+        lacks=("derivative_cutoff_hz", "Kff_o", "Kaff_i", SLEW, "model_damping", MODEL, "yaw_weight"),
+        largest={name: (most * _BETAFLIGHT_STEP[name],) * 3 for name, most in _BETAFLIGHT_LARGEST.items()},
+        step=_BETAFLIGHT_STEP,
+        shared=("Kp_o",),
     ),
 }
 

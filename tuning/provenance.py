@@ -6,11 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from mimopilot.common.charts import IS_FLOWN, IS_NEW, IS_SISO
 from mimopilot.common.toml import shown
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.reference_model import ContinuousModel, model_from_table
 
 Models = tuple[ContinuousModel, ContinuousModel]
+#: Methods of sets that were not tuned.
+UNTUNED = ("", "flown", "default")
 MODELS = ("inner_model", "outer_model")
 
 
@@ -46,6 +49,11 @@ class Provenance:
     fit: tuple[float, ...] = ()
     warnings: tuple[str, ...] = ()
     details: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def kind(self) -> str:
+        """What reports tell sets apart by: flown or given, tuned axis by axis, or another new one."""
+        return IS_FLOWN if self.method in UNTUNED else IS_SISO if self.method == "siso" else IS_NEW
 
     def as_table(self) -> dict[str, Any]:
         """All entries that are not empty, as plain TOML values."""

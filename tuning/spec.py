@@ -69,8 +69,8 @@ class TuningSpec(_SpecTable):
     Attributes
     ----------
     profile : str
-        Controller that the gains are for: ``mimo`` (ours), ``px4-stock`` or ``ardupilot-stock``. Those of a stock one
-        are designed within its own law, diagonal, from a flight with it.
+        Controller that the gains are for: ``mimo`` (ours), ``px4-stock``, ``ardupilot-stock`` or ``betaflight``. Those
+        of a stock one are designed within its own law, diagonal, from a flight with it.
     method : str
         ``mimo``: full matrices. ``siso``: each axis by itself, with the optimal prefilter (3.12).
     inner, outer : tuple of 2 ContinuousModel or None
@@ -111,7 +111,7 @@ class TuningSpec(_SpecTable):
 
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
-    profile: Literal["mimo", "px4-stock", "ardupilot-stock"] = "mimo"
+    profile: Literal["mimo", "px4-stock", "ardupilot-stock", "betaflight"] = "mimo"
     method: Literal["mimo", "siso"] = "mimo"
     inner: Models | None = None
     outer: Models | None = None

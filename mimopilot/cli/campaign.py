@@ -20,7 +20,8 @@ from mimopilot.cli.options import (
     WorkersOption,
 )
 from mimopilot.common.console import json_text, print_json, print_table
-from mimopilot.common.errors import Error, check_not_given
+from mimopilot.common.errors import check_not_given
+from mimopilot.common.extras import CAMPAIGN
 
 
 def register(app: typer.Typer) -> None:
@@ -60,7 +61,7 @@ def campaign(
     as_json: JsonOption = False,
 ) -> None:
     """Fly many varied vehicles; report survival and tracking of each gain set."""
-    _check_parquet()
+    CAMPAIGN.need()
     from mimopilot.common.files import inside, write_atomically
     from mimopilot.common.parallel import cores
     from mimopilot.sitl.campaign.campaign_figures import parse_map
@@ -112,16 +113,6 @@ def campaign(
     print(f"results {results.path}\nreport  {report}")
 
 
-def _check_parquet() -> None:
-    """Refuse to begin without pyarrow, which is as large as scipy and only campaigns need."""
-    try:
-        import pyarrow  # noqa: F401
-    except ImportError:
-        raise Error(
-            "a campaign keeps its flights as Parquet, and pyarrow is not installed: pip install 'mimopilot[campaign]'"
-        ) from None
-
-
 def _task(scenario: str, axis: str | None, sizes: dict[str, float | None], faults: list[str] | None) -> dict[str, Any]:
     """Entries of the plan from the options that say what is flown."""
     from mimopilot.sitl.errors import SitlError
@@ -151,7 +142,7 @@ def replay(
     as_json: JsonOption = False,
 ) -> None:
     """Fly one run of a campaign again: the same flight, bit for bit. Exit code 1: it differs on this machine."""
-    _check_parquet()
+    CAMPAIGN.need()
     from mimopilot.sitl.campaign.replay import replay_flight
     from mimopilot.sitl.flight.flight_log import save_flight
     from mimopilot.sitl.flight.metrics import FIGURE_LABELS

@@ -15,6 +15,7 @@ from pathlib import Path
 import typer
 
 from mimopilot.cli.options import JsonOption
+from mimopilot.common.extras import EXTRAS
 
 #: Oldest Python that the package installs on.
 PYTHON = (3, 11)
@@ -87,7 +88,8 @@ def every_check() -> Iterator[Check]:
     cross = "apt-get install gcc-arm-none-eabi libnewlib-arm-none-eabi"
     yield _program("cross compiler", "arm-none-eabi-g++", "pil, --on cortex-m4", cross)
     yield _program("QEMU", "qemu-system-arm", "pil --emulator qemu", "apt-get install qemu-system-arm")
-    yield _package("unicorn", "pil, --on cortex-m4", "pip install 'mimopilot[emulator]'")
+    for extra in EXTRAS:
+        yield _package(extra.package, extra.use.rstrip(","), extra.advice)
     yield _serial()
     for port, (protocol, use) in PORTS.items():
         yield _port(port, protocol, use)

@@ -11,7 +11,19 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = os.environ[
 
 import typer
 
-from mimopilot.cli import campaign, codegen, doctor, field, report, simulation, sitl, studies, tuning, vehicle
+from mimopilot.cli import (
+    campaign,
+    codegen,
+    doctor,
+    field,
+    identification,
+    report,
+    simulation,
+    sitl,
+    studies,
+    tuning,
+    vehicle,
+)
 from mimopilot.common.errors import Error
 from mimopilot.common.verbosity import Verbosity, set_verbosity
 
@@ -22,7 +34,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (studies, simulation, sitl, campaign, tuning, report, codegen, vehicle, field, doctor):
+for group in (studies, simulation, sitl, campaign, identification, tuning, report, codegen, vehicle, field, doctor):
     group.register(app)
 
 

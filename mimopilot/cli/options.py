@@ -7,6 +7,16 @@ from typing import Annotated
 
 import typer
 
+from mimopilot.common.extras import REPORT
+
+
+def _page(path: Path | None) -> Path | None:
+    """Refuse to begin work whose page could not be written."""
+    if path is not None:
+        REPORT.need()
+    return path
+
+
 AirframeArgument = Annotated[
     str,
     typer.Argument(
@@ -14,7 +24,10 @@ AirframeArgument = Annotated[
         "adam0_thesis_flown, adam0_thesis_perturbed, antr, antr_thesis, px4_sih; or a TOML file."
     ),
 ]
-LogArgument = Annotated[Path, typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, CSV or MATLAB file.")]
+LogArgument = Annotated[
+    Path,
+    typer.Argument(help="Flight log: PX4 ULog, ArduPilot dataflash, Betaflight blackbox (CSV), CSV or MATLAB file."),
+]
 GainsArgument = Annotated[Path, typer.Argument(help="Gains file: FILE.gains.toml.")]
 
 GainsOption = Annotated[Path | None, typer.Option(help="Gains file; by default the airframe's own.")]
@@ -38,13 +51,15 @@ SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast
 LogOutOption = Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")]
 UncertifiedOption = Annotated[bool, typer.Option("--uncertified", help="Accept gains whose stability is in doubt.")]
 ReportOption = Annotated[
-    Path | None, typer.Option(help="Also write a page with figures of the log and of these gains (HTML).")
+    Path | None,
+    typer.Option(callback=_page, help="Also write a page with figures of the log and of these gains (HTML)."),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 ProfileOption = Annotated[
     str | None,
     typer.Option(
-        help="Controller: mimo (our module), px4-stock or ardupilot-stock (the autopilot's own).", show_default="mimo"
+        help="Controller: mimo (our module), px4-stock, ardupilot-stock (the autopilot's own); tune: also betaflight.",
+        show_default="mimo",
     ),
 ]
 YesOption = Annotated[bool, typer.Option("--yes", help="Do not ask.")]

@@ -147,7 +147,11 @@ def params(
     gains: Annotated[Path | None, typer.Argument(help="Gains file: FILE.gains.toml.")] = None,
     connect: Annotated[str | None, typer.Option(help="Vehicle to read from; see upload.")] = None,
     form: Annotated[
-        str, typer.Option("--format", help="qgc, mavproxy, missionplanner; for a gains file also c-header, px4-yaml.")
+        str,
+        typer.Option(
+            "--format",
+            help="qgc, mavproxy, missionplanner; for a gains file also c-header, px4-yaml, betaflight (its CLI).",
+        ),
     ] = "qgc",
     out: Annotated[Path | None, typer.Option(help="File to write; by default standard output.")] = None,
     uncertified: UncertifiedOption = False,

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from mimopilot.common.charts import PIXELS_PER_INCH, svg
 from mimopilot.common.figures import Chart, HeatMap, Line, Panel, SpanMark, Spread
@@ -15,6 +16,8 @@ from mimopilot.common.files import inside, write_atomically
 
 #: Width of a figure, inches, and pixels of `Panel.height` in an inch.
 WIDTH, PIXELS = 9.0, 96.0
+#: Letters of a legend in the whole width, and the thickest line in one, points.
+LETTERS, THICKEST = 150, 3.0
 #: Points of a line in a page's pixel.
 POINTS = 0.75
 
@@ -49,13 +52,13 @@ def chart_figure(chart: Chart) -> Figure:
     figure = Figure(figsize=(WIDTH, height / PIXELS + 0.4), layout="constrained")
     grid: Any = figure.subplots(rows, chart.columns, squeeze=False)
     for axes, panel in zip(grid.flat, chart.panels, strict=False):
-        _draw(axes, panel, figure)
+        _draw(axes, panel, figure, chart.columns)
     for axes in list(grid.flat)[len(chart.panels) :]:
         axes.set_visible(False)
     return figure
 
 
-def _draw(axes: Any, panel: Panel, figure: Figure) -> None:
+def _draw(axes: Any, panel: Panel, figure: Figure, columns: int) -> None:
     for item in panel.lines:
         if isinstance(item, HeatMap):
             mesh = axes.pcolormesh(item.x, item.y, item.z, cmap="cividis", shading="nearest", rasterized=True)
@@ -79,7 +82,6 @@ def _draw(axes: Any, panel: Panel, figure: Figure) -> None:
                     {"rotation": 90, "ha": "left", "va": "top"} if mark.upright else {"ha": "right", "va": "bottom"}
                 )
                 axes.text(*place, mark.label, transform=to, color=mark.colour, fontsize=7, clip_on=True, **turned)
-    axes.set_title(panel.title, loc="left", fontsize=10)
     axes.set_xlabel(panel.x_label, fontsize=9)
     axes.set_ylabel(panel.y_label, fontsize=9)
     axes.set_xscale("log" if panel.log_x else "linear")
@@ -96,8 +98,22 @@ def _draw(axes: Any, panel: Panel, figure: Figure) -> None:
     if panel.equal:
         axes.set_aspect("equal", adjustable="box" if panel.x_range else "datalim")
     axes.grid(alpha=0.3)
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(fontsize=7, loc="best")
+    _head(axes, panel.title, columns)
+
+
+def _head(axes: Any, title: str, columns: int) -> None:
+    """Title and legend above the axes, where they lie over no curve."""
+    labels = axes.get_legend_handles_labels()[1]
+    if not labels:
+        axes.set_title(title, loc="left", fontsize=10)
+        return
+    # As many entries in a row as there is room for: the handle of an entry is as wide as four letters.
+    fitting = int(LETTERS / columns / (max(map(len, labels)) + 4))
+    place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2, "ncols": max(1, fitting)}
+    legend = axes.legend(title=title, alignment="left", frameon=False, fontsize=7, title_fontsize=10, **place)
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D):
+            handle.set_linewidth(min(handle.get_linewidth(), THICKEST))
 
 
 def _draw_line(axes: Any, line: Line) -> None:

@@ -42,6 +42,26 @@ def with_deviation(value: float, deviation: float | None = None) -> str:
     return plain_zero(f"{value:.{decimals}f} ({deviation:.{decimals}f})")
 
 
+def plus_minus(value: float, error: float, unit: str = "") -> str:
+    """A number with the digits that its error (two standard deviations) justifies: two digits of the error.
+
+    Four digits where no error is known.
+
+    Examples
+    --------
+    >>> plus_minus(1.42913, 0.0043)
+    '1.4291 +- 0.0043'
+    >>> plus_minus(45.09, 3.2, " deg")
+    '45.1 +- 3.2 deg'
+    >>> plus_minus(-0.00004, float("nan"))
+    '-4e-05'
+    """
+    if not (math.isfinite(error) and error > 0):
+        return plain_zero(f"{value:.4g}") + unit
+    decimals = min(max(1 - int(f"{error:.1e}".partition("e")[2]), 0), 8)
+    return plain_zero(f"{value:.{decimals}f} +- {error:.{decimals}f}") + unit
+
+
 def text_table(columns: Sequence[str], rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
     """Lines of a table: first column left-aligned, the others right-aligned.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -11,12 +10,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
+from mimopilot.common.charts import LIMIT, looks
 from mimopilot.sitl.campaign.flights import FlightRunner
 from mimopilot.sitl.campaign.plan import CampaignPlan
 from mimopilot.sitl.campaign.results import CampaignResults
 from mimopilot.sitl.campaign.varied import label, varied
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.flight.figures import SETPOINT, STYLES
+from mimopilot.sitl.flight.figures import SETPOINT
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from mimopilot.sitl.flight.scenario import AXES
 
@@ -26,7 +26,6 @@ FLIGHTS_PER_CELL = 8  # least average number of flights per cell of the map
 POINTS = 300  # points of a distribution curve
 CROSSES = 200  # largest number of lost flights marked in the map
 LARGEST = 75.0  # deg: limit of the angle axis of the envelopes
-VERMILLION = "#D55E00"  # Okabe and Ito's palette for colour blindness
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +42,11 @@ class EnvelopeSample:
 
     angles: dict[tuple[str, int], NDArray[np.float32]]
     survived: dict[tuple[str, int], NDArray[np.bool_]]
+
+
+def set_looks(plan: CampaignPlan) -> dict[str, tuple[str, str]]:
+    """Gain set -> its colour and line style: the same as in every other report."""
+    return dict(zip(plan.gains, looks([gains.provenance.kind for gains in plan.gains.values()]), strict=True))
 
 
 def fly_sample(runner: FlightRunner) -> EnvelopeSample:
@@ -79,7 +83,7 @@ def envelope_figure(runner: FlightRunner, sample: EnvelopeSample, results: Campa
     time = (np.arange(len(scenario.setpoint)) - scenario.window[0]) * scenario.Ts
     figure = Figure(figsize=(9, 0.9 + 2.6 * len(plan.gains)), layout="constrained")
     panels: Any = figure.subplots(len(plan.gains), 2, sharex=True, sharey="col", squeeze=False)
-    for row, name, (colour, _) in zip(panels, plan.gains, cycle(STYLES), strict=False):
+    for row, (name, (colour, _)) in zip(panels, set_looks(plan).items(), strict=True):
         angles, survived = sample.angles[name, index], sample.survived[name, index]
         bad = results.worst(name, AXES[axis], 1)[0].run
         worst = np.degrees(runner.fly(runner.draw(bad), name, index).truth["attitude"][:, :2])
@@ -114,7 +118,7 @@ def distribution_figure(results: CampaignResults, axis: str) -> Figure:
     figure = Figure(figsize=(9, 6), layout="constrained")
     panels: Any = figure.subplots(2, 2, sharey=True)
     for panel, name in zip(panels.flat, names, strict=True):
-        for gains, (colour, style) in zip(plan.gains, cycle(STYLES), strict=False):
+        for gains, (colour, style) in set_looks(plan).items():
             survived = results.column("survived", gains, axis)
             ordered = np.sort(results.column(name, gains, axis)[survived])
             if not len(ordered):
@@ -174,7 +178,8 @@ def _correlation(value: NDArray[Any], other: NDArray[Any]) -> float:
     if np.ptp(value) == 0 or np.ptp(other.astype(float)) == 0:
         return 0.0
     both = (rankdata(value), rankdata(np.abs(value - np.median(value))))
-    return max(abs(float(np.corrcoef(one, other)[0, 1])) for one in both)
+    # Two values have the same distance from their median: those are no quantity that could matter.
+    return max(abs(float(np.corrcoef(one, other)[0, 1])) for one in both if np.ptp(one) > 0)
 
 
 def survival_figure(results: CampaignResults, axis: str, names: tuple[str, str]) -> Figure:
@@ -194,7 +199,7 @@ def survival_figure(results: CampaignResults, axis: str, names: tuple[str, str])
         share = np.divide(good, all_flights, out=np.full_like(good, np.nan), where=all_flights > 0)
         image = panel.pcolormesh(*edges, share.T, cmap="cividis", vmin=0, vmax=1, rasterized=True)
         lost = np.flatnonzero(~survived)[:CROSSES]
-        panel.plot(x[lost], y[lost], "x", color=VERMILLION, markersize=3, markeredgewidth=0.8)
+        panel.plot(x[lost], y[lost], "x", color=LIMIT, markersize=3, markeredgewidth=0.8)
         panel.set_title(f"{gains}: {int(survived.sum())} of {len(survived)} survived", loc="left", fontsize=10)
         panel.set_facecolor("white")
     for panel in panels[-1]:

@@ -16,6 +16,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mimopilot.common.console import progress_console
+from mimopilot.common.extras import CLUSTER
 from mimopilot.common.files import inside
 from mimopilot.common.parallel import processes, run_all
 from mimopilot.common.part_folder import RESUME, PartFolder, UnusablePartError, folder_lock
@@ -105,11 +106,10 @@ def _executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executor, i
         with processes(workers) as executor:
             yield executor, 2 * workers
         return
-    try:
-        from distributed import Client, KilledWorker
-        from distributed.comm import CommClosedError
-    except ImportError:
-        raise SitlError("--scheduler needs dask: pip install 'mimopilot[cluster]'") from None
+    CLUSTER.need()
+    from distributed import Client, KilledWorker
+    from distributed.comm import CommClosedError
+
     try:
         client = Client(scheduler, timeout=5)
     except (OSError, ValueError) as error:

@@ -28,6 +28,10 @@ INTERVALS = (
     "counts as worse than any surviving one. Pairs: differences in the same run, over the runs that both sets survive."
 )
 
+#: Where no quantity varies.
+NOTHING_VARIED = (
+    "Nothing varied but the noise of the sensors: name a file with --vary to fly vehicles that differ from one another."
+)
 #: Captions of tables.
 VARIED, PAIRS = "What varied", "Pairs of gain sets, run by run"
 
@@ -62,13 +66,14 @@ def write_campaign_report(
         ReportTable("Worst flights; run the commands in this folder", WORST_COLUMNS, worst_rows(summary, ".")),
     ]
     tables = [table for table in tables if table.rows]
+    nothing = "" if summary.varied else f"{NOTHING_VARIED} "
     sample = campaign_figures.fly_sample(runner)
     envelopes = [
         svg(campaign_figures.envelope_figure(runner, sample, results, index), f"envelope {axis}")
         for index, axis in enumerate(d.axes)
     ]
     sections = [
-        Section("Summary", INTERVALS, tables=tables),
+        Section("Summary", nothing + INTERVALS, tables=tables),
         Section(
             "Responses",
             "True angles of the surviving runs among the first "
@@ -84,10 +89,7 @@ def write_campaign_report(
             ],
         ),
     ]
-    names = over or campaign_figures.choose_map(results)
-    if names:
-        maps = [svg(campaign_figures.survival_figure(results, axis, names), f"map {axis}") for axis in d.axes]
-        sections.append(Section("Survival", "Over two varied quantities.", figures=maps))
+    sections.append(_survival(results, summary, over))
     sections.append(
         Section(
             "What was flown", "", tables=[ReportTable(SPEC, ("",), [[line] for line in plan.files[SPEC].splitlines()])]
@@ -96,3 +98,20 @@ def write_campaign_report(
     path = inside(results.path.parent, REPORT)
     write_report(path, f"mimopilot campaign: {plan.airframe.name}", lead, sections)
     return path
+
+
+def _survival(results: CampaignResults, summary: CampaignSummary, over: tuple[str, str] | None) -> Section:
+    """Maps of survival over two quantities, for each axis on which some flights are lost; else what happened."""
+    heading, names = "Survival", over or campaign_figures.choose_map(results)
+    if names is None:
+        return Section(heading, "No map: it needs two quantities that vary.")
+    points, maps = [], []
+    for axis in results.plan.description.axes:
+        groups = [group for group in summary.groups if group.axis == axis]
+        flights, survived = sum(group.flights for group in groups), sum(group.survived for group in groups)
+        if 0 < survived < flights:
+            maps.append(svg(campaign_figures.survival_figure(results, axis, names), f"map {axis}"))
+        else:
+            fate = "survived" if survived else "were lost"
+            points.append(f"{axis}: all {flights} flights {fate}: a map of survival would have one colour.")
+    return Section(heading, "Over two varied quantities." if maps else "", figures=maps, points=points)

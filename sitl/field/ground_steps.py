@@ -7,7 +7,6 @@ import math
 from typing import Any
 
 from mimopilot.common.blas import reproducible
-from mimopilot.common.errors import Error
 from mimopilot.common.files import sha256
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_report import write_autotune_report
@@ -243,8 +242,8 @@ def judge(run: AutotuneRun) -> Found:
     run.dialogue.show_check(result)
     try:
         write_autotune_report(run, gains, result)
-    except Error as error:  # a page that cannot be made decides nothing
-        run.dialogue.tell(f"no report: {error}")
+    except Exception as error:  # whatever fails in a page, also a mistake of ours: it decides nothing about the gains
+        run.dialogue.tell(f"no report: {error or type(error).__name__}")
     if result.worse:
         raise Decided(f"the check flight is worse than predicted: {'; '.join(result.worse)}")
     return result.as_table()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from mimopilot.common.charts import AXIS_COLOURS
 from mimopilot.common.charts import STYLES as STYLES
 from mimopilot.common.charts import svg as svg
 from mimopilot.sitl.flight.metrics import reference_responses
@@ -89,8 +90,7 @@ def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
         # The overview is drawn as pixels: its lines would be most of the size of a report.
         for panel, width, pixels in zip(row, (0.4, 1.2), (True, False), strict=True):
             for axis in shown:
-                colour = (STYLES[1], STYLES[0], STYLES[2])[axis][0]
-                line = {"color": colour, "linewidth": width, "rasterized": pixels, "label": ALL_AXES[axis]}
+                line = {"color": AXIS_COLOURS[axis], "linewidth": width, "rasterized": pixels, "label": ALL_AXES[axis]}
                 panel.step(time, values[:, axis], where="post", **line)
             panel.grid(alpha=0.3)
         row[0].set_ylabel(text)

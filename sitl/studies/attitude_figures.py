@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from mimopilot.sitl.flight.figures import STYLES
+from mimopilot.common.charts import AXIS_COLOURS, FIFTH, FLOWN, STYLES
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS, reference_responses
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.flight.simulator import Flight
@@ -28,7 +28,7 @@ from mimopilot.sitl.studies.attitude_study import (
 #: Methods in the plots; method -> (colour, line style) and marker.
 TUNED = (SISO_THESIS, MIMO_THESIS, SISO, MIMO)
 LOOK = {
-    SISO_THESIS: (("#E69F00", ":"), "s"),
+    SISO_THESIS: ((FIFTH, ":"), "s"),
     MIMO_THESIS: (STYLES[3], "o"),
     SISO: (STYLES[1], "^"),
     MIMO: (STYLES[2], "v"),
@@ -117,7 +117,7 @@ def experiment_motors_figure(flight: Flight, rotors: int, title: str) -> Figure:
         command = flight.record["commands"][:, motor]
         # As in `experiment_figure`: the overview is drawn as pixels.
         for panel, width, pixels in zip(panels[motor], (0.4, 1.2), (True, False), strict=True):
-            panel.step(time, command, where="post", color=STYLES[1][0], linewidth=width, rasterized=pixels)
+            panel.step(time, command, where="post", color=FLOWN, linewidth=width, rasterized=pixels)
             panel.axhline(command.mean(), color="black", linewidth=0.8)
             panel.grid(alpha=0.3)
         panels[motor, 0].set_ylabel(f"motor {motor + 1} [-]")
@@ -165,7 +165,7 @@ def costs_figure(
     panels: Any = figure.subplots(3, 2, sharey=True)
     places = np.arange(len(methods))[::-1]
     for panel, (name, text) in zip(panels.flat, COSTS.items(), strict=True):
-        for axis, shift, (colour, _), marker in zip(AXES, (0.16, -0.16), (STYLES[1], STYLES[0]), "os", strict=True):
+        for axis, shift, colour, marker in zip(AXES, (0.16, -0.16), AXIS_COLOURS[:2], "os", strict=True):
             for place, method in zip(places, methods, strict=True):
                 values = found.values(method, axis, name)
                 low, middle, high = np.percentile(values, [LOW, 50, HIGH])

@@ -15,7 +15,7 @@ from mimopilot.tuning.law import Filters
 from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 
 #: (colour, line style) of each controller: Okabe and Ito's palette for colour blindness.
-LINES = (*STYLES, ("#E69F00", (0, (5, 1, 1, 1, 1, 1))))
+LINES = (*STYLES[:4], (STYLES[4][0], (0, (5, 1, 1, 1, 1, 1))))
 
 
 def step_figure(task: Benchmark, controllers: Mapping[str, LoopController], samples: int, title: str) -> Figure:

@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from mimopilot.common.charts import STYLES, svg
+from mimopilot.common.charts import NEW, SETPOINT_COLOUR, svg
 from mimopilot.common.console import json_text, progress_console
 from mimopilot.common.files import inside, write_atomically
 from mimopilot.common.parallel import processes, run_all
@@ -31,7 +31,7 @@ QUANTILES = (0.05, 0.5, 0.95)
 #: Elements of a matrix, row by row: output <- error.
 PAIRS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
 UNITS = {row.key: row.unit or "-" for row in rows(Shape.MATRIX)}
-(CURVE, _), (BARS, _) = STYLES[:2]
+CURVE, BARS = SETPOINT_COLOUR, NEW
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,11 @@ def check_profile(experiment: Experiment, spec: TuningSpec) -> None:
         return
     flown = experiment.flown
     if flown is not None and flown.controller == spec.profile:
+        largest = flown.filters.law.largest
+        if "F" in spec.structure and largest is not None and not any(largest[LOOP_TERMS["F"].matrix]):
+            raise TuningError(
+                f"structure: got {spec.structure}, but the {spec.profile} controller has no F; leave it out"
+            )
         return
     lacking = flown.provenance.details.get(LACKING) if flown is not None else None
     if lacking:
@@ -76,7 +81,7 @@ def stock_starts(base: Gains, experiment: Experiment, omega: float, B: Matrix) -
 
 
 def in_digits(law: AnyLaw) -> AnyLaw:
-    """A stock law with its gains rounded to `DIGITS`, within the autopilot's ranges; ours as it is."""
+    """A stock law with its gains rounded to `DIGITS` or to its steps, within the autopilot's ranges; ours as it is."""
     largest = law.filters.law.largest
     if largest is None:
         return law
@@ -84,7 +89,9 @@ def in_digits(law: AnyLaw) -> AnyLaw:
     def rounded(name: str) -> Matrix:
         values = np.diag(getattr(law, name))
         tops = largest[name][-1:] if len(values) == 1 else largest[name][: len(values)]
-        digits = [float(f"{value:.{DIGITS}g}") for value in values]
+        step = law.filters.law.step.get(name)
+        digits = [step * round(value / step) if step else float(f"{value:.{DIGITS}g}") for value in values]
+        digits = [min(digits)] * len(digits) if name in law.filters.law.shared else digits
         return np.diag([min(max(v, 0.0), top) for v, top in zip(digits, tops, strict=True)])
 
     changed: dict[str, Any] = {name: rounded(name) for name in largest}

@@ -154,9 +154,11 @@ def _before_tumble(recording: Recording, parts: tuple[Interval, ...]) -> tuple[t
     level = np.flatnonzero(inside & (tilt < TUMBLE / 2))
     times = len(np.unique(np.searchsorted(level, beyond)))
     if times >= MAX_TUMBLES:
+        # A log that names its signals knows their units, too.
+        unit = "" if recording.columns is None else "if the angles are in degrees, give their unit; "
         raise TuningError(
             f"{source}: {angles.topic}: a tilt beyond {np.degrees(TUMBLE):.0f} degrees {times} times in the "
-            "experiment: if the angles are in degrees, give their unit; if it was aerobatics, excite in hover instead"
+            f"experiment: {unit}if it was aerobatics, excite in hover instead"
         )
     at = float(angles.time[beyond[0]])
     kept = intersection(parts, ((-np.inf, at - BEFORE_TUMBLE),))

@@ -52,6 +52,11 @@ def _is_delimited_text(head: bytes) -> bool:
     return b"\0" not in head and any(mark in head.partition(b"\n")[0] for mark in (b",", b";", b"\t"))
 
 
+def _is_blackbox_csv(head: bytes) -> bool:
+    """Whether a text has the first column of a decoded blackbox log, or Blackbox Explorer's settings above it."""
+    return not head.startswith(b"H ") and any(mark in head for mark in (b"loopIteration", b"Blackbox flight data"))
+
+
 #: The first row that matches reads the file.
 FORMATS = (
     LogFormat(
@@ -79,6 +84,14 @@ FORMATS = (
         "MathWorks, MAT-File Format (R2019b), level 5: versions 5 to 7",
     ),
     LogFormat(
+        "Betaflight blackbox",
+        (".csv",),
+        _is_blackbox_csv,
+        "mimopilot.tuning.logs.blackbox:record_blackbox",
+        False,
+        "betaflight/blackbox-tools, src/blackbox_decode.c; betaflight/blackbox-log-viewer, src/csv-exporter.js",
+    ),
+    LogFormat(
         "CSV",
         (".csv",),
         _is_delimited_text,
@@ -93,10 +106,10 @@ UNSUPPORTED = {
     b"MATLAB 7.3 MAT-file": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
     b"\x89HDF\r\n\x1a\n": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
     b"FMT,": "an ArduPilot log as text; give the .bin file that it was made from",
-    b"H Product:Blackbox": "a Betaflight log; make a CSV file with blackbox_decode and name its columns with --columns",
+    b"H Product:Blackbox": "a Betaflight log; make a CSV file with blackbox_decode --save-headers",
 }
 
-SUFFIXES = tuple(suffix for row in FORMATS for suffix in row.suffixes)
+SUFFIXES = tuple(dict.fromkeys(suffix for row in FORMATS for suffix in row.suffixes))
 
 
 def known_formats() -> str:

@@ -128,7 +128,7 @@ def read_source(path: Path) -> ParameterSource:
     if not path.is_file():
         raise TuningError(f"{path}: no such file; give a parameter file or a flight log")
     found, _ = log_format(path)
-    if found is None or found.suffixes == (".csv",):  # parameter files have commas, too
+    if found is None or (found.takes_columns and ".csv" in found.suffixes):  # parameter files have commas, too
         values = {name: entry.value for name, entry in read_parameter_file(path).items()}
         return ParameterSource(path.name, "parameter file", values, sha256(read_bytes(path, "parameter file")))
     if found.takes_columns:

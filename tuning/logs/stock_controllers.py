@@ -1,4 +1,4 @@
-"""The controllers of PX4 and ArduPilot: which of their parameters is which of our gains."""
+"""The controllers of PX4, ArduPilot and Betaflight: which of their parameters is which of our gains."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from mimopilot.tuning.gains import Limits
-from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, PX4_STOCK, StockFilters
+from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, BETAFLIGHT, LAWS, PX4_STOCK, StockFilters
 from mimopilot.tuning.parameter_row import AXIS_LETTERS, Row, Shape
 
 
@@ -22,7 +22,7 @@ class StockController:
     axes : tuple of 3 str
         Its names of roll, pitch and yaw.
     gains : mapping
-        Matrix -> parameter of an axis.
+        Matrix -> parameter of an axis; empty: it has none, the gain is 0.
     factor : str
         Parameter of an axis that multiplies the rate terms; empty: none.
     limits : mapping
@@ -42,6 +42,8 @@ class StockController:
         Scalar of our table -> parameter.
     unlimited : mapping
         Limit -> value where the parameter is 0, which means that there is no limit.
+    fixed : mapping
+        Element of the table -> value where it has no parameter.
     """
 
     name: str
@@ -56,6 +58,7 @@ class StockController:
     later: tuple[str, ...]
     scalars: Mapping[str, str] = field(default_factory=dict)
     unlimited: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    fixed: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def filter_names(self) -> list[str]:
@@ -86,7 +89,9 @@ class StockController:
         if row.shape is Shape.AXES:
             name = self.limits[row.key][axis][0]
             return (name,) if name else ()
-        own = self.gains[row.key].format(axis=self.axes[axis])
+        own = "" if code in self.fixed else self.gains[row.key].format(axis=self.axes[axis])
+        if not own:
+            return ()
         return (own, self.factor.format(axis=self.axes[axis])) if self.factor and row.key in _SCALED else (own,)
 
     def value(self, row: Row, code: str, values: Mapping[str, float]) -> float:
@@ -104,9 +109,10 @@ class StockController:
         if row.key not in self.gains:
             return math.nan
         if not names:
-            return 0.0
+            return self.fixed.get(code, 0.0)
         own, *factors = names
-        return math.prod(values.get(name, 1.0) for name in factors) * values.get(own, math.nan)
+        step = LAWS[self.profile].step.get(row.key, 1.0)
+        return math.prod(values.get(name, 1.0) for name in factors) * step * values.get(own, math.nan)
 
 
 _DEGREE = math.pi / 180
@@ -173,7 +179,37 @@ ARDUPILOT = StockController(
     unlimited={"rate_max": Limits().rate_max},
 )
 
+_BETAFLIGHT_AXES = ("roll", "pitch", "yaw")
+BETAFLIGHT_STOCK = StockController(
+    name="Betaflight",
+    axes=_BETAFLIGHT_AXES,
+    gains={
+        "Kp_o": "angle_p_gain",
+        "Kp_i": "p_{axis}",
+        "Ki_i": "i_{axis}",
+        "Kd_i": "d_{axis}",
+        "Kff_i": "",  # its feed-forward follows the speed of the sticks
+    },
+    factor="",
+    limits={
+        "rate_max": [(f"{axis}_rate_limit", _DEGREE, math.nan) for axis in _BETAFLIGHT_AXES],
+        "moment_max": [(name, 1e-3, math.nan) for name in ("pidsum_limit", "pidsum_limit", "pidsum_limit_yaw")],
+        "integral_max": [(name, 1e-3, math.nan) for name in ("iterm_limit", "iterm_limit", "iterm_limit_yaw")],
+    },
+    cutoffs={},
+    rate="pid_loop_hz",
+    profile=BETAFLIGHT,
+    filters={
+        "derivative_hz": ("dterm_lpf1_static_hz",) * 3,
+        "derivative2_hz": ("dterm_lpf2_static_hz",) * 3,
+    },
+    later=(),
+    # It holds no heading: the smallest gain that a set can have.
+    fixed={"AP_YY": 0.01},
+)
+_STOCKS = {"ATC_RAT_RLL_P": ARDUPILOT, "p_roll": BETAFLIGHT_STOCK}
+
 
 def stock_of(values: Mapping[str, float]) -> StockController:
     """The controller whose parameters these are; PX4's if they do not tell."""
-    return ARDUPILOT if "ATC_RAT_RLL_P" in values else PX4
+    return next((stock for name, stock in _STOCKS.items() if name in values), PX4)

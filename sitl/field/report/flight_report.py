@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mimopilot.common.errors import Error
+from mimopilot.common.extras import REPORT
 from mimopilot.common.figures import Chart
 from mimopilot.common.html_report import Headline, ReportTable, Section, write_report
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight, gain_cases, read_flights
 from mimopilot.sitl.field.report.headline import headline, lead
 from mimopilot.sitl.field.report.sections.compare import compare_section
 from mimopilot.sitl.field.report.sections.frequency import frequency_section
-from mimopilot.sitl.field.report.sections.gain_sets import gains_section, prediction_section
+from mimopilot.sitl.field.report.sections.gain_sets import gains_section
+from mimopilot.sitl.field.report.sections.prediction import prediction_section
 from mimopilot.sitl.field.report.sections.spectra import filter_section, flight_spectra, spectra_section
 from mimopilot.sitl.field.report.sections.stability import stability_section
 from mimopilot.sitl.field.report.sections.steps import step_section
@@ -91,8 +93,9 @@ def make_report(
     Raises
     ------
     Error
-        When there are too many logs, a file is no flight log, or two sets have one name.
+        When there are too many logs, a file is no flight log, two sets have one name, or plotly is not installed.
     """
+    REPORT.need()
     check_count(len(logs))
     task = spec or TuningSpec()
     flights = read_flights(logs, columns)

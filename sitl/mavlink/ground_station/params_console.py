@@ -9,6 +9,7 @@ from mimopilot.common.console import print_json, print_table
 from mimopilot.common.files import write_atomically
 from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
 from mimopilot.sitl.mavlink.wire.float32 import shortest
@@ -16,6 +17,7 @@ from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
 from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
+from mimopilot.tuning.law_terms import BETAFLIGHT
 from mimopilot.tuning.parameters import PARAMETERS
 
 #: Format -> code generation target that emits it, and its path there.
@@ -59,17 +61,21 @@ def export(file: Path | None, options: LinkOptions, form: str, out: Path | None,
     SitlError
         If the format is unknown, or there is nothing to export.
     """
-    if form not in (*FORMATS, *GENERATED):
-        raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *GENERATED])}")
+    from_gains = (*GENERATED, BETAFLIGHT)
+    if form not in (*FORMATS, *from_gains):
+        raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *from_gains])}")
     if file is not None:
         gains = load_gains(file)
         warning = check_verdict(gains, allow=uncertified)
         if warning:
             warn(file, [warning])
-        text = _generated(gains, form) if form in GENERATED else parameter_text(form, make_plan(gains).values)
+        if form == BETAFLIGHT:
+            text = betaflight_lines(gains)
+        else:
+            text = _generated(gains, form) if form in GENERATED else parameter_text(form, make_plan(gains).values)
     elif not options.connect:
         raise SitlError("give a gains file to write, --connect to read from a vehicle, or both to compare them")
-    elif form in GENERATED:
+    elif form in from_gains:
         raise SitlError(f"--format {form}: needs a gains file; a vehicle cannot be written in this format")
     else:
         with open_session(options) as vehicle:

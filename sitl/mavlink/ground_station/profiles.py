@@ -16,7 +16,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains, Limits, Triple
-from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, MIMO, PX4_STOCK, StockFilters
+from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, BETAFLIGHT, MIMO, PX4_STOCK, StockFilters
 from mimopilot.tuning.parameter_row import PREFIX, Parameter, Shape
 from mimopilot.tuning.parameters import (
     ARDUPILOT_EXCITATION,
@@ -199,6 +199,11 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
     CodegenError
         If a value is out of the range of our module's parameter.
     """
+    if BETAFLIGHT in (profile, gains.controller):
+        raise SitlError(
+            f"the gains are for {gains.controller}: Betaflight takes no parameters over MAVLink; write lines for its "
+            f"command line: mimopilot params FILE --format {BETAFLIGHT}, of gains from tune LOG --profile {BETAFLIGHT}"
+        )
     if profile not in PROFILES:
         raise SitlError(f"--profile: got {profile!r}, expected one of {', '.join(PROFILES)}")
     if law_of(profile) != gains.controller:

@@ -153,6 +153,21 @@ class Killed(BaseException):
     """The program ends at once, without any of its endings."""
 
 
+@pytest.mark.parametrize("failure", [OSError("no space"), ValueError()])
+def test_a_page_that_cannot_be_made_decides_nothing_about_the_gains(scripted, monkeypatch, failure):
+    field = scripted()
+    old = dict(field.vehicle.set)
+
+    def fail(*_):
+        raise failure
+
+    monkeypatch.setattr(ground_steps, "write_autotune_report", fail)
+    assert field.run() == ""
+    assert field.vehicle.set != old
+    assert json.loads((field.options.folder / "decisions.json").read_text())["result"] == "kept"
+    assert f"no report: {failure or 'ValueError'}" in [text for text in field.user.told if isinstance(text, str)]
+
+
 @pytest.mark.parametrize("writes", [1, 12])
 def test_after_a_kill_in_the_middle_of_the_upload_the_next_run_restores_and_goes_on(scripted, writes):
     field = scripted()

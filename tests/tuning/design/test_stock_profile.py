@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 from mimopilot.common.errors import Error
+from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.design.cascade import certify_from_log, tune
+from mimopilot.tuning.design.stock_profile import in_digits
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.law_terms import StockFilters
 from mimopilot.tuning.spec import TuningSpec, load_spec
@@ -22,6 +25,7 @@ VEHICLE = "adam0_boom"
 FILTERS = {
     "px4-stock": StockFilters("px4-stock", (30.0,) * 3, torque_hz=(0.0, 0.0, 2.0)),
     "ardupilot-stock": StockFilters("ardupilot-stock", (20.0,) * 3, (20.0,) * 3, (0.0, 0.0, 2.5)),
+    "betaflight": StockFilters("betaflight", (75.0,) * 3, derivative2_hz=(150.0,) * 3),
 }
 
 
@@ -57,6 +61,10 @@ def documented(gains, omega):
 
     slope = (z - 1) / (Ts * z) * low_pass(stock.derivative_hz[0])
     Kp, Ki, Kd, Kp_o = (np.diag(getattr(gains, n))[None] for n in ("Kp_i", "Ki_i", "Kd_i", "Kp_o"))
+    if stock.controller == "betaflight":
+        of_y = Kp + Ki * (Ts * z / (z - 1))[:, None] + Kd * (slope * low_pass(stock.derivative2_hz[0]))[:, None]
+        of_r = (Kp + Ki * (Ts * z / (z - 1))[:, None]) * (low_pass(50.0 * 1.961459177) ** 3)[:, None]
+        return of_y[:, :, None] * np.eye(2), (of_r * Kp_o)[:, :, None] * np.eye(2)
     if stock.controller == "px4-stock":
         of_r = Kp + Ki * (Ts / (z - 1))[:, None]
         of_y = of_r + Kd * slope[:, None]
@@ -143,3 +151,54 @@ def test_a_log_of_another_controller_is_refused(log):
 def test_a_stock_law_is_taken_as_it_is(option, name):
     with pytest.raises(Error, match=f"{name}: not with profile px4-stock"):
         load_spec(profile="px4-stock", **option)
+
+
+def whole_numbers(**changes):
+    """A set of Betaflight whose numbers on its command line are known."""
+    degree = np.pi / 180
+    numbers = {"Kp_o": (50, 50), "Kp_i": (45, 47), "Ki_i": (80, 84), "Kd_i": (30, 34), "Kff_i": (0, 0)} | changes
+    scale = {"Kp_o": 0.1, "Kp_i": 0.032029e-3 / degree, "Ki_i": 0.244381e-3 / degree, "Kd_i": 0.000529e-3 / degree}
+    matrices = {name: scale.get(name, 1.0) * np.diag(pair) for name, pair in numbers.items()}
+    return dataclasses.replace(stock_set("betaflight"), **matrices)
+
+
+def test_betaflights_lines_hold_the_numbers_of_its_command_line(tmp_path):
+    path = tmp_path / "bf.gains.toml"
+    whole_numbers().save(path)
+    lines = betaflight_lines(load_gains(path)).splitlines()
+    gains = ("p_roll = 45", "i_roll = 80", "d_roll = 30", "p_pitch = 47", "i_pitch = 84", "d_pitch = 34")
+    others = ("angle_p_gain = 50", "d_max_roll = 0", "dterm_lpf1_static_hz = 75", "dterm_lpf2_static_hz = 150")
+    assert {f"set {line}" for line in (*gains, *others)} <= set(lines)
+    assert lines[-1] == "save"
+
+
+def test_betaflight_takes_only_what_was_certified_as_it_flies():
+    for gains, message in (
+        (
+            dataclasses.replace(defaults(VEHICLE), Kp_i=np.array([[0.15, 0.02], [0.0, 0.15]])),
+            r"are for mimo: .* off-diagonals \(up to 0\..*would be lost.*tune LOG --profile betaflight",
+        ),
+        (
+            whole_numbers(Kp_i=(45.5, 47)),
+            r"p_roll: got 45\.5, expected a whole number from 0 to 250: rounding would fly",
+        ),
+        (whole_numbers(Kd_i=(30, 251)), "d_pitch: got 251, expected a whole number from 0 to 250"),
+        (whole_numbers(Kp_o=(50, 51)), r"angle_p_gain: got \[50, 51\] for roll and pitch"),
+    ):
+        with pytest.raises(Error, match=message):
+            betaflight_lines(gains)
+    with pytest.raises(Error, match=r"over MAVLink.*--format betaflight"):
+        make_plan(whole_numbers(), "betaflight")
+
+
+def test_a_design_for_betaflight_is_rounded_to_its_numbers_before_the_certificate():
+    rounded = in_digits(whole_numbers(Kp_i=(45.4, 300), Kp_o=(52.6, 50.2), Kd_i=(29.6, 34.4)))
+    expected = whole_numbers(Kp_i=(45, 250), Kp_o=(50, 50), Kd_i=(30, 34))
+    for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i"):
+        np.testing.assert_allclose(getattr(rounded, name), getattr(expected, name), rtol=1e-12)
+
+
+def test_feed_forward_of_the_rate_setpoint_is_not_in_betaflights_law(log):
+    flown = dataclasses.replace(log, flown=stock_set("betaflight"))
+    with pytest.raises(TuningError, match="structure: got PIDF, but the betaflight controller has no F"):
+        tune(flown, TuningSpec(profile="betaflight", structure="PIDF"))

@@ -30,6 +30,16 @@ def test_an_unknown_format_is_refused_with_the_known_ones(tmp_path):
 
 
 def test_a_file_matches_one_format_at_most():
-    heads = (b"ULog\x01\x12\x35\x01", b"\xa3\x95\x80", b"MATLAB 5.0 MAT-file, Platform\x00", b"t,p,q\n0,1,2\n")
+    heads = (
+        b"ULog\x01\x12\x35\x01",
+        b"\xa3\x95\x80",
+        b"MATLAB 5.0 MAT-file, Platform\x00",
+        b"loopIteration, time (us), axisP[0]\n0, 1, 2\n",
+        b"t,p,q\n0,1,2\n",
+    )
     for head, row in zip(heads, FORMATS, strict=True):
-        assert [one for one in FORMATS if one.matches(head)] == [row]
+        first = next(one for one in FORMATS if one.matches(head))
+        assert first == row
+        # Of decoded blackbox logs, which are CSV files, too, the names of the columns are known.
+        others = [one.name for one in FORMATS if one.matches(head) and one != row]
+        assert others == (["CSV"] if row.name == "Betaflight blackbox" else [])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.common.charts import FLOWN, FURTHER, NEW, SISO
+from mimopilot.common.charts import INJECTED, IS_FLOWN, IS_NEW, IS_SISO, LIMIT, looks
 from mimopilot.common.figures import MOST_SAMPLES
 from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals, further_signals
 from mimopilot.tuning.design.cascade import certify_from_log
@@ -23,6 +23,7 @@ from mimopilot.tuning.logs.inspection import Inspection, inspect_log
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import MAX_GAP, Interval, Series, sampling_period
 from mimopilot.tuning.motors import END
+from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
@@ -32,19 +33,21 @@ from mimopilot.tuning.spec import TuningSpec
 AT_LIMIT = 0.999
 #: Parameters of the control rate, Hz, and the period (s) if none is logged: that of this project's controllers.
 RATES, USUAL_PERIOD = ("SCHED_LOOP_RATE", "IMU_GYRO_RATEMAX"), 0.004
+#: Shortest time on the ground that is shown, s: one sample is none.
+SHORTEST = 0.1
+#: Relative error of a gain that a vehicle stores and logs in single precision.
+STORED = 1e-5
 #: Pauses in saturation or excitation that do not end a phase, s.
 BRIDGE = 0.5
-#: Colours and line styles of gain sets and flights in their order: what was, what is new, further ones.
-LOOKS = ((FLOWN, ":"), (NEW, "-"), (FURTHER, "-."), (SISO, "--"))
 
-#: Phase -> its colour, from top to bottom of the timeline.
+#: Phase -> its colour, from top to bottom of the timeline; of P. Tol's palette, apart from the colours of gain sets.
 PHASES = {
-    "ground": "#999999",
-    "air": "#56B4E9",
-    "excitation": "#009E73",
-    "used": "#0072B2",
-    "saturated": "#E69F00",
-    "crash": "#B00020",
+    "ground": "#bbbbbb",
+    "air": "#88CCEE",
+    "excitation": INJECTED,
+    "used": "#44AA99",
+    "saturated": "#DDCC77",
+    "crash": LIMIT,
     "gaps": "#1a1a1a",
 }
 
@@ -123,20 +126,28 @@ class ReportedFlight:
         length = self.span[1] - self.span[0]
         logged = self.recording.airborne is not None
         edges = [0.0, *(edge for part in self.airborne for edge in part), length]
-        ground = tuple((a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b > a) if logged else ()
+        pauses = zip(edges[::2], edges[1::2], strict=True)
+        ground = tuple((a, b) for a, b in pauses if b - a >= SHORTEST) if logged else ()
         return {
             "ground": ground,
             "air": self.airborne if logged else (),
-            "excitation": self._excited(),
-            "used": self.found.parts,
+            "excitation": self._excited((self.recording.signals, self.recording.yaw)),
+            "used": self._used(),
             "saturated": self._saturated(),
             "crash": intersection(self.tumbles, self.airborne) if logged else self.tumbles,
             "gaps": self._gaps(),
         }
 
-    def _excited(self) -> tuple[Interval, ...]:
+    def _used(self) -> tuple[Interval, ...]:
+        """What gains are tuned from, those of yaw, too; nothing in a log that they cannot be tuned from."""
+        if self.found.experiment is None or self.found.reason:
+            return ()
+        yaw = self._excited((self.recording.yaw,)) if self.yaw_response is not None else ()
+        return bridged(tuple(sorted((*self.found.parts, *intersection(yaw, self.airborne)))), BRIDGE)
+
+    def _excited(self, sources: Sequence[Mapping[str, Series]]) -> tuple[Interval, ...]:
         parts: tuple[Interval, ...] = ()
-        for signals in (self.recording.signals, self.recording.yaw):
+        for signals in sources:
             for name in ("u_bar", "r_bar"):
                 if name in signals:
                     series = self.since_begin(signals[name])
@@ -188,6 +199,14 @@ class ReportedFlight:
         """The response continued to all frequencies; None if too few are known."""
         try:
             return wide_response(self.measured) if self.measured else None
+        except TuningError:
+            return None
+
+    @cached_property
+    def wide_yaw(self) -> WideResponse | None:
+        """The same of yaw alone; None where the log does not excite it enough."""
+        try:
+            return wide_response(self.measured.yaw) if self.measured else None
         except TuningError:
             return None
 
@@ -249,12 +268,21 @@ def read_flights(logs: Sequence[Path], columns: Columns | None) -> list[Reported
     names = [path.name for path in logs]
     labels = [str(Path(path.parent.name) / path.name) if names.count(path.name) > 1 else path.name for path in logs]
     flights = []
-    for place, (path, label) in enumerate(zip(logs, labels, strict=True)):
+    for path, label, (colour, dash) in zip(logs, labels, looks(_kinds(len(logs))), strict=True):
         found = inspect_log(path, columns)
-        colour, dash = LOOKS[place % len(LOOKS)]
         samples = MOST_SAMPLES if len(logs) == 1 else 2 * MOST_SAMPLES // (len(logs) + 1)
         flights.append(ReportedFlight(label, found, further_signals(found.recording), colour, dash, samples))
     return flights
+
+
+def _kinds(flights: int) -> list[str]:
+    """What the flights are: the first one is that before, the others fly something new."""
+    return [IS_FLOWN] + [IS_NEW] * (flights - 1)
+
+
+def _alike(one: Gains, other: Gains) -> bool:
+    """Whether two sets are the same one, of which a vehicle stores single precision."""
+    return all(np.allclose(getattr(one, name), getattr(other, name), rtol=STORED) for name in MATRICES)
 
 
 def gain_cases(
@@ -276,10 +304,12 @@ def gain_cases(
             label = "flown" if len(flights) == 1 else f"flown in {flight.label}"
             cases.append(GainCase(label, flight.colour, flight.dash, flown, flight, True))
     tunable = next((flight for flight in flights if flight.measured), flights[0])
-    used = {(case.colour, case.dash) for case in cases}
-    free = [look for look in LOOKS if look not in used] or list(LOOKS)
-    for place, (name, gains) in enumerate(sets):
-        colour, dash = (SISO, "--") if gains.provenance.method == "siso" else free[place % len(free)]
+    # A set that is none of a flight has no flight's colour; one set beside one flight is the new one.
+    kinds = [gains.provenance.kind if gains.provenance.kind == IS_SISO else IS_NEW for _, gains in sets]
+    free = looks([*_kinds(len(flights)), *kinds])[len(flights) :]
+    for (name, gains), look in zip(sets, free, strict=True):
+        same = next((case for case in cases if case.flown and _alike(case.gains, gains)), None)
+        colour, dash = (same.colour, same.dash) if same else look
         cases.append(GainCase(name, colour, dash, gains, tunable, False))
     return [_examined(case, spec) for case in cases]
 

@@ -3,55 +3,81 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mimopilot.common.charts import NEW
 from mimopilot.common.figures import Chart, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.analysis.filters_advice import least_phase, torque_rms
+from mimopilot.common.text_table import plus_minus
+from mimopilot.sitl.field.report.analysis.filters_advice import torque_rms
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
-from mimopilot.sitl.field.report.sections.gain_sets import PREDICTED, predicted
+from mimopilot.sitl.field.report.sections.prediction import BOTH, PREDICTED, YAW, attitude_model, predicted
 from mimopilot.sitl.field.report.sections.spectra import FlightSpectra
 from mimopilot.sitl.field.report.sections.steps import step_estimates
 from mimopilot.sitl.field.report.sections.tracking import tracking_error
-from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.axes import axis_names
 from mimopilot.tuning.logs.inspection import AXES
 
 HEADING = "Before and after"
 
 
+@dataclass(frozen=True)
+class Compared:
+    """A figure before and after: its values, and the error of each and of their difference; NaN: not known."""
+
+    before: float
+    after: float
+    errors: tuple[float, float] = (float("nan"), float("nan"))
+    doubt: float = float("nan")
+
+    def row(self, name: str) -> list[str]:
+        """Both, the difference with as many digits as its error justifies, and the difference in percent."""
+        change = self.after - self.before
+        share = f"{100 * change / self.before:+.0f} %" if self.before else "-"
+        cells = [plus_minus(value, error) for value, error in zip((self.before, self.after), self.errors, strict=True)]
+        text = plus_minus(change, self.doubt)
+        return [name, *cells, text if text.startswith("-") else f"+{text}", share]
+
+
 def compare_section(found: Sequence[FlightSpectra], cases: Sequence[GainCase]) -> Section | None:
-    """The comparison of the first two flights, else of the first two gain sets; None if there is one of each."""
+    """The comparison of the first two flights, and of two gain sets; None if there is one of each."""
+    texts, tables, charts = list[str](), list[ReportTable](), list[Chart]()
     if len(found) > 1:
         before, after = found[:2]
-        figures = [_flight_figures(one) for one in (before, after)]
         labels = (before.flight.label, after.flight.label)
-        charts = _overlaid(before, after)
-        text = (
-            f"Before: {labels[0]}. After: {labels[1]}. Both flights on the same axes; their step responses are above."
+        texts.append(
+            f"Before: {labels[0]}. After: {labels[1]}. Both flights on the same axes; their step responses are below."
         )
-    elif len(cases) > 1:
-        pair = cases[0], cases[-1]
-        figures, labels, charts = [_set_figures(one, pair[1].gains) for one in pair], (pair[0].label, pair[1].label), []
-        text = f"Before: {labels[0]}. After: {labels[1]}, around the vehicle of {pair[1].flight.label}."
-    else:
+        figures = [_flight_figures(one) for one in (before, after)]
+        flown = {name: Compared(value, figures[1][name]) for name, value in figures[0].items() if name in figures[1]}
+        tables.append(difference_table("The flights", labels, flown))
+        charts = _overlaid(before, after)
+    pair = _pair(cases)
+    if pair is not None:
+        names = (pair[0].label, pair[1].label)
+        texts.append(f"Gain sets: before: {names[0]}; after: {names[1]}.")
+        tables.append(difference_table("The gain sets (+- two standard deviations)", names, _set_figures(*pair)))
+    if not texts:
         return None
-    table = difference_table(labels, figures)
-    if not table.rows:
-        return Section(HEADING, f"{text} They share no figure that could be compared.")
-    return Section(HEADING, text, tables=[table], charts=charts)
+    tables = [table for table in tables if table.rows]
+    if not tables:
+        texts.append("They share no figure that could be compared.")
+    return Section(HEADING, " ".join(texts), tables=tables, charts=charts)
 
 
-def difference_table(labels: tuple[str, str], figures: Sequence[Mapping[str, float]]) -> ReportTable:
+def _pair(cases: Sequence[GainCase]) -> tuple[GainCase, GainCase] | None:
+    """The flown gains of the first flight and the newest set, if those have a certificate each."""
+    if len(cases) < 2:
+        return None
+    judged = [case for case in cases if not case.problem and case.gains.certificate and case.gains.certificate.figures]
+    return (judged[0], judged[-1]) if len(judged) > 1 else None
+
+
+def difference_table(caption: str, labels: tuple[str, str], figures: Mapping[str, Compared]) -> ReportTable:
     """Figures that both have, their difference and its share."""
-    rows = []
-    for name, before in figures[0].items():
-        after = figures[1].get(name, np.nan)
-        if np.isfinite(before) and np.isfinite(after):
-            share = f"{(after / before - 1):+.0%}" if before else "-"
-            rows.append([name, f"{before:.4g}", f"{after:.4g}", f"{after - before + 0.0:+.3g}", share])
-    return ReportTable("Figures", ("", *labels, "difference", "in percent"), rows)
+    rows = [one.row(name) for name, one in figures.items() if np.isfinite(one.before) and np.isfinite(one.after)]
+    return ReportTable(caption, ("", *labels, "difference", "in percent"), rows)
 
 
 def _flight_figures(one: FlightSpectra) -> dict[str, float]:
@@ -60,10 +86,10 @@ def _flight_figures(one: FlightSpectra) -> dict[str, float]:
         error = tracking_error(flight.signal(setpoint), flight.signal(answer), flight.airborne)
         if error is not None:
             for axis, rms in zip(AXES, np.sqrt(np.mean(error**2, axis=0)), strict=True):
-                figures[f"{axis} {what}, RMS of the error [{unit}]"] = float(rms)
+                figures[f"{axis}: RMS of the {what}'s error [{unit}]"] = float(rms)
     for axis, estimate in step_estimates(flight)[0].items():
-        figures[f"{axis}, rise of the step response [s]"] = estimate.rise()
-        figures[f"{axis}, overshoot of the step response [%]"] = 100 * estimate.overshoot()
+        figures[f"{axis}: rise of the step response [s]"] = estimate.rise()
+        figures[f"{axis}: overshoot of the step response [%]"] = 100 * estimate.overshoot()
     if one.gyro is not None:
         above = one.gyro.hertz >= 30.0
         power = one.gyro.density[above].sum(axis=0) * one.gyro.hertz[0]
@@ -73,19 +99,46 @@ def _flight_figures(one: FlightSpectra) -> dict[str, float]:
     return figures
 
 
-def _set_figures(case: GainCase, model: Gains) -> dict[str, float]:
-    certificate = case.gains.certificate
-    if case.problem or certificate is None or not certificate.figures:
-        return {}
-    figures = {"Ms": certificate.figures["Ms"], "smallest phase margin [deg]": least_phase(certificate)}
-    figures["disk margin"] = certificate.figures["disk_margin"]
+def _set_figures(before: GainCase, after: GainCase) -> dict[str, Compared]:
+    """Margins by the certificates and predicted figures of two sets, of roll and pitch, and of yaw."""
+    found = {}
+    certificates = [case.gains.certificate for case in (before, after)]
+    tables = [certificate.figures for certificate in certificates if certificate]
+    # The errors of the margins are not known in pairs: their difference is at most as uncertain as if independent.
+    found["Ms"] = _apart([(one["Ms"], one["Ms_error"]) for one in tables])
     for axis in AXES:
-        figures[f"delay margin, {axis} [ms]"] = certificate.figures["delay_margin_ms"][axis]
-    found = predicted(case, model)
-    for name, title in PREDICTED.items() if found else ():
-        for axis, value in zip(AXES, getattr(found, name), strict=True):
-            figures[f"{title}, {axis}"] = value
-    return figures
+        found[f"{axis}: phase margin [deg]"] = _apart(
+            [(one["phase_margin_deg"][axis], one["phase_margin_error_deg"][axis]) for one in tables]
+        )
+    for axis in AXES:
+        found[f"{axis}: delay margin [ms]"] = Compared(*(one["delay_margin_ms"][axis] for one in tables))
+    yaws = [one.get("yaw", {}) for one in tables]
+    if all("Ms" in yaw for yaw in yaws):
+        found["yaw: Ms"] = _apart([(yaw["Ms"], yaw["Ms_error"]) for yaw in yaws])
+        found["yaw: phase margin [deg]"] = _apart(
+            [(yaw["phase_margin_deg"], yaw["phase_margin_error_deg"]) for yaw in yaws]
+        )
+    for axes in (BOTH, YAW):
+        asked = attitude_model([before, after], axes)
+        pair = [predicted(case, asked[0], axes) for case in (before, after)] if asked else [None, None]
+        first, second = pair
+        if first is None or second is None:
+            continue
+        same = before.flight is after.flight
+        for name, title in PREDICTED.items():
+            for axis, text in enumerate(axis_names(axes) if axes == BOTH or name != "offaxis_deg" else ()):
+                values = [(one.value(name, axis), one.error(name, axis)) for one in (first, second)]
+                compared = _apart(values)
+                if same:  # around the same drawn plants
+                    compared = replace(compared, doubt=second.error(name, axis, first))
+                found[f"{text}: {title}"] = compared
+    return found
+
+
+def _apart(values: Sequence[tuple[float, float]]) -> Compared:
+    """Two values with independent errors."""
+    (before, error), (after, other) = values
+    return Compared(before, after, (error, other), float(np.hypot(error, other)))
 
 
 def _overlaid(before: FlightSpectra, after: FlightSpectra) -> list[Chart]:
@@ -99,8 +152,7 @@ def _overlaid(before: FlightSpectra, after: FlightSpectra) -> list[Chart]:
             found = getattr(one, name)
             if found is not None:
                 density = np.maximum(factor * found.density.sum(axis=1), 1e-30)
-                colour = one.flight.colour if one is before else NEW
-                lines.append(Line(found.hertz, density, one.flight.label, colour, width=1.2))
+                lines.append(Line(found.hertz, density, one.flight.label, one.flight.colour, width=1.2))
         if len(lines) == 2:
             panels.append(Panel(title, "frequency [Hz]", unit, lines, log_x=True, log_y=True))
     return [Chart("compared-spectra", "Spectra of both flights in the air.", panels)] if panels else []

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mimopilot.common.charts import FLOWN, NEW, SISO
+from mimopilot.common.charts import AXIS_COLOURS
 from mimopilot.common.figures import Chart, HeatMap, LimitLine, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.sitl.field.report.analysis.filters_advice import NOISE_FROM, FilterChange, filter_changes, least_phase
@@ -28,7 +28,10 @@ from mimopilot.tuning.certificate import Thresholds
 from mimopilot.tuning.logs.resample import Series
 
 AXIS_NAMES = ("roll", "pitch", "yaw")
-AXIS_COLOURS = (FLOWN, SISO, "#E69F00")
+#: Power of an axis over that of the loudest one below which it is not logged: a column of zeros.
+QUIETEST = 1e-12
+#: Of the mean of all motors: as in the timeline.
+MOTORS = "#555555"
 #: Hz. A signal logged more slowly says nothing about vibration.
 SLOW = 50.0
 
@@ -215,9 +218,9 @@ def _panels(one: FlightSpectra) -> list[Panel]:
             continue
         lines = []
         if title == "motor commands":
-            lines.append(Line(found.hertz, _floored(found.density.mean(axis=1)), "mean of all", NEW, width=1.2))
+            lines.append(Line(found.hertz, _floored(found.density.mean(axis=1)), "mean of all", MOTORS, width=1.2))
         else:
-            for axis in range(found.density.shape[1]):
+            for axis in np.flatnonzero(found.density.max(axis=0) > QUIETEST * found.density.max()):
                 density = _floored(factor * found.density[:, axis])
                 lines.append(Line(found.hertz, density, AXIS_NAMES[axis], AXIS_COLOURS[axis], width=1.2))
         span = (max(float(found.hertz[0]), 0.5), float(found.hertz[-1]))

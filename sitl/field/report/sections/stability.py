@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from mimopilot.common.charts import LIMIT
 from mimopilot.common.figures import Chart, LimitLine, Line, Panel, SpanMark, Spread
 from mimopilot.common.html_report import ReportTable, Section
+from mimopilot.common.text_table import plus_minus
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
 from mimopilot.tuning.analysis import margins
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop
@@ -95,6 +96,11 @@ def stability_section(cases: Sequence[GainCase], thresholds: Thresholds) -> Sect
         for case in cases
         if not case.problem and case.gains.certificate and not case.gains.certificate.figures
     ]
+    reasons += [
+        f"{case.label}: yaw is {yaw['verdict']}: {yaw['reason']}."
+        for case in cases
+        if not case.problem and (yaw := _yaw_of(case)) and "Ms" not in yaw
+    ]
     found = [loops for case in cases if (loops := loops_of(case))]
     if not found:
         text = "Not shown: " + ("no gains are known: give them with --gains." if not cases else "see below.")
@@ -138,7 +144,7 @@ def margin_table(cases: Sequence[GainCase]) -> ReportTable:
     rows: list[list[str]] = []
     shown = [(case, case.gains.certificate) for case in cases if case.gains.certificate is not None]
     rows.append(["verdict", *(str(certificate.verdict) for _, certificate in shown)])
-    rows.append(["Ms", *(f"{c.figures['Ms']:.2f} +- {c.figures['Ms_error']:.2f}" for _, c in shown)])
+    rows.append(["Ms", *(plus_minus(c.figures["Ms"], c.figures["Ms_error"]) for _, c in shown)])
     for axis in AXES:
         rows.append([f"phase margin, {axis}", *(_phase_margin(c.figures, axis) for _, c in shown)])
     for axis in AXES:
@@ -154,24 +160,33 @@ def margin_table(cases: Sequence[GainCase]) -> ReportTable:
     return ReportTable("Margins by the certificate", ("", *(case.label for case, _ in shown)), rows)
 
 
+def _yaw_of(case: GainCase) -> Mapping[str, Any]:
+    """The certificate's figures of yaw; empty: it has none."""
+    found: Mapping[str, Any] = case.gains.certificate.figures.get("yaw", {}) if case.gains.certificate else {}
+    return found
+
+
 def _yaw_rows(yaws: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Rows of yaw; none where no set's yaw was examined."""
     if not any("Ms" in yaw for yaw in yaws):
         return []
 
-    def cells(text: str) -> list[str]:
-        return [text.format(**yaw) if "Ms" in yaw else "not examined" for yaw in yaws]
+    def row(name: str, value: str, error: str, unit: str) -> list[str]:
+        known = (
+            plus_minus(yaw[value], yaw.get(error, np.nan), unit) if "Ms" in yaw else "not examined" for yaw in yaws
+        )
+        return [name, *known]
 
     return [
-        ["Ms, yaw", *cells("{Ms:.2f} +- {Ms_error:.2f}")],
-        ["phase margin, yaw", *cells("{phase_margin_deg:.0f} +- {phase_margin_error_deg:.0f} deg")],
-        ["delay margin, yaw", *cells("{delay_margin_ms:.1f} ms")],
+        row("Ms, yaw", "Ms", "Ms_error", ""),
+        row("phase margin, yaw", "phase_margin_deg", "phase_margin_error_deg", " deg"),
+        row("delay margin, yaw", "delay_margin_ms", "", " ms"),
     ]
 
 
 def _phase_margin(figures: Mapping[str, Any], axis: str) -> str:
     phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
-    return f"{phase:.0f} +- {error:.0f} deg" if np.isfinite(phase) else NEVER
+    return plus_minus(phase, error, " deg") if np.isfinite(phase) else NEVER
 
 
 def _gain_margin(figures: Mapping[str, Any], axis: str) -> str:

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mimopilot.common.charts import FLOWN, SISO
+from mimopilot.common.charts import AXIS_COLOURS
 from mimopilot.common.figures import Chart, LimitLine, Line, Panel, thinned
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.sitl.field.report.analysis.flight_data import PHASES, ReportedFlight
-from mimopilot.tuning.logs.inspection import AXES
+from mimopilot.tuning.axes import axis_names
+from mimopilot.tuning.logs.resample import Series, sampling_period
 
 #: Names of the signals, their factor from SI and unit in the table.
 SIGNALS = {
@@ -62,11 +63,10 @@ def timeline(flights: Sequence[ReportedFlight], number: int) -> Chart | None:
         )
     angles, thrust = flight.signal("y_o"), flight.further.thrust
     if angles is not None:
-        lines = []
-        for axis, colour in enumerate((FLOWN, SISO)):
-            x, y = thinned(angles.time, np.degrees(angles.values[:, axis]), flight.samples)
-            lines.append(Line(x, y, AXES[axis], colour, width=1.0))
-        panels.append(Panel("Angles", "time [s]", "[deg]", lines, x_range=span, height=220))
+        panels.append(Panel("Angles", "time [s]", "[deg]", _by_axis(angles, flight), x_range=span, height=220))
+    elif flight.further.gyro is not None:
+        lines = _by_axis(flight.since_begin(flight.further.gyro), flight)
+        panels.append(Panel("Gyro", "time [s]", "[deg/s]", lines, x_range=span, height=220))
     lines = []
     if flight.further.motors is not None:
         motors = flight.since_begin(flight.further.motors)
@@ -89,6 +89,15 @@ def timeline(flights: Sequence[ReportedFlight], number: int) -> Chart | None:
         panels,
         columns=1,
     )
+
+
+def _by_axis(series: Series, flight: ReportedFlight) -> list[Line]:
+    """A line for each axis of angles or rates, in degrees."""
+    looks = zip(axis_names(3), AXIS_COLOURS, series.values.T, strict=False)
+    return [
+        Line(*thinned(series.time, np.degrees(values), flight.samples), name, colour, width=1.0)
+        for name, colour, values in looks
+    ]
 
 
 def timeline_section(flights: Sequence[ReportedFlight]) -> Section:
@@ -114,10 +123,23 @@ def contents_section(flights: Sequence[ReportedFlight]) -> Section:
             spans = [f"{factor * low:.3g} to {factor * high:.3g} {unit}".rstrip() for low, high in ends]
             gaps = f"{found.gaps} (longest {found.longest_gap_s * 1e3:.0f} ms)" if found.gaps else "none"
             rows.append([title, found.source, f"{found.rate_hz:.0f} Hz{held}", gaps, *spans])
-        caption = f"{flight.label}: {flight.recording.format}, {flight.found.seconds:.1f} s"
+        rows += [_further(title, series) for title, series in _beside(flight) if series is not None]
+        caption = f"{flight.label}: {flight.recording.format}, {flight.span[1] - flight.span[0]:.1f} s"
         tables.append(ReportTable(caption, ("signal", "from", "rate", "gaps", "roll", "pitch"), rows))
     points = [f"{flight.label}: {note}" for flight in flights for note in flight.recording.notes]
     return Section("What the log holds", "", tables=tables, points=points)
+
+
+def _beside(flight: ReportedFlight) -> Sequence[tuple[str, Series | None]]:
+    """Signals that gains are not tuned from."""
+    further = flight.further
+    return (("gyro", further.gyro), ("thrust", further.thrust), ("motors", further.motors))
+
+
+def _further(title: str, series: Series) -> list[str]:
+    period = sampling_period(series.time)
+    rate = f"{1 / period:.0f} Hz" if period > 0 else ""
+    return [title, series.topic, rate]
 
 
 def _seconds(name: str, parts: Sequence[tuple[float, float]]) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.common.charts import FURTHER, MODEL_COLOUR, SETPOINT_COLOUR
+from mimopilot.common.charts import INJECTED, MODEL_COLOUR, SETPOINT_COLOUR
 from mimopilot.common.figures import Chart, Line, Panel, thinned
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.sitl.field.report.analysis.flight_data import ReportedFlight
@@ -80,7 +80,7 @@ def yaw_charts(flight: ReportedFlight, number: int, count: int) -> list[Chart]:
         for name, label, look in (
             (setpoint, "setpoint", {"colour": SETPOINT_COLOUR, "width": 1.0, "step": True}),
             (response, "torque u" if response == "u" else "response", {"colour": flight.colour, "width": 1.3}),
-            (injected, "injected", {"colour": FURTHER, "width": 0.9, "step": True}),
+            (injected, "injected", {"colour": INJECTED, "width": 0.9, "step": True}),
         ):
             if name in yaw:
                 series = flight.since_begin(yaw[name])
@@ -88,7 +88,7 @@ def yaw_charts(flight: ReportedFlight, number: int, count: int) -> list[Chart]:
                 x, y = thinned(series.time[inside], factor * series.values[inside, 0], flight.samples)
                 if len(y) > 1 and (name != injected or y.any()):
                     lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
-        if response in yaw and lines:
+        if response in yaw and lines and np.ptp(yaw[response].values):  # a column of zeros is no signal
             panels.append(Panel(title, "time [s]", unit, lines, height=230))
     named = f" in {flight.label}" if count > 1 else ""
     text = f"Yaw{named}, in the air."
@@ -130,7 +130,7 @@ def _panels(flight: ReportedFlight, part: Interval, model: Gains | None) -> list
             for signal, label, look in (
                 (setpoint, "setpoint", {"colour": SETPOINT_COLOUR, "width": 1.0, "step": True}),
                 (answer, "torque u" if answer == "u" else "response", {"colour": flight.colour, "width": 1.3}),
-                (injected, "injected", {"colour": FURTHER, "width": 0.9, "step": True}),
+                (injected, "injected", {"colour": INJECTED, "width": 0.9, "step": True}),
             ):
                 series = flight.signal(signal) if signal else None
                 if series is not None:

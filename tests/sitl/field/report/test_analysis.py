@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 from scipy.signal import butter, group_delay
 
 import mimopilot as mp
@@ -28,13 +29,15 @@ from mimopilot.sitl.field.report.analysis.predicted_motion import doublet_setpoi
 from mimopilot.sitl.field.report.analysis.step_response import WIDEST, estimate_step
 from mimopilot.sitl.field.report.analysis.vibration import Tone, air_spectrum, find_tones, spectrogram
 from mimopilot.sitl.field.report.flight_report import make_report
+from mimopilot.sitl.field.report.sections.compare import _set_figures
 from mimopilot.sitl.field.report.sections.frequency import coherence_band
 from mimopilot.sitl.field.report.sections.tracking import tracking_error
+from mimopilot.tuning.axes import law_of
 from mimopilot.tuning.certificate import Thresholds
 from mimopilot.tuning.law_terms import StockFilters
 from mimopilot.tuning.logs.resample import Series
 from mimopilot.tuning.reference_model import second_order
-from tests.tuning.logs.flights import make_flight, px4_topics, write_ulog
+from tests.tuning.logs.flights import make_flight, px4_topics, table, write_csv, write_ulog
 
 
 def steps(Ts, seconds=40.0, size=0.2, hold=0.5):
@@ -159,8 +162,11 @@ def test_margins_are_those_of_the_certificate(bench):
     assert case.gains.certificate.figures == certificate.figures
     table = next(table for table in report.tables if table.caption == "Margins by the certificate")
     shown = {row[0]: row[table.columns.index("my")] for row in table.rows}
-    assert shown["Ms"] == f"{certificate.figures['Ms']:.2f} +- {certificate.figures['Ms_error']:.2f}"
-    assert shown["phase margin, roll"].startswith(f"{certificate.figures['phase_margin_deg']['roll']:.0f} +-")
+    assert [float(part) for part in shown["Ms"].split(" +- ")] == pytest.approx(
+        [certificate.figures["Ms"], certificate.figures["Ms_error"]], rel=0.05
+    )
+    phase, error = shown["phase margin, roll"].removesuffix(" deg").split(" +- ")
+    assert float(phase) == pytest.approx(certificate.figures["phase_margin_deg"]["roll"], abs=float(error) / 10)
     assert shown["delay margin, pitch"] == f"{certificate.figures['delay_margin_ms']['pitch']:.1f} ms"
 
 
@@ -171,11 +177,66 @@ def test_predicted_doublets_and_steps_of_torque_end_at_rest_with_the_figures_of_
     assert np.abs(motion.doublet[motion.time < 0]).max() < 0.1
     assert np.abs(motion.torque[motion.time < 0]).max() < 0.02
     held = (motion.time > 0.5) & (motion.time < 0.6)
-    assert motion.doublet[held, 0, 0] == pytest.approx(doublet_setpoint(motion.time)[held], abs=1.0)
+    assert motion.doublet[held, 0, 0] == pytest.approx(motion.setpoint[held], abs=1.0)
     assert np.abs(motion.doublet[-10:]).max() < 0.3
     pushed = motion.torque[:, 0, 0]
     assert 0.2 < pushed.max() < 2.0
     assert abs(pushed[-1]) < 0.7 * pushed.max()
+
+
+def test_the_predicted_doublet_and_step_of_torque_of_yaw_are_those_of_the_closed_form(bench):
+    _, gains, report = bench
+    measured, b = report.flights[0].wide_yaw, 40.0
+    s = 1j * measured.omega[:, None, None]
+    body = replace(measured.body, B=np.array([[b]]))
+    plant = replace(
+        measured, G_i=b / s, G_o=b / s**2, body=body, error_i=0 * measured.error_i, error_o=0 * measured.error_o
+    )
+    p, i, attitude = 12 / b, 10 / b, 2.0
+    yaw = replace(gains.yaw, Kp_o=attitude, Kp_i=p, Ki_i=i, Kd_i=0.0, Kff_i=0.0)
+    motion = predicted_motion(law_of(replace(gains, yaw=yaw), 1), plant)
+    # u = (p + i / s) (attitude (r - y) - rate), rate = b u / s; the loop is delayed by half of the hold and the sum.
+    below = [1.0, p * b, (attitude * p + i) * b, attitude * i * b]
+    time = np.linspace(0.0, motion.time[-1], 4000)
+    _, step = scipy.signal.step(([attitude * p * b, attitude * i * b], below), T=time)
+    _, pushed = scipy.signal.step(([0.5, 0.0], below), T=time)
+    halves = [np.interp(motion.time - at, time, step, left=0.0) for at in (0.0, 1.75, 3.5)]
+    doublet = 10.0 * (halves[0] - 2 * halves[1] + halves[2])
+    assert motion.setpoint == pytest.approx(doublet_setpoint(motion.time, 3.5))
+    assert motion.doublet[:, 0, 0] == pytest.approx(doublet, abs=0.25)
+    after = motion.time > 0
+    known = np.degrees(np.interp(motion.time, time, pushed, left=0.0))
+    assert motion.torque[after, 0, 0] == pytest.approx(known[after], abs=0.03 * known.max())
+
+
+def test_yaw_is_predicted_and_compared_beside_roll_and_pitch(bench):
+    report = bench[2]
+    charts = {chart.name: chart for chart in report.charts}
+    titles = [panel.title for panel in charts["predicted-motion-yaw"].panels]
+    assert titles == ["yaw doublet: yaw", "step of torque on yaw: yaw"]
+    for panel in charts["predicted-motion-yaw"].panels:
+        assert [line.label for line in panel.lines if getattr(line, "label", "")][-1] == "my"
+    stability = next(one for one in report.sections if one.heading == "Stability and margins")
+    assert any(point.startswith("flown: yaw is not examined: excitation begins at") for point in stability.points)
+    rows = {row[0]: row[1:] for row in report.tables[0].rows}
+    assert {"Ms", "roll: phase margin [deg]", "pitch: torque at hover from noise"} <= set(rows)
+    new = report.cases[1]
+    assert {"yaw: Ms", "yaw: phase margin [deg]"} <= set(_set_figures(new, new))
+    before, after, difference, _ = rows["roll: other axis in doublets [deg]"]
+    values = [float(cell.split(" +- ")[0]) for cell in (before, after, difference)]
+    assert values[1] - values[0] == pytest.approx(values[2], abs=1.5 * 10.0 ** -len(before.split()[0].split(".")[1]))
+    # Both sets are predicted around the same plants: their difference is surer than two independent figures.
+    errors = [float(cell.split(" +- ")[1]) for cell in (before, after, difference)]
+    assert errors[2] < np.hypot(errors[0], errors[1])
+
+
+def test_the_time_that_excites_yaw_is_used_and_what_cannot_be_tuned_from_is_not(bench, tmp_path):
+    flight = bench[2].flights[0]
+    (excited,) = flight._excited((flight.recording.yaw,))
+    assert any(begin <= excited[0] and excited[1] <= end for begin, end in flight.phases["used"])
+    still = make_report([write_csv(tmp_path / "still.csv", table(make_flight(seconds=12.0, Ts=0.02)))]).flights[0]
+    assert still.found.reason
+    assert still.phases["used"] == ()
 
 
 def test_a_filter_costs_the_phase_that_it_takes_at_the_crossover(bench):
