@@ -93,4 +93,4 @@ def context(gains: Gains) -> dict[str, Any]:
     """What the templates of this target use beside those of all targets."""
     entries = group(gains)
     places = [entry.name for entry in entries if entry.index > len(PARAMETERS)]
-    return {"prefix": ARDUPILOT_PREFIX, "entries": entries, "places": places}
+    return {"prefix": ARDUPILOT_PREFIX, "entries": entries, "places": places, "settings": ARDUPILOT_EXCITATION}

@@ -295,9 +295,9 @@ def test_the_injector_excites_one_axis_after_the_other_and_is_logged(program):
     ("line", "text"),
     [
         ("sticks 0 0.15 0 0", "stop: a stick moved"),
-        ("mode 2", "stop: mode, ground or fault"),
-        ("flying 0", "stop: mode, ground or fault"),
-        (f"attitude {math.cos(0.3)} {math.sin(0.3)} 0 0", "stop: tilt"),
+        ("mode 2", "stop: mode, ground or disarmed"),
+        ("flying 0", "stop: mode, ground or disarmed"),
+        (f"attitude {math.cos(0.3)} {math.sin(0.3)} 0 0", "stop: EX_TILT"),
         ("param EX_AX 0", "cancelled"),
     ],
 )

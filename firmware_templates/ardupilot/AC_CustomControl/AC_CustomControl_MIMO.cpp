@@ -94,44 +94,6 @@ void lead(const Gains &gains, float roll, float pitch, float (&q)[4])
 // Turns the sign of the last torque into that of the torque that the motors could not give.
 int32_t unallocated(bool limited, float torque) { return !limited ? 0 : (torque > 0.0F ? 1 : (torque < 0.0F ? -1 : 0)); }
 
-const char *describe(Excitation::Phase phase)
-{
-	switch (phase) {
-	case Excitation::Phase::Roll: return "roll";
-
-	case Excitation::Phase::Pitch: return "pitch";
-
-	case Excitation::Phase::Pause: return "pause";
-
-	case Excitation::Phase::Yaw: return "yaw";
-
-	case Excitation::Phase::Waiting: return "waiting";
-
-	default: return "off";
-	}
-}
-
-const char *describe(Excitation::End end)
-{
-	switch (end) {
-	case Excitation::End::Finished: return "finished";
-
-	case Excitation::End::Cancelled: return "cancelled";
-
-	case Excitation::End::NotReady: return "stop: mode, ground or fault";
-
-	case Excitation::End::Tilt: return "stop: tilt";
-
-	case Excitation::End::Turn: return "stop: turned";
-
-	case Excitation::End::Sticks: return "stop: a stick moved";
-
-	case Excitation::End::Settings: return "refused: a setting is out of range";
-
-	default: return "none yet";
-	}
-}
-
 }  // namespace
 
 void AC_CustomControl_MIMO::reset()
