@@ -48,7 +48,8 @@ def commands_page() -> str:
         command = commands[name]
         parts += [f"## {name}", re.sub(r"\n(?!\n)", " ", command.help or "").replace("<", "&lt;")]
         if command.params:
-            rows = [_parameter_row(parameter) for parameter in command.params if not getattr(parameter, "hidden", False)]
+            shown = (parameter for parameter in command.params if not getattr(parameter, "hidden", False))
+            rows = map(_parameter_row, shown)
             parts.append("\n".join(["| option | what | default |", "|---|---|---|", *rows]))
         examples = (command.epilog or "").removeprefix("Example: ").split("; ")
         parts.append("\n".join(["```", *filter(None, examples), "```"]))
