@@ -236,7 +236,7 @@ def test_acro_without_an_attitude_loop_flies_the_rates(program):
 )
 def test_what_it_must_not_fly_the_main_controller_flies_with_its_integrators(line, text, program):
     rows, texts = fly(program, line, *MAIN_FLIES, "slope 0.001 0 -0.002", TILTED, "switch 1", "step 50")
-    assert texts[-1] == f"MIMO: {text}: main controller flies"
+    assert texts[-1] == f"MIMO: {text}: main flies"
     # As the main controller alone: its integrators go on, although ArduPilot zeroes them after each update.
     steps = np.arange(1, 51)[:, np.newaxis] * [0.001, 0, -0.002]
     np.testing.assert_allclose(rows[:, TORQUE], MAIN + MAIN_INTEGRAL + steps, atol=1e-5)

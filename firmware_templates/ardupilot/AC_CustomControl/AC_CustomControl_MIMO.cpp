@@ -107,7 +107,7 @@ void AC_CustomControl_MIMO::reset()
 	_obstacle = initialise(_state, kGains) && update_parameters() ? obstacle() : "parameter out of range";
 
 	if (_obstacle != nullptr) {
-		GCS_SEND_TEXT(MAV_SEVERITY_WARNING, "MIMO: %s: main controller flies", _obstacle);
+		GCS_SEND_TEXT(MAV_SEVERITY_WARNING, "MIMO: %s: main flies", _obstacle);
 	}
 }
 
