@@ -139,6 +139,8 @@ def main() -> None:
     for path, content in changes.items():
         if content is None:
             path.unlink()
+            if not any(path.parent.iterdir()):
+                path.parent.rmdir()
             continue
         path.parent.mkdir(exist_ok=True)
         draft = path.with_name(path.name + ".mimopilot")
