@@ -46,6 +46,7 @@ pictures: $(VENV)/.installed
 
 lint: $(VENV)/.installed-test as-imported
 	$(BIN)/ruff check .
+	$(BIN)/hadolint Dockerfile
 	$(BIN)/mypy
 
 bench: $(VENV)/.installed-test cross

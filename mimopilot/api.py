@@ -262,7 +262,9 @@ def report(
 def _gains_name(gains: GainSet, place: int, count: int) -> str:
     """Name of a gain set in a report: that of its file, else new."""
     if isinstance(gains, str | Path):
-        return Path(gains).name.removesuffix(".toml").removesuffix(".gains")
+        from mimopilot.tuning.gains_file import set_name
+
+        return set_name(Path(gains))
     return "new" if count == 1 else f"new {place + 1}"
 
 
@@ -803,11 +805,12 @@ def prepare_upload(
     from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
     from mimopilot.tuning.acceptance import check_verdict
+    from mimopilot.tuning.gains_file import set_name
 
     loaded = _gains(gains)
     warning = check_verdict(loaded, allow=uncertified)
     source = Path(gains) if isinstance(gains, str | Path) else Path("gains")
-    stem = source.with_name(source.name.removesuffix(".toml").removesuffix(".gains"))
+    stem = source.with_name(set_name(source))
     plan = make_plan(loaded, profile)
     return plan, LinkOptions(connect, stem=stem, **link), loaded, warning
 

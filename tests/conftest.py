@@ -74,6 +74,7 @@ def stock_gains(controller: str = "px4-stock") -> Gains:
             error_hz=(0.0, 30.0, 2.5),
             derivative_feedforward=(0.001, 0.002, 0.003),
         ),
+        "betaflight": StockFilters("betaflight", (75.0, 70.0, 65.0), derivative2_hz=(100.0, 110.0, 120.0)),
     }
     diagonal = {
         name: np.diag(np.diag(getattr(coupled_gains(), name))) for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i", "Kff_i")

@@ -66,6 +66,11 @@ def axis_names(count: int) -> tuple[str, ...]:
     return AXES[2:] if count == 1 else AXES[:count]
 
 
+def axes_slice(count: int) -> slice:
+    """Those axes among roll, pitch and yaw."""
+    return slice(2, 3) if count == 1 else slice(0, count)
+
+
 def law_of(gains: Gains, count: int, yaw_unit: float = 1.0) -> Law:
     """The law of `count` axes of a set.
 
@@ -83,7 +88,7 @@ def law_of(gains: Gains, count: int, yaw_unit: float = 1.0) -> Law:
         scalar = getattr(gains.yaw, name) if name in YAW_GAINS else 0.0
         yaw = np.array([[scalar / yaw_unit if name.endswith("_i") else scalar]])
         matrices[name] = yaw if count == 1 else block_diag(getattr(gains, name), yaw)
-    filters = replace(gains.filters, model_omega=0.0).on(slice(2, 3) if count == 1 else slice(0, 3), yaw_unit)
+    filters = replace(gains.filters, model_omega=0.0).on(axes_slice(count), yaw_unit)
     return AxesLaw(**matrices, filters=filters)
 
 

@@ -25,6 +25,11 @@ OTHERS = ("schema", "controller", "moment_scale", "certificate", "provenance")
 FILTERS = "filters"
 
 
+def set_name(path: Path) -> str:
+    """Name of a gain set: that of its file without ``.gains.toml``."""
+    return path.name.removesuffix(".toml").removesuffix(".gains")
+
+
 def load_gains(path: str | Path) -> Gains:
     """Read a ``*.gains.toml`` file, of schema 2 or 1.
 

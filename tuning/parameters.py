@@ -325,3 +325,9 @@ def check_names() -> None:
         if name in seen:
             raise TuningError(f"{name}: two parameters have this name; rename one")
         seen.add(name)
+
+
+def with_unit(key: str) -> str:
+    """Name of a gain with its unit, for the first column of a table: ``Kp_o [1/s]``."""
+    unit = next(row.unit for row in ROWS if row.key == key)
+    return f"{key} [{unit}]" if unit else key

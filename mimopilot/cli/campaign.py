@@ -19,9 +19,9 @@ from mimopilot.cli.options import (
     TailOption,
     WorkersOption,
 )
-from mimopilot.common.console import json_text, print_json, print_table
+from mimopilot.common.console import json_text, print_json, print_table, print_text
 from mimopilot.common.errors import check_not_given
-from mimopilot.common.extras import CAMPAIGN
+from mimopilot.common.extras import CAMPAIGN, REPORT
 
 
 def register(app: typer.Typer) -> None:
@@ -62,6 +62,7 @@ def campaign(
 ) -> None:
     """Fly many varied vehicles; report survival and tracking of each gain set."""
     CAMPAIGN.need()
+    REPORT.need()
     from mimopilot.common.files import inside, write_atomically
     from mimopilot.common.parallel import cores
     from mimopilot.sitl.campaign.campaign_figures import parse_map
@@ -100,9 +101,9 @@ def campaign(
     if as_json:
         print_json({"results": str(results.path), "report": str(report), **summary.as_json(str(out))})
         return
-    print(INTERVALS)
+    print_text(INTERVALS)
     if summary.rejected:
-        print(f"{summary.rejected} impossible draws were repeated")
+        print_text(f"{summary.rejected} impossible draws were repeated")
     if summary.varied:
         print_table(VARIED, VARIED_COLUMNS, varied_rows(summary.varied))
     print_table("Survived", SURVIVAL_COLUMNS, survival_rows(summary))
@@ -110,7 +111,7 @@ def campaign(
     if summary.pairs:
         print_table(PAIRS, PAIR_COLUMNS, pair_rows(summary.pairs))
     print_table("Worst flights", WORST_COLUMNS, worst_rows(summary, str(out)))
-    print(f"results {results.path}\nreport  {report}")
+    print_text(f"results {results.path}\nreport  {report}")
 
 
 def _task(scenario: str, axis: str | None, sizes: dict[str, float | None], faults: list[str] | None) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument
-from mimopilot.common.console import print_json, print_table
+from mimopilot.common.console import print_json, print_table, print_text
 from mimopilot.common.progress import step
 from mimopilot.common.verbosity import warn
 
@@ -89,10 +89,10 @@ def identify(
             for i, value in enumerate(shown)
         ],
     )
-    print(f"one-step fit of the rates: roll {fits[0]:.1f} %, pitch {fits[1]:.1f} %")
-    print(f"fit to the measured frequency response: {found.response_percent:.1f} %")
+    print_text(f"one-step fit of the rates: roll {fits[0]:.1f} %, pitch {fits[1]:.1f} %")
+    print_text(f"fit to the measured frequency response: {found.response_percent:.1f} %")
     if out is not None:
-        print(f"written to {out}")
+        print_text(f"written to {out}")
 
 
 def read_warned(log: Path, columns: Path | None) -> Experiment:

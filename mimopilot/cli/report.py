@@ -79,8 +79,3 @@ def check_count(logs: Sequence[Path]) -> None:
     from mimopilot.sitl.field.report.flight_report import check_count as check
 
     check(len(logs))
-
-
-def name_of(gains: Path) -> str:
-    """Name of a gains file in a report."""
-    return gains.name.removesuffix(".toml").removesuffix(".gains")

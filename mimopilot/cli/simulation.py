@@ -25,7 +25,7 @@ from mimopilot.cli.options import (
     TimeoutOption,
     YesOption,
 )
-from mimopilot.common.console import print_json, print_table, progress_console
+from mimopilot.common.console import print_json, print_table, print_text, progress_console
 from mimopilot.common.errors import check_not_given
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def convert(
     loaded, scale = mp.load_gains(gains), mp.load_airframe(airframe).moment_scale()
     loaded.with_moment_scale(scale).save(out)
     before, after = (", ".join(f"{value:.4g}" for value in triple) for triple in (loaded.moment_scale or (), scale))
-    print(f"{out}: one unit of torque stood for {before} N m, now for {after} N m (roll, pitch, yaw)")
+    print_text(f"{out}: one unit of torque stood for {before} N m, now for {after} N m (roll, pitch, yaw)")
 
 
 def experiment(
@@ -225,7 +225,7 @@ def simulate_experiment(plan: ExperimentPlan, out: Path, seed: int) -> None:
     flight = plan.record(out, seed)
     angles = np.degrees(np.abs(flight.truth["attitude"]).max(axis=0))
     seconds = len(flight.record) * plan.gains.Ts
-    print(
+    print_text(
         f"{out}: {seconds:.1f} s, largest roll {angles[0]:.1f} deg, pitch {angles[1]:.1f} deg, yaw {angles[2]:.1f} deg"
     )
     check_survived(flight)
@@ -242,7 +242,7 @@ def simulate_experiments(plan: ExperimentPlan, out: Path, seeds: range) -> None:
     with Progress(console=progress_console(), transient=True) as bar:
         task = bar.add_task("flying", total=len(seeds))
         lost = repeat_experiment(plan, out, seeds, cores(), lambda: bar.advance(task))
-    print(f"{out}: {len(seeds)} logs of {plan.seconds:.1f} s")
+    print_text(f"{out}: {len(seeds)} logs of {plan.seconds:.1f} s")
     if lost:
         names = ", ".join(f"{seed} at {when:.2f} s" for seed, when in list(lost.items())[:NAMED])
         raise SitlError(

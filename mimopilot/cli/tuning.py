@@ -10,9 +10,9 @@ import typer
 
 from mimopilot.cli.identification import read_warned
 from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ProfileOption, ReportOption
-from mimopilot.cli.report import check_count, name_of, write_report_of
+from mimopilot.cli.report import check_count, write_report_of
 from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
-from mimopilot.common.console import print_json, print_table, progress_console
+from mimopilot.common.console import print_json, print_table, print_text, progress_console
 from mimopilot.common.errors import check_not_given
 from mimopilot.common.progress import step
 from mimopilot.common.text_table import with_deviation
@@ -98,6 +98,7 @@ def tune(
 ) -> None:
     """Find the best gains of the attitude cascade from one flight, and compare them with those that flew."""
     import mimopilot as mp
+    from mimopilot.tuning.gains_file import set_name
     from mimopilot.tuning.logs.columns import load_columns
     from mimopilot.tuning.spec import load_spec, parse_model
 
@@ -129,7 +130,7 @@ def tune(
         gains = mp.tune(experiments if len(logs) > 1 else experiments[0], spec=task, repeat=second)
     gains.save(out)
     if report is not None:
-        write_report_of(logs, [(name_of(out), gains)], report, columns, task)
+        write_report_of(logs, [(set_name(out), gains)], report, columns, task)
     known = {warning for experiment in experiments for warning in experiment.warnings}
     warn(logs[0], (warning for warning in gains.provenance.warnings if warning not in known))
     details, deviations = gains.provenance.details, gains.provenance.standard_deviation
@@ -161,7 +162,7 @@ def tune(
         print_comparison(gains, [log.name for log in logs])
         print_yaw(gains)
         print_certificate(gains)
-        print(f"written to {out}")
+        print_text(f"written to {out}")
     if require_better and not comparison.get("better_than_flown", False):
         raise typer.Exit(1)
 
@@ -176,30 +177,33 @@ def print_comparison(gains: Gains, logs: list[str]) -> None:
     model = f"{gains.provenance.outer_model[0].bandwidth:g} rad/s"
     print_table(PREDICTED_TITLE.format(model=model), PREDICTED, predicted_rows(gains, logs))
     if details.get("better_than_flown"):
-        print("better than the gains that flew: in following and on the other axis, within the limits of Ms and noise")
+        print_text(
+            "better than the gains that flew: in following and on the other axis, within the limits of Ms and noise"
+        )
     worth = details.get("worth_of_off_diagonals", {})
     for before, after in zip(worth.get("tuned", ()), worth.get("module", ()), strict=True):
-        print(
+        print_text(
             f"off-diagonals would bring: the other axis moves {after[0]:.2f} / {after[1]:.2f} instead of "
             f"{before[0]:.2f} / {before[1]:.2f} degrees with our module"
         )
     for reason in details.get("keep_flown", ()):
-        print(f"keep what you fly: {reason}")
+        print_text(f"keep what you fly: {reason}")
     if details["limited_by"]:
-        print(f"limited by: {', '.join(details['limited_by'])}")
+        print_text(f"limited by: {', '.join(details['limited_by'])}")
 
 
 def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Columns | None, as_json: bool) -> None:
     """`tune --campaign`: every log by itself, and the distributions."""
     from mimopilot.common.parallel import cores
     from mimopilot.tuning.design.many_logs import find_logs, tune_all
+    from mimopilot.tuning.parameters import with_unit
 
     found = tune_all(find_logs(logs), task, out, cores(), columns)
     if as_json:
         print_json({"out": str(out), **found.as_json()})
         return
     rows = [
-        [f"{e.matrix} {e.pair}", *(f"{v:.4g}" for v in (e.mean, e.deviation, e.predicted, *e.quantiles))]
+        [f"{with_unit(e.matrix)} {e.pair}", *(f"{v:.4g}" for v in (e.mean, e.deviation, e.predicted, *e.quantiles))]
         for e in found.elements()
     ]
     columns_shown = ["gain", "mean", "deviation", "predicted", "5 %", "median", "95 %"]
@@ -207,10 +211,10 @@ def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Column
         f"{task.method.upper()} gains from {len(found.tuned)} of {len(found.outcomes)} logs", columns_shown, rows
     )
     for verdict, count in found.verdicts.items():
-        print(f"{verdict}: {count} of {len(found.tuned)}")
+        print_text(f"{verdict}: {count} of {len(found.tuned)}")
     for name, reason in found.refusals.items():
-        print(f"refused: {name}: {reason}")
-    print(f"written to {out}")
+        print_text(f"refused: {name}: {reason}")
+    print_text(f"written to {out}")
 
 
 def certify(
@@ -231,13 +235,14 @@ def certify(
     """Check the stability of the closed loop, from a flight with any gains. Exit code 1: not certified."""
     import mimopilot as mp
     from mimopilot.tuning.certificate import ACCEPTED
+    from mimopilot.tuning.gains_file import set_name
     from mimopilot.tuning.spec import load_spec
 
     experiment = read_warned(log, columns)
     with step("examining the loop"):
         examined = mp.certify(experiment, gains, rate=rate, spec=spec)
     if report is not None:
-        write_report_of([log], [(name_of(gains), examined)], report, columns, load_spec(spec))
+        write_report_of([log], [(set_name(gains), examined)], report, columns, load_spec(spec))
     if out is not None:
         examined.save(out)
     if as_json:
@@ -310,9 +315,9 @@ def advise(
     columns_shown = ["", "model [rad/s]", "D [Hz]", *PREDICTED[1:], "certificate"]
     print_table(PREDICTED_TITLE.format(model="its own; flown: the recommended one's"), columns_shown, rows)
     for name, reason in found.refused.items():
-        print(f"{name}: {reason}")
+        print_text(f"{name}: {reason}")
     print_yaw(best.gains)
-    print(
+    print_text(
         "no non-minimum-phase zero from torque to rates"
         if found.zero is None
         else f"non-minimum-phase zero at {found.zero:.1f} rad/s from torque to rates"
@@ -324,7 +329,7 @@ def print_certificate(gains: Gains) -> None:
     certificate = gains.certificate
     assert certificate is not None
     figures = certificate.figures
-    print(f"{certificate.verdict}: {certificate.reason}")
+    print_text(f"{certificate.verdict}: {certificate.reason}")
     if not figures:
         return
     rows = [
@@ -354,9 +359,11 @@ def print_certificate(gains: Gains) -> None:
 
 def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None:
     """The matrices and the yaw gains of a set as a table, with standard deviations where they are known."""
+    from mimopilot.tuning.parameters import with_unit
+
     rows = []
     for name, matrix in gains.matrices.items():
         known = deviations.get(name, [[None, None], [None, None]])
         cells = [with_deviation(matrix[i][j], known[i][j]) for i in range(2) for j in range(2)]
-        rows.append([name, *cells, yaw_cell(gains, name, deviations)])
+        rows.append([with_unit(name), *cells, yaw_cell(gains, name, deviations)])
     print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch", "yaw"], rows)

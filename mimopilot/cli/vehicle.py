@@ -243,7 +243,7 @@ def import_params(
     the command then ends. The gains have no certificate.
     """
     import mimopilot as mp
-    from mimopilot.common.console import print_json
+    from mimopilot.common.console import print_json, print_text
     from mimopilot.tuning.errors import TuningError
 
     target = out or (source.with_suffix(".gains.toml") if source else Path("vehicle.gains.toml"))
@@ -281,12 +281,14 @@ def import_params(
         )
         return
     print_import(found)
-    print(f"written to {target}; no certificate: fly an experiment with these gains, then mimopilot tune or certify")
+    print_text(
+        f"written to {target}; no certificate: fly an experiment with these gains, then mimopilot tune or certify"
+    )
 
 
 def print_import(found: ImportedGains) -> None:
     """Table of the parameters and the gains that they became, and what the gains do not hold."""
-    from mimopilot.common.console import print_table
+    from mimopilot.common.console import print_table, print_text
     from mimopilot.tuning.parameter_row import Shape
     from mimopilot.tuning.parameters import ROWS
 
@@ -306,6 +308,6 @@ def print_import(found: ImportedGains) -> None:
     notes = ("default" if rate in found.defaults else "") if given else "--rate"
     rows.append([rate, given, "Ts", f"{gains.Ts:.6g}", "s", notes])
     print_table(f"Gains of {found.stock.name}", ["parameter", "value", "gain", "value", "unit", ""], rows)
-    print("not in the gains file:")
+    print_text("not in the gains file:")
     for text in found.not_carried:
-        print(f"  {text}")
+        print_text(f"  {text}")

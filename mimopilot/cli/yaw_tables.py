@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from mimopilot.common.console import print_table
+from mimopilot.common.console import print_table, print_text
 from mimopilot.common.text_table import with_deviation
 
 if TYPE_CHECKING:
@@ -50,9 +50,9 @@ def print_yaw(gains: Gains) -> None:
         title = f"Predicted, yaw (excited by {signals}). RMS in doublets of 10 degrees, 1.2 to 6 s, to the model\n"
         print_table(f"{title}({model:g} rad/s); after a step of torque; of the torque at hover", PREDICTED_YAW, rows)
     if "kept" in details:
-        print(f"yaw: the gains are kept as they were: {details['kept']}")
+        print_text(f"yaw: the gains are kept as they were: {details['kept']}")
     elif details["limited_by"]:
-        print(f"yaw is limited by: {', '.join(details['limited_by'])}")
+        print_text(f"yaw is limited by: {', '.join(details['limited_by'])}")
 
 
 def _cells(figures: Mapping[str, float]) -> list[str]:
@@ -86,11 +86,11 @@ def print_cross_terms(figures: Mapping[str, Any]) -> None:
     """What couples yaw with roll and pitch, and whether the certificate counts it; or why yaw is not examined."""
     yaw, cross = figures.get("yaw"), figures.get("cross_terms")
     if yaw is not None and "Ms" not in yaw:
-        print(f"yaw is {yaw['verdict']}: {yaw['reason']}")
+        print_text(f"yaw is {yaw['verdict']}: {yaw['reason']}")
     if cross is None:
         return
     if "share" not in cross:
-        print(f"cross terms of yaw: not known: {cross['reason']}")
+        print_text(f"cross terms of yaw: not known: {cross['reason']}")
         return
     size = (
         f"at most {cross['share']:.1%} +- {cross['share_error']:.1%} of a {cross['from']} torque's effect goes to "
@@ -103,4 +103,4 @@ def print_cross_terms(figures: Mapping[str, Any]) -> None:
         if cross["matters"]
         else f"they change the loop by less than {cross['limit']:.0%}, error included: yaw is a loop by itself"
     )
-    print(f"cross terms of yaw: {size}; {counted}")
+    print_text(f"cross terms of yaw: {size}; {counted}")

@@ -11,12 +11,12 @@ import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mimopilot.common.text_table import RULE, text_table
+from mimopilot.common.text_table import RULE, folded, text_table
 from mimopilot.common.verbosity import Verbosity, verbosity
 
 
 def print_json(value: Mapping[str, Any]) -> None:
-    """Print one JSON object on standard output; a number that is not finite becomes null."""
+    """Print one JSON object on standard output; a number that is not finite becomes null, and a zero has no sign."""
     print(json_text(value), end="")
 
 
@@ -27,7 +27,7 @@ def json_text(value: Mapping[str, Any]) -> str:
 
 def _finite(value: Any) -> Any:
     if isinstance(value, float):
-        return value if math.isfinite(value) else None
+        return value + 0.0 if math.isfinite(value) else None  # a zero has no sign
     if isinstance(value, Mapping):
         return {str(key): _finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -43,6 +43,11 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
     # A terminal of another encoding has no line to draw.
     encoding = sys.stdout.encoding or "utf-8"
     print(text if encoding.lower().replace("-", "") == "utf8" else text.replace(RULE, "-"))
+
+
+def print_text(text: str) -> None:
+    """Print prose on standard output, folded to the terminal's width; piped, each of its lines is one line."""
+    print("\n".join(folded(text, _width())))
 
 
 def _width() -> int | None:

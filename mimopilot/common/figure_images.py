@@ -61,7 +61,9 @@ def chart_figure(chart: Chart) -> Figure:
 def _draw(axes: Any, panel: Panel, figure: Figure, columns: int) -> None:
     for item in panel.lines:
         if isinstance(item, HeatMap):
-            mesh = axes.pcolormesh(item.x, item.y, item.z, cmap="cividis", shading="nearest", rasterized=True)
+            low, high = item.z_range or (None, None)
+            scale = {"cmap": "cividis", "vmin": low, "vmax": high}
+            mesh = axes.pcolormesh(item.x, item.y, item.z, shading="nearest", rasterized=True, **scale)
             figure.colorbar(mesh, ax=axes, label=item.label)
         elif isinstance(item, Spread):
             shade = {"color": item.colour, "alpha": item.opacity, "linewidth": 0, "label": item.label or None}

@@ -74,12 +74,16 @@ class Spread:
 
 @dataclass(frozen=True, eq=False)
 class HeatMap:
-    """Values z (len(y), len(x)) as colours, in whole steps of the unit that `label` names."""
+    """Values z (len(y), len(x)) as colours, in whole steps of the unit that `label` names; NaN has none.
+
+    `z_range` are the values at the ends of the scale; None: the least and the largest.
+    """
 
     x: Any
     y: Any
     z: Any
     label: str
+    z_range: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

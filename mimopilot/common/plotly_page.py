@@ -125,12 +125,15 @@ def _spread(band: Spread) -> list[dict[str, Any]]:
 
 def _heat(heat: HeatMap) -> list[dict[str, Any]]:
     z = np.clip(np.round(np.asarray(heat.z)), -127, 127)
+    packed = _packed(z.astype("<f4"), "f4") if np.isnan(z).any() else _packed(z.astype(np.int8), "i1")
+    ends = dict(zip(("zmin", "zmax"), map(_number, heat.z_range), strict=True)) if heat.z_range else {}
     return [
         {
             "type": "heatmap",
             "x": _array(heat.x),
             "y": _array(heat.y),
-            "z": _packed(z.astype(np.int8), "i1"),
+            "z": packed,
+            **ends,
             "colorscale": SCALE,
             "colorbar": {"title": {"text": _text(heat.label), "side": "right"}, "thickness": 10, "len": 1.0},
         }

@@ -92,6 +92,29 @@ def text_table(columns: Sequence[str], rows: Sequence[Sequence[str]], width: int
     return [*_folded(table[0], widths), rule, *(line for row in cells for line in _folded(row, widths))]
 
 
+def folded(text: str, width: int | None) -> list[str]:
+    """Lines of prose, folded at spaces, the rest of a line indented as it begins; zeros without a sign.
+
+    Parameters
+    ----------
+    text : str
+    width : int or None
+        Columns of the terminal; None: unlimited. A longer word, such as a path, stays whole: it is to be copied.
+    """
+    lines: list[str] = []
+    for line in plain_zero(text).splitlines():
+        indent = line[: len(line) - len(line.lstrip())]
+        wrapper = textwrap.TextWrapper(
+            width=width or len(line) + 1,
+            initial_indent=indent,
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+        lines += wrapper.wrap(line.strip()) or [""]
+    return lines
+
+
 def _shared(natural: Sequence[int], least: Sequence[int], room: int) -> list[int]:
     """Widths between the least and the natural ones, together `room`: the column that folds most gets the next one."""
     widths = list(least)

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from mimopilot.common.charts import LIMIT, looks
+from mimopilot.common.charts import LIMIT, SETPOINT_COLOUR, looks
+from mimopilot.common.figures import Chart, HeatMap, Line, Panel, Spread
 from mimopilot.sitl.campaign.flights import FlightRunner
 from mimopilot.sitl.campaign.plan import CampaignPlan
 from mimopilot.sitl.campaign.results import CampaignResults
 from mimopilot.sitl.campaign.varied import label, varied
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.flight.figures import SETPOINT
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS
 from mimopilot.sitl.flight.scenario import AXES
 
@@ -26,6 +26,7 @@ FLIGHTS_PER_CELL = 8  # least average number of flights per cell of the map
 POINTS = 300  # points of a distribution curve
 CROSSES = 200  # largest number of lost flights marked in the map
 LARGEST = 75.0  # deg: limit of the angle axis of the envelopes
+BEFORE = 0.1  # s before the manoeuvre that is shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +65,7 @@ def fly_sample(runner: FlightRunner) -> EnvelopeSample:
     return EnvelopeSample(angles, survived)
 
 
-def envelope_figure(runner: FlightRunner, sample: EnvelopeSample, results: CampaignResults, index: int) -> Figure:
+def envelope_chart(runner: FlightRunner, sample: EnvelopeSample, results: CampaignResults, index: int) -> Chart:
     """Responses on one axis: median, 5 to 95 %, and the worst flight; one row of panels per gain set.
 
     Parameters
@@ -78,65 +79,63 @@ def envelope_figure(runner: FlightRunner, sample: EnvelopeSample, results: Campa
     index : int
         Index of the scenario.
     """
-    plan = runner.plan
-    scenario, axis = plan.scenarios[index], plan.scenarios[index].axis
+    scenario, axis = runner.plan.scenarios[index], runner.plan.scenarios[index].axis
     time = (np.arange(len(scenario.setpoint)) - scenario.window[0]) * scenario.Ts
-    figure = Figure(figsize=(9, 0.9 + 2.6 * len(plan.gains)), layout="constrained")
-    panels: Any = figure.subplots(len(plan.gains), 2, sharex=True, sharey="col", squeeze=False)
-    for row, (name, (colour, _)) in zip(panels, set_looks(plan).items(), strict=True):
+    inside = time >= -BEFORE
+    panels = []
+    for name, look in set_looks(runner.plan).items():
         angles, survived = sample.angles[name, index], sample.survived[name, index]
         bad = results.worst(name, AXES[axis], 1)[0].run
         worst = np.degrees(runner.fly(runner.draw(bad), name, index).truth["attitude"][:, :2])
-        for panel, shown in zip(row, (axis, 1 - axis), strict=True):
+        for shown in (axis, 1 - axis):
+            lines: list[Line | Spread] = []
             if shown == axis:
-                panel.step(time, np.degrees(scenario.setpoint[:, axis]), where="post", label="setpoint", **SETPOINT)
+                setpoint = np.degrees(scenario.setpoint[:, axis])
+                lines.append(Line(time[inside], setpoint[inside], "setpoint", SETPOINT_COLOUR, width=1.0, step=True))
             if survived.any():
-                low, median, high = np.percentile(angles[survived, :, shown], (5, 50, 95), axis=0)
-                panel.fill_between(time, low, high, color=colour, alpha=0.3, linewidth=0, label="5 to 95 %")
-                panel.plot(time, median, color=colour, linewidth=1.8, label="median")
-            panel.plot(time, worst[:, shown], color="black", linestyle=":", linewidth=1.2, label=f"worst: run {bad}")
-            panel.grid(alpha=0.3)
-            panel.set_title(f"{name}: {AXES[shown]}{'' if shown == axis else ', off-axis'}", loc="left", fontsize=10)
-            panel.set_ylabel("angle [deg]")
-        row[0].legend(fontsize=8, loc="upper right", ncols=2)
-        if not survived.all():
-            row[1].set_title(f"{int((~survived).sum())} of {len(survived)} lost: not shown", loc="right", fontsize=8)
-    for panel in panels[0]:  # a tumbling vehicle must not flatten the other curves; leave space for the legend
-        low, high = panel.get_ylim()
-        low, high = max(low, -LARGEST), min(high, LARGEST)
-        panel.set_ylim(low, high + 0.3 * (high - low))
-    for panel in panels[-1]:
-        panel.set_xlabel("time from the start of the manoeuvre [s]")
-        panel.set_xlim(max(-0.1, time[0]), time[-1])
-    figure.suptitle(f"{AXES[axis].capitalize()} {scenario.name}", x=0.02, ha="left")
-    return figure
+                low, median, high = np.percentile(angles[survived, :, shown], (5, 50, 95), axis=0)[:, inside]
+                lines.append(Spread(time[inside], low, high, "5 to 95 %", look[0]))
+                lines.append(Line(time[inside], median, "median", look[0], width=2.0))
+            fallen = worst[inside, shown]
+            lines.append(Line(time[inside], fallen, f"worst: run {bad}", SETPOINT_COLOUR, ":", width=1.2))
+            lost = "" if survived.all() else f"; {int((~survived).sum())} of {len(survived)} lost: not shown"
+            title = f"{name}: {AXES[shown]}" + (lost if shown == axis else ", off-axis")
+            panels.append(Panel(title, "time from the start of the manoeuvre [s]", "[deg]", lines))
+    # One range for all sets, so that they compare; a tumbling vehicle must not flatten the other curves.
+    panels = [replace(panel, y_range=_range(panels[place % 2 :: 2])) for place, panel in enumerate(panels)]
+    return Chart(f"responses-{AXES[axis]}", f"{AXES[axis].capitalize()} {scenario.name}.", panels)
 
 
-def distribution_figure(results: CampaignResults, axis: str) -> Figure:
+def _range(panels: Sequence[Panel]) -> tuple[float, float]:
+    """Range of the angles in some panels, deg, with a little room, at most `LARGEST`."""
+    values = [
+        edge
+        for panel in panels
+        for one in panel.lines
+        for edge in ((one.low, one.high) if isinstance(one, Spread) else (one.y,))  # type: ignore[union-attr]
+    ]
+    low, high = min(float(np.nanmin(one)) for one in values), max(float(np.nanmax(one)) for one in values)
+    room = 0.05 * (high - low) + 1e-3
+    return max(low - room, -LARGEST), min(high + room, LARGEST)
+
+
+def distribution_chart(results: CampaignResults, axis: str) -> Chart:
     """Cumulative distribution of each figure, one curve per gain set; lost flights count as infinite."""
     plan, names = results.plan, ("J_M_o", "offaxis_peak_deg", "peak_deg", "effort_rms")
-    figure = Figure(figsize=(9, 6), layout="constrained")
-    panels: Any = figure.subplots(2, 2, sharey=True)
-    for panel, name in zip(panels.flat, names, strict=True):
+    panels = []
+    for name in names:
+        lines = []
         for gains, (colour, style) in set_looks(plan).items():
             survived = results.column("survived", gains, axis)
             ordered = np.sort(results.column(name, gains, axis)[survived])
-            if not len(ordered):
-                continue
-            at = np.unique(np.linspace(0, len(ordered) - 1, POINTS).astype(int))
-            share = (at + 1) / len(survived)
-            panel.step(ordered[at], share, where="post", color=colour, linestyle=style, linewidth=1.8, label=gains)
-        if name == "J_M_o":
-            panel.set_xscale("log")
-        panel.set_xlabel(FIGURE_LABELS[name])
-        panel.set_ylim(0, 1.02)
-        panel.grid(alpha=0.3, which="both")
-    for row in panels:
-        row[0].set_ylabel("fraction of flights [-]")
-    if panels[0, 0].lines:
-        panels[0, 0].legend(fontsize=8, loc="lower right")
-    figure.suptitle(f"Distributions, {axis}", x=0.02, ha="left")
-    return figure
+            if len(ordered):
+                at = np.unique(np.linspace(0, len(ordered) - 1, POINTS).astype(int))
+                share = (at + 1) / len(survived)
+                lines.append(Line(ordered[at], share, gains, colour, style, width=2.0, step=True))
+        label = FIGURE_LABELS[name]
+        log = name == "J_M_o" and bool(lines)
+        panels.append(Panel(f"{axis}: {label}", label, "fraction of flights", lines, log_x=log, y_range=(0.0, 1.02)))
+    return Chart(f"distributions-{axis}", f"Distributions of the figures on {axis}.", panels, linked=False)
 
 
 def parse_map(plan: CampaignPlan, text: str) -> tuple[str, str]:
@@ -182,35 +181,25 @@ def _correlation(value: NDArray[Any], other: NDArray[Any]) -> float:
     return max(abs(float(np.corrcoef(one, other)[0, 1])) for one in both if np.ptp(one) > 0)
 
 
-def survival_figure(results: CampaignResults, axis: str, names: tuple[str, str]) -> Figure:
-    """Fraction of surviving flights over two varied quantities; one panel per gain set."""
-    plan = results.plan
-    columns = min(len(plan.gains), 3)
-    lines = -(-len(plan.gains) // columns)
-    figure = Figure(figsize=(max(3.2 * columns + 0.8, 5), 3.0 * lines + 0.6), layout="constrained")
-    panels: Any = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False)
-    image: Any = None
-    for panel, gains in zip(panels.flat, plan.gains, strict=False):
+def survival_chart(results: CampaignResults, axis: str, names: tuple[str, str]) -> Chart:
+    """Share of surviving flights over two varied quantities; one panel per gain set."""
+    plan, panels = results.plan, []
+    for gains in plan.gains:
         x, y, survived = (results.column(name, gains, axis) for name in (*names, "survived"))
         cells = int(np.clip(np.sqrt(len(x) / FLIGHTS_PER_CELL), 4, CELLS))
         edges = [_edges(x, cells), _edges(y, cells)]
-        all_flights, _, _ = np.histogram2d(x, y, edges)
+        flown, _, _ = np.histogram2d(x, y, edges)
         good, _, _ = np.histogram2d(x[survived], y[survived], edges)
-        share = np.divide(good, all_flights, out=np.full_like(good, np.nan), where=all_flights > 0)
-        image = panel.pcolormesh(*edges, share.T, cmap="cividis", vmin=0, vmax=1, rasterized=True)
+        share = np.divide(100.0 * good, flown, out=np.full_like(good, np.nan), where=flown > 0)
+        across, along = ((one[1:] + one[:-1]) / 2 for one in edges)
         lost = np.flatnonzero(~survived)[:CROSSES]
-        panel.plot(x[lost], y[lost], "x", color=LIMIT, markersize=3, markeredgewidth=0.8)
-        panel.set_title(f"{gains}: {int(survived.sum())} of {len(survived)} survived", loc="left", fontsize=10)
-        panel.set_facecolor("white")
-    for panel in panels[-1]:
-        panel.set_xlabel(label(plan, names[0]))
-    for row in panels:
-        row[0].set_ylabel(label(plan, names[1]))
-    for panel in list(panels.flat)[len(plan.gains) :]:
-        panel.set_visible(False)
-    figure.colorbar(image, ax=panels, label="fraction survived [-]  (white: not flown; x: lost)")
-    figure.suptitle(f"Survived, {axis}", x=0.02, ha="left")
-    return figure
+        marks = Line(x[lost], y[lost], "lost", LIMIT, width=0, marker="x")
+        lines: list[HeatMap | Line | Spread] = [HeatMap(across, along, share.T, "% survived", (0.0, 100.0))]
+        lines += [marks] if len(lost) else []
+        title = f"{gains}: {int(survived.sum())} of {len(survived)} survived"
+        panels.append(Panel(title, label(plan, names[0]), label(plan, names[1]), lines, height=320))
+    caption = f"Share of the flights on {axis} that survived; white: not flown. Crosses: lost flights."
+    return Chart(f"survival-{axis}", caption, panels, columns=min(len(panels), 3), linked=False)
 
 
 def _edges(value: NDArray[Any], cells: int) -> NDArray[np.float64]:

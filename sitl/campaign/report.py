@@ -21,7 +21,6 @@ from mimopilot.sitl.campaign.summary import (
     worst_rows,
 )
 from mimopilot.sitl.campaign.varied import VARIED_COLUMNS, varied_rows
-from mimopilot.sitl.flight.figures import svg
 
 INTERVALS = (
     "Survival with Wilson's 95 % interval; quantiles with 95 % intervals between order statistics. A lost flight "
@@ -68,25 +67,20 @@ def write_campaign_report(
     tables = [table for table in tables if table.rows]
     nothing = "" if summary.varied else f"{NOTHING_VARIED} "
     sample = campaign_figures.fly_sample(runner)
-    envelopes = [
-        svg(campaign_figures.envelope_figure(runner, sample, results, index), f"envelope {axis}")
-        for index, axis in enumerate(d.axes)
-    ]
+    envelopes = [campaign_figures.envelope_chart(runner, sample, results, index) for index in range(len(d.axes))]
     sections = [
         Section("Summary", nothing + INTERVALS, tables=tables),
         Section(
             "Responses",
             "True angles of the surviving runs among the first "
             f"{min(d.runs, campaign_figures.ENVELOPE_RUNS)}, and of the worst run of all.",
-            figures=envelopes,
+            charts=envelopes,
         ),
         Section(
             "Distributions",
             "Fraction of all flights whose figure is at most the abscissa. Further left is better. A curve that ends "
             "below 1 has lost the rest of the flights.",
-            figures=[
-                svg(campaign_figures.distribution_figure(results, axis), f"distribution {axis}") for axis in d.axes
-            ],
+            charts=[campaign_figures.distribution_chart(results, axis) for axis in d.axes],
         ),
     ]
     sections.append(_survival(results, summary, over))
@@ -110,8 +104,8 @@ def _survival(results: CampaignResults, summary: CampaignSummary, over: tuple[st
         groups = [group for group in summary.groups if group.axis == axis]
         flights, survived = sum(group.flights for group in groups), sum(group.survived for group in groups)
         if 0 < survived < flights:
-            maps.append(svg(campaign_figures.survival_figure(results, axis, names), f"map {axis}"))
+            maps.append(campaign_figures.survival_chart(results, axis, names))
         else:
             fate = "survived" if survived else "were lost"
             points.append(f"{axis}: all {flights} flights {fate}: a map of survival would have one colour.")
-    return Section(heading, "Over two varied quantities." if maps else "", figures=maps, points=points)
+    return Section(heading, "Over two varied quantities." if maps else "", charts=maps, points=points)

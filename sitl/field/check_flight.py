@@ -20,12 +20,13 @@ from mimopilot.sitl.field.doublet_flight import BEFORE_S, DoubletPlan
 from mimopilot.tuning import law
 from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.axes import Law, axis_names, law_of, yaw_axis
+from mimopilot.tuning.design.yaw_design import yaw_model
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
-from mimopilot.tuning.reference_model import ReferenceModel, model_from_table
+from mimopilot.tuning.reference_model import ReferenceModel
 
 # All chosen, see the tests for what healthy and damaged vehicles reach:
 #: Share by which a figure may be worse than predicted.
@@ -147,12 +148,6 @@ def check_flight(flight: Experiment, experiment: Experiment, gains: Gains, plan:
         more = _compare(yaw_axis(flight), part, measured.yaw, law_of(gains, 1), [yaw])
         predicted, flown, axes = predicted + more[0], flown + more[1], axes + more[2]
     return CheckResult(predicted, flown, _worse(predicted, flown), axes)
-
-
-def yaw_model(gains: Gains) -> ReferenceModel | None:
-    """The model that the heading follows with a set; None: its yaw gains are not tuned."""
-    found = gains.provenance.details.get("yaw", {}).get("attitude_model")
-    return None if found is None else model_from_table(found, "yaw attitude model").discretise(gains.Ts)
 
 
 def _compare(

@@ -10,7 +10,6 @@ from pymavlink.dialects.v20 import common as mavlink
 from mimopilot.sitl.autopilot.flight_modes import Mode
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import FLIGHT, GAINS, AutotuneOptions, AutotuneRun, Decided
-from mimopilot.sitl.field.check_flight import yaw_model
 from mimopilot.sitl.field.doublet_flight import doublet_plan, fly_doublets
 from mimopilot.sitl.field.flight_commands import land, send_command, take_off, wait_until_disarmed, wait_until_hovering
 from mimopilot.sitl.field.flight_watch import POLL_S, FlightWatch, start_watch
@@ -23,6 +22,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
 from mimopilot.sitl.mavlink.ground_station.session import Session
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
+from mimopilot.tuning.design.yaw_design import yaw_model
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameters import ENABLE
 

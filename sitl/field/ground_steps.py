@@ -11,7 +11,7 @@ from mimopilot.common.files import sha256
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_report import write_autotune_report
 from mimopilot.sitl.field.autotune_run import ANSWER_S, CHECK, FLIGHT, GAINS, SNAPSHOT, AutotuneRun, Decided
-from mimopilot.sitl.field.check_flight import check_flight, yaw_model
+from mimopilot.sitl.field.check_flight import check_flight
 from mimopilot.sitl.field.doublet_flight import doublet_plan
 from mimopilot.sitl.field.flight_watch import start_watch
 from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, old_plan, save_snapshot, write_set
@@ -29,6 +29,7 @@ from mimopilot.sitl.mavlink.log_transfer.vehicle_logs import VehicleLog
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.yaw_design import yaw_model
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains_file import load_gains

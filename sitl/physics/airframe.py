@@ -18,7 +18,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.physics.mixer import Allocation, make_allocation, moment_scale
 from mimopilot.sitl.physics.rigid_body import GRAVITY, PlantParameters, checked_inertia
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.gains_file import load_gains
+from mimopilot.tuning.gains_file import load_gains, set_name
 
 MAX_HOVER = 0.9  # weight over largest thrust; chosen: with less than 10 % to spare no torque can be given
 FOLDER = Path(__file__).resolve().parent / "airframes"
@@ -215,7 +215,7 @@ class AirframeFile:
         SitlError
             When two files have the same name.
         """
-        names = [path.name.removesuffix(".toml").removesuffix(".gains") for path in files]
+        names = [set_name(path) for path in files]
         if len(set(names)) < len(names):
             raise SitlError(f"--gains: two files have the same name ({', '.join(names)}); rename one")
         return dict(zip(names, map(load_gains, files), strict=True)) or {"default": self.default_gains()}

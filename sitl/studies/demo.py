@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mimopilot.codegen.native import NativeController, load_native
-from mimopilot.common.console import print_table
+from mimopilot.common.console import print_table, print_text
 from mimopilot.common.files import inside
 from mimopilot.common.html_report import ReportTable, Section, write_report
 from mimopilot.common.progress import step
@@ -29,6 +29,7 @@ from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.reader import read_log
+from mimopilot.tuning.parameters import with_unit
 from mimopilot.tuning.spec import load_spec
 
 AIRFRAME = "adam0"
@@ -190,7 +191,7 @@ def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
             found = gains[method].provenance.standard_deviation
             values = np.ravel(getattr(gains[method], name))
             deviations = np.ravel(found[name]) if name in found else [None] * 4
-            rows.append([f"{name}  {label}", *map(with_deviation, values, deviations)])
+            rows.append([f"{with_unit(name)}  {label}", *map(with_deviation, values, deviations)])
     return rows
 
 
@@ -212,7 +213,10 @@ def _predicted_rows(gains: dict[str, Gains]) -> list[list[str]]:
 
 GAIN_COLUMNS = ("gain", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
 PREDICTED_COLUMNS = ("set", "following [deg]", "off-axis [deg]", "after a torque [deg]", "noise of u", "Ms")
-FIGURE_COLUMNS = ("doublet", "J_M,o", "J_r,o", "J_r,i", "off-axis peak [deg]", "off-axis RMS [deg]", "effort RMS")
+FIGURE_COLUMNS = (
+    *("doublet", "J_M,o [rad^2]", "J_r,o [rad^2]", "J_r,i [rad^2/s^2]"),
+    *("off-axis peak [deg]", "off-axis RMS [deg]", "effort RMS"),
+)
 
 
 def _figure_rows(figures: dict[str, dict[str, Performance]]) -> list[list[str]]:
@@ -290,12 +294,12 @@ def print_summary(summary: DemoSummary) -> None:
     print_table("Predicted from the log, roll / pitch", PREDICTED_COLUMNS, _predicted_rows(summary.gains))
     title = f"Flown: doublet of {DOUBLET_DEG:g} deg, {DOUBLET_S:g} s; J in rad^2 and rad^2/s^2"
     print_table(title, FIGURE_COLUMNS, _figure_rows(summary.figures))
-    print(
+    print_text(
         f"over MAVLink (roll, MIMO): {summary.mavlink_samples} torques, 0 differ from the flight in process; "
         f"{summary.mavlink_speed:.0f} times real time"
     )
-    print(f"log     {summary.log}")
+    print_text(f"log     {summary.log}")
     for method, path in summary.paths.items():
-        print(f"gains   {path}  ({method})")
-    print(f"report  {summary.report}")
-    print(f"{summary.seconds:.1f} s")
+        print_text(f"gains   {path}  ({method})")
+    print_text(f"report  {summary.report}")
+    print_text(f"{summary.seconds:.1f} s")

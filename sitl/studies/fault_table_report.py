@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from mimopilot.common.console import print_table
+from mimopilot.common.console import print_table, print_text
 from mimopilot.sitl.studies.fault_table import FaultTable, FaultTableRow
 
 COLUMNS = (
-    *("fault", "gains", "survived", "95 %", "peak [deg]", "worst", "RMS", "recovered [s]"),
-    *("saturated", "detected [s]", "non-finite"),
+    *("fault", "gains", "survived", "95 % interval", "peak [deg]", "worst [deg]", "RMS [deg]", "recovered [s]"),
+    *("saturated samples", "detected [s]", "non-finite outputs"),
 )
 
 
@@ -16,7 +16,7 @@ def print_fault_table(table: FaultTable) -> None:
     print_table(table.title, COLUMNS, [_cells(row) for row in table.rows])
     for name, lost in table.lost_without.items():
         runs = next(row.runs for row in table.rows if row.gains == name)
-        print(f"without faults, {name}: {lost} of {runs} lost, {table.alarms_without[name]} with a false alarm")
+        print_text(f"without faults, {name}: {lost} of {runs} lost, {table.alarms_without[name]} with a false alarm")
     print("commands to repeat the worst flights:")
     for row in table.rows:
         print(f"  {row.replay}")

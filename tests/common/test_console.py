@@ -9,10 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mimopilot.common import console
-from mimopilot.common.console import print_table
-from mimopilot.common.text_table import UNBROKEN, plain_zero, text_table, with_deviation
+import mimopilot
+from mimopilot.common.console import print_json, print_table, print_text
+from mimopilot.common.text_table import folded, plain_zero, text_table, with_deviation
+from mimopilot.tuning.design.advise import Advice, Candidate
+from mimopilot.tuning.design.prediction import Prediction
+from mimopilot.tuning.gains_file import load_gains
 from tests.conftest import run_here
+from tests.readable import Printed
 
 WORDS = st.lists(st.text("abcdefgh0123456789.-", min_size=1, max_size=40), max_size=6).map(" ".join)
 TABLES = st.integers(1, 9).flatmap(
@@ -77,17 +81,50 @@ def test_a_number_has_the_digits_that_its_deviation_justifies(value, deviation, 
 def test_a_zero_has_no_sign(capsys):
     print_table("zeros", ["", "a"], [["-0.00", "-0.0000 (0.0001), -0.5, 1e-0, -0.01"]])
     assert "0.00   0.0000 (0.0001), -0.5, 1e-0, -0.01" in capsys.readouterr().out
+    print_text("from -0.0000 to -0.0001, -0 dB")
+    print_json({"a": [-0.0, {"b": -0.0}], "c": -1.5})
+    assert capsys.readouterr().out.split() == [
+        *("from", "0.0000", "to", "-0.0001,", "0", "dB"),
+        *("{", '"a":', "[", "0.0,", "{", '"b":', "0.0", "}", "],", '"c":', "-1.5", "}"),
+    ]
+
+
+def test_prose_folds_at_spaces_and_keeps_its_indent_and_its_paths():
+    path = "/a/path/that/is/longer/than/the/terminal/is/wide.toml"
+    text = f"  {path}  (MIMO)\nshort\n\n{'word ' * 20}"
+    lines = folded(text, 30)
+    assert lines[0] == f"  {path}"
+    assert lines[1:4] == ["  (MIMO)", "short", ""]
+    assert all(len(line) <= 30 for line in lines[1:])
+    assert folded(text, None) == [*text.splitlines()[:3], ("word " * 20).rstrip()]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """A flight and gains from it."""
-    folder = tmp_path_factory.mktemp("terminal")
-    run_here(folder, "experiment", "adam0", "--seconds-per-axis", 8, "--out", "flight.ulg")
-    done = run_here(folder, "tune", "flight.ulg", "--out", "my.gains.toml", "--verbose")
+def made(tmp_path_factory):
+    """A folder with a flight and gains from it, and what the commands that made them printed."""
+    folder, outputs = tmp_path_factory.mktemp("terminal"), {}
+    for name, *options in (
+        ("experiment", "adam0", "--seconds-per-axis", 8, "--out", "flight.ulg"),
+        ("tune", "flight.ulg", "--out", "my.gains.toml", "--verbose"),
+    ):
+        with pytest.MonkeyPatch.context() as patch:
+            printed = Printed(patch)
+            outputs[name] = (run_here(folder, name, *options), printed)
+    done = outputs["tune"][0]
     assert re.search(r"^mimopilot: reading flight\.ulg: \d+\.\d\d s\n", done.stderr)
     assert "\nmimopilot: designing the gains: " in done.stderr
-    return folder
+    return folder, outputs
+
+
+@pytest.fixture(scope="module")
+def folder(made):
+    return made[0]
+
+
+@pytest.mark.parametrize("name", ["experiment", "tune"])
+def test_what_made_the_flight_and_the_gains_is_readable_at_any_width(made, name):
+    done, printed = made[1][name]
+    printed.check(done.stdout, tables=name == "tune")
 
 
 COMMANDS = {
@@ -103,27 +140,24 @@ COMMANDS = {
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_the_tables_of_a_command_are_readable_at_any_width(folder, name, monkeypatch):
-    """The command runs once; its tables are set again at each width."""
-    tables = []
-    monkeypatch.setattr(console, "text_table", lambda *table: tables.append(table) or text_table(*table))
-    monkeypatch.setenv("COLUMNS", "80")
+def test_what_a_command_prints_is_readable_at_any_width(folder, name, monkeypatch):
+    printed = Printed(monkeypatch)
     done = run_here(folder, *COMMANDS[name])
     assert done.returncode in (0, 1), done.stderr
-    assert tables
-    for columns, rows, width in tables:
-        assert width == 80
-        assert "\n".join(text_table(columns, rows, 80)) in done.stdout
-        cells = [plain_zero(word) for row in (columns, *rows) for cell in row for word in cell.split()]
-        for width in (60, 80, 120, None):
-            text = text_table(columns, rows, width)
-            assert width is None or max(map(len, text)) <= width
-            assert "…" not in "".join(text)
-            # Words are whole unless they are longer than any column could be.
-            words = " ".join(text).split()
-            assert not [
-                word for word in cells if len(word) <= UNBROKEN and word not in words and f"{word}:" not in words
-            ]
+    printed.check(done.stdout)
+
+
+def test_advice_is_readable_at_any_width(folder, monkeypatch):
+    """The tuned set stands for its alternatives: their design takes long."""
+    gains = load_gains(folder / "my.gains.toml")
+    figures = Prediction(**gains.provenance.details["predicted"]["tuned"][0])
+    sets = [Candidate(name, gains, 12.6, figures) for name in ("recommended", "flown", "D filter at 20 Hz")]
+    found = Advice(tuple(sets), {"faster": "limited by the noise of the torque and by the range of the motors"}, 41.0)
+    monkeypatch.setattr(mimopilot, "advise", lambda *_, **__: found, raising=False)
+    printed = Printed(monkeypatch)
+    done = run_here(folder, "advise", "flight.ulg")
+    assert done.returncode == 0, done.stderr
+    printed.check(done.stdout)
 
 
 def test_quiet_shows_only_results_and_errors(folder):

@@ -1,4 +1,4 @@
-"""The laws of PX4 and ArduPilot in tuning, against recursions written from the autopilots' documentation."""
+"""The stock laws in tuning, against recursions written from the documentation of PX4, ArduPilot and Betaflight."""
 
 import dataclasses
 import math
@@ -14,7 +14,7 @@ from mimopilot.tuning.law import ERROR, RATE, SETPOINT, rate_matrices, regressor
 from mimopilot.tuning.parameters import YAW_GAINS
 from tests.conftest import stock_gains
 
-STOCK = ("px4-stock", "ardupilot-stock")
+STOCK = ("px4-stock", "ardupilot-stock", "betaflight")
 SAMPLES = 400
 
 
@@ -63,13 +63,34 @@ def ardupilot(gains, axis, setpoint, rate):
     return made
 
 
+def betaflight(gains, axis, setpoint, rate):
+    """Betaflight's pid.c in angle mode, from rest: setpoint behind a PT3 of 50 Hz, gyro behind two PT1."""
+    Kp, Ki, Kd, Kff = terms(gains, axis)
+    Ts, stock = gains.Ts, gains.filters.stock
+    a, b = weight(stock.derivative_hz[axis], Ts), weight(stock.derivative2_hz[axis], Ts)
+    c = weight(50.0 * 1.961459177, Ts)
+    stages, first, second, integral, made = [0.0] * 3, rate[0], rate[0], 0.0, []
+    for r, y in zip(setpoint, rate, strict=True):
+        for i in range(3):  # each stage takes the new output of the one before it
+            stages[i] += c * ((stages[i - 1] if i else r) - stages[i])
+        before = second
+        first += a * (y - first)
+        second += b * (first - second)
+        integral += Ki * (stages[2] - y) * Ts
+        made.append(Kp * (stages[2] - y) + integral - Kd * (second - before) / Ts + Kff * stages[2])
+    return made
+
+
+RECURSIONS = dict(zip(STOCK, (px4, ardupilot, betaflight), strict=True))
+
+
 @pytest.fixture(scope="module", params=STOCK)
 def case(request):
     """A set, setpoints and rates (N, 3) that begin at zero, and the torque of the documented law."""
     gains = stock_gains(request.param)
     signals = np.random.default_rng(0).normal(size=(2, SAMPLES, 3))
     signals[:, :1] = 0.0
-    recursion = {"px4-stock": px4, "ardupilot-stock": ardupilot}[request.param]
+    recursion = RECURSIONS[request.param]
     torque = [recursion(gains, axis, signals[0, :, axis], signals[1, :, axis]) for axis in range(3)]
     return gains, *signals, np.array(torque).T
 
@@ -99,7 +120,7 @@ def test_the_regressors_and_the_state_space_are_the_documented_law(case):
 def test_the_response_of_all_axes_is_that_of_the_documented_law(controller):
     """By the recursions' answers to a sine of 300 periods, of which the first 200 are for their transient."""
     gains, periods = stock_gains(controller), 300
-    recursion = {"px4-stock": px4, "ardupilot-stock": ardupilot}[controller]
+    recursion = RECURSIONS[controller]
     for samples in (20, 80):  # a period of the sine
         omega = 2 * np.pi / samples / gains.Ts
         law = response(gains, np.array([omega]))[0]
@@ -116,8 +137,8 @@ def test_the_response_of_all_axes_is_that_of_the_documented_law(controller):
             of_rate = phasor(np.array(recursion(gains, axis, still, sine)))
             Kp_o = gains.yaw.Kp_o if axis == 2 else gains.Kp_o[axis, axis]
             assert law[3 + axis, 6 + axis] == pytest.approx(of_rate, rel=1e-6)
-            # A rate setpoint acts one period after the attitude that it is made of.
-            late = Kp_o * of_setpoint * np.exp(-1j * omega * gains.Ts)
+            # A rate setpoint acts one period after the attitude that it is made of, but for Betaflight.
+            late = Kp_o * of_setpoint * (1.0 if controller == "betaflight" else np.exp(-1j * omega * gains.Ts))
             assert law[3 + axis, axis] == pytest.approx(late, rel=1e-6)
             assert law[3 + axis, 3 + axis] == pytest.approx(-late, rel=1e-6)
 
@@ -130,7 +151,7 @@ def test_a_file_says_for_which_controller_it_is_and_comes_back_the_same(controll
     assert gains_to_toml(gains_from_toml(text, "x")) == text
     assert gains_from_toml(text, "x").filters == gains.filters
     for line, message in (
-        ('controller = "betaflight"', "x: controller: got 'betaflight', expected one of mimo, px4-stock"),
+        ('controller = "inav"', "x: controller: got 'inav', expected one of mimo, px4-stock"),
         ('controller = "mimo"', "x: filters: unknown entry"),
     ):
         with pytest.raises(TuningError, match=message):

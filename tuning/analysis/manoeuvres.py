@@ -5,6 +5,7 @@ All figures are energies by Parseval's theorem, so the time after a manoeuvre co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -139,8 +140,8 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
     )
 
 
-def doublet_torque(plant: WideResponse, amplitude: float, lag: float = 0.0) -> Complex:
-    """Weights (T, K) whose product with the response U gives, in its real part, the torque in the doublets.
+def doublet_torque(plant: WideResponse, amplitude: float, lags: Sequence[float] = (0.0,)) -> list[Complex]:
+    """For each lag the weights (T, K) whose product with U gives, in its real part, the torque in the doublets.
 
     At the times when it is largest: after the setpoint jumps.
 
@@ -148,13 +149,15 @@ def doublet_torque(plant: WideResponse, amplitude: float, lag: float = 0.0) -> C
     ----------
     plant : WideResponse
     amplitude : float, rad
-    lag : float, s
+    lags : sequence of float, s
         Of the rotors, for the torque behind them; 0: as commanded.
     """
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, COARSE)
-    rows = []
+    found: list[list[Complex]] = [[] for _ in lags]
     for period in family_of(plant.axes).periods:
-        spectrum = amplitude * doublet_spectrum(fine, period) / np.pi / (1 + 1j * fine * lag)
         times = [begin + (k + 0.5) * plant.Ts for begin in (0.0, period / 2, period) for k in AFTER]
-        rows.append(hat_weights(plant.omega, fine, spectrum[:, None] * np.exp(1j * np.outer(fine, times))).T)
-    return np.concatenate(rows)
+        waves = np.exp(1j * np.outer(fine, times))
+        spectrum = amplitude * doublet_spectrum(fine, period) / np.pi
+        for rows, lag in zip(found, lags, strict=True):
+            rows.append(hat_weights(plant.omega, fine, (spectrum / (1 + 1j * fine * lag))[:, None] * waves).T)
+    return [np.concatenate(rows) for rows in found]

@@ -20,6 +20,7 @@ from mimopilot.common.parallel import processes, run_all
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.logs.blackbox_file import BESIDE
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.formats import SUFFIXES
 from mimopilot.tuning.logs.reader import read_log
@@ -131,6 +132,11 @@ class RepeatedTuning:
         }
 
 
+def _is_log(path: Path) -> bool:
+    """Whether a file is a log by its name, and not the settings of one."""
+    return path.suffix.lower() in SUFFIXES and not path.name.endswith(BESIDE)
+
+
 def find_logs(paths: Sequence[Path]) -> list[Path]:
     """The given logs, and those of the given folders in order of their names.
 
@@ -141,7 +147,7 @@ def find_logs(paths: Sequence[Path]) -> list[Path]:
     """
     found: list[Path] = []
     for path in paths:
-        inside = sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
+        inside = sorted(filter(_is_log, path.iterdir())) if path.is_dir() else [path]
         if not inside:
             raise TuningError(f"{path}: no logs in this folder; expected files ending in {', '.join(SUFFIXES)}")
         found += inside

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mimopilot.tuning.analysis.beyond_band import MAX_SENSITIVITY_BELOW_BAND, exceeded_frequencies
 from mimopilot.tuning.analysis.closed_loop import model_spectral_radius
 from mimopilot.tuning.analysis.manoeuvres import doublet_torque, family_of, manoeuvres
-from mimopilot.tuning.axes import Law, flown_law
+from mimopilot.tuning.axes import Law, axes_slice, flown_law
 from mimopilot.tuning.design.constraints import (
     SHARE,
     Constraint,
@@ -326,7 +326,7 @@ class ResponseDesign:
         if TERMS["D"].matrix in free.units:
             found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(plant.axes))]
         largest = free.base.filters.law.largest or {}
-        axes = slice(2, 3) if plant.axes == 1 else slice(0, plant.axes)
+        axes = axes_slice(plant.axes)
         found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
         return found + self._actuators(place)
 
@@ -345,8 +345,8 @@ class ResponseDesign:
             name = "range of the motors"
         loop = None if flown is None else _loop_of(flown, plant)
         # The rotors' torque stays within the range. Their command may exceed it for less than their lag.
-        for share, lag in ((RANGE, plant.shape[1]), (PEAK, 0.0)):
-            limit = MotorLimit(doublet_torque(plant, size, lag), mixer, share * room, name)
+        for share, torque in zip((RANGE, PEAK), doublet_torque(plant, size, (plant.shape[1], 0.0)), strict=True):
+            limit = MotorLimit(torque, mixer, share * room, name)
             # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
             used = 1.0 if loop is None else max(1.0, 1 - limit.margin(loop))
             found.append(replace(limit, room=used * limit.room))

@@ -28,7 +28,7 @@ from mimopilot.tuning.parameters import YAW_GAINS
 from mimopilot.tuning.plant.frequency_response import MIN_FREQUENCIES
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.provenance import Provenance
-from mimopilot.tuning.reference_model import SecondOrder
+from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder, model_from_table
 from mimopilot.tuning.spec import TuningSpec
 
 #: Bandwidths of the heading model, rad/s: those of the attitude and slower ones, at most that of roll and pitch. A
@@ -177,6 +177,12 @@ def _plain(figures: Prediction) -> dict[str, float]:
     """A prediction of yaw as TOML and JSON values; there is no other axis."""
     by_axis = ("follow_deg", "disturbance_deg", "noise", "fast_noise")
     return {name: getattr(figures, name)[0] for name in by_axis} | {"Ms": figures.Ms}
+
+
+def yaw_model(gains: Gains) -> ReferenceModel | None:
+    """The model that the heading follows with a set; None: its yaw gains are not tuned."""
+    found = gains.provenance.details.get("yaw", {}).get("attitude_model")
+    return None if found is None else model_from_table(found, "yaw attitude model").discretise(gains.Ts)
 
 
 def with_yaw(

@@ -21,6 +21,8 @@ from mimopilot.tuning.errors import TuningError
 
 #: The first column of every tool.
 FIRST = "loopIteration"
+#: End of the name of the file with the settings that blackbox_decode --save-headers writes beside the table.
+BESIDE = ".headers.csv"
 #: Lines of settings that Blackbox Explorer writes above the table: about 200 with Betaflight 2025.12.
 MAX_SETTINGS = 2000
 #: Name and unit in a cell of the header line.
@@ -85,7 +87,9 @@ def read_blackbox(path: Path, wanted: re.Pattern[str]) -> BlackboxTable:
     lines = text.splitlines()
     start = next((i for i, line in enumerate(lines[:MAX_SETTINGS]) if FIRST in line), None)
     if start is None:
-        raise TuningError(f"{path}: no line with the column names ({FIRST}, ...); decode the log again")
+        beside = f"it holds the settings of {path.name.removesuffix(BESIDE)}.csv; give that file"
+        cause = beside if path.name.endswith(BESIDE) else "decode the log again"
+        raise TuningError(f"{path}: no line with the column names ({FIRST}, ...); {cause}")
     names, units = _header(lines[start])
     settings = _settings(lines[:start]) or _settings_beside(path)
     rows = [line for line in lines[start + 1 :] if line.strip()]
@@ -115,7 +119,7 @@ def _settings(lines: Sequence[str]) -> dict[str, str]:
 
 def _settings_beside(path: Path) -> dict[str, str]:
     """Settings that blackbox_decode --save-headers wrote beside the table; empty when it did not."""
-    beside = path.with_name(f"{path.name.removesuffix('.csv')}.headers.csv")
+    beside = path.with_name(f"{path.name.removesuffix('.csv')}{BESIDE}")
     return _settings(beside.read_text("utf-8", "replace").splitlines()) if beside.is_file() else {}
 
 

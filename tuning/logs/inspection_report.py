@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict
 from typing import Any
 
-from mimopilot.common.console import print_table
+from mimopilot.common.console import print_table, print_text
 from mimopilot.tuning.experiment import EXTERNAL
 from mimopilot.tuning.logs.inspection import Inspection, SignalReport
 
@@ -73,24 +73,28 @@ def print_inspection(found: Inspection) -> None:
     columns = ["signal", "from", "rate", "gaps (longest)", "roll", "pitch", "yaw", "saturated"]
     print_table(f"{recording.path.name}: {recording.format}, {found.seconds:.1f} s", columns, rows)
     if found.airborne is not None:
-        print(f"airborne: {sum(b - a for a, b in found.airborne):.1f} s by {recording.evidence}")
+        print_text(f"airborne: {sum(b - a for a, b in found.airborne):.1f} s by {recording.evidence}")
     if found.parts:
-        print("used: " + ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.parts))
+        print_text("used: " + ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.parts))
     if experiment is not None:
         count = len(experiment.segments)
-        print(f"experiment: {experiment.seconds:.1f} s at {1 / experiment.Ts:.1f} Hz, {count} segments without a gap")
+        print_text(
+            f"experiment: {experiment.seconds:.1f} s at {1 / experiment.Ts:.1f} Hz, {count} segments without a gap"
+        )
         if experiment.yaw is not None:
             parts = experiment.yaw.segments
-            print(f"yaw: {sum(b - a for a, b in parts) * experiment.Ts:.1f} s, {len(parts)} segments")
+            print_text(f"yaw: {sum(b - a for a, b in parts) * experiment.Ts:.1f} s, {len(parts)} segments")
     if found.external:
         axes = {name: [axis for axis, of_axis in found.external.items() if of_axis == name] for name in EXTERNAL}
-        print("excited: " + "; ".join(f"{', '.join(on)} by {EXTERNAL[name]}" for name, on in axes.items() if on))
+        print_text("excited: " + "; ".join(f"{', '.join(on)} by {EXTERNAL[name]}" for name, on in axes.items() if on))
     for name, excitation in found.excitation.items():
         low, high = excitation.band_hz
-        print(f"excitation {name}: {excitation.rms:.4f} RMS, 90 % of its power from {low:.2f} to {high:.2f} Hz")
+        print_text(f"excitation {name}: {excitation.rms:.4f} RMS, 90 % of its power from {low:.2f} to {high:.2f} Hz")
     if found.flown is not None:
         diagonals = [f"{name} {m[0, 0]:.4g} / {m[1, 1]:.4g}" for name, m in found.flown.matrices.items()]
-        print(f"flown (roll / pitch): {', '.join(diagonals)}")
+        print_text(f"flown (roll / pitch): {', '.join(diagonals)}")
     for note in recording.notes:
-        print(f"note: {note}")
-    print("gains can be tuned from it" if found.reason is None else f"gains cannot be tuned from it: {found.reason}")
+        print_text(f"note: {note}")
+    print_text(
+        "gains can be tuned from it" if found.reason is None else f"gains cannot be tuned from it: {found.reason}"
+    )

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.plant.frequency_response import GROWTH, MIN_FREQUENCIES, SMOOTH, PlantResponse
@@ -172,12 +173,13 @@ def hat_weights(omega: Signal, fine: Signal, values: NDArray[Any]) -> NDArray[An
     -------
     (K,) or (K, n) array
     """
-    products = (values.T * _trapezoid(fine)).T
     cell = np.clip(np.searchsorted(omega, fine) - 1, 0, len(omega) - 2)
     part = np.clip((fine - omega[cell]) / (omega[cell + 1] - omega[cell]), 0.0, 1.0)
-    weights = np.zeros((len(omega), *values.shape[1:]), values.dtype)
-    np.add.at(weights, cell, (products.T * (1 - part)).T)
-    np.add.at(weights, cell + 1, (products.T * part).T)
+    places, shares = np.concatenate([cell, cell + 1]), np.concatenate([1 - part, part])
+    order = np.argsort(places, kind="stable")
+    ends = np.concatenate([[0], np.cumsum(np.bincount(places, minlength=len(omega)))])
+    hats = csr_array((shares[order], order % len(fine), ends), shape=(len(omega), len(fine)))
+    weights: NDArray[Any] = hats @ (values.T * _trapezoid(fine)).T
     return weights
 
 

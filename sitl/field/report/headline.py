@@ -32,7 +32,8 @@ def headline(flights: Sequence[ReportedFlight], cases: Sequence[GainCase]) -> He
     crashed = next((flight for flight in flights if flight.phases["crash"]), None)
     before = ""
     if crashed is not None:
-        before = f"The vehicle tumbled {crashed.phases['crash'][0][0]:.1f} s into {crashed.label}. "
+        fell = max(crashed.phases["crash"][0][0], crashed.tumbles[0][0])
+        before = f"The vehicle tumbled {fell:.1f} s into {crashed.label}. "
     judged = [case for case in cases if not case.problem and case.gains.certificate]
     if not judged:
         return _without_certificate(flights, cases, before)

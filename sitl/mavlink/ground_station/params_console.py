@@ -10,7 +10,7 @@ from mimopilot.common.files import write_atomically
 from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
-from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
+from mimopilot.sitl.mavlink.ground_station.profiles import TABLE, make_plan
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
@@ -45,10 +45,13 @@ def compare(file: Path, options: LinkOptions) -> None:
         print_json({"equal": not differ, "parameters": both})
     else:
         rows = [
-            [name, shortest(value), shortest(held[name]), f"{held[name] - value:+.6g}" if name in differ else ""]
+            [
+                *(name, TABLE[name].unit, shortest(value), shortest(held[name])),
+                f"{held[name] - value:+.6g}" if name in differ else "",
+            ]
             for name, value in wanted.items()
         ]
-        print_table(str(file), ["parameter", "in the file", "on the vehicle", "difference"], rows)
+        print_table(str(file), ["parameter", "unit", "in the file", "on the vehicle", "difference"], rows)
     if differ:
         raise SitlError(f"{len(differ)} of {len(wanted)} parameters differ", exit_code=1)
 

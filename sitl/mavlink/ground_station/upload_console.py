@@ -9,7 +9,7 @@ from typing import Literal
 
 import typer
 
-from mimopilot.common.console import print_json, print_table
+from mimopilot.common.console import print_json, print_table, print_text
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Heartbeat
 from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan
@@ -52,7 +52,7 @@ class TerminalDialogue:
 
     def saved(self, path: Path) -> None:
         """Print where the old values are."""
-        print(f"old values saved: {path}")
+        print_text(f"old values saved: {path}")
 
 
 def upload_with_dialogue(
@@ -74,7 +74,7 @@ def upload_with_dialogue(
         rows = [[s.name, s.unit, shortest(done.outcome.held[s.name][0])] for s in plan.settings]
         print_table("read back from the vehicle", ["parameter", "unit", "value"], rows)
         written = sum(s.value != done.held[s.name] for s in plan.settings)
-        print(f"{len(rows)} parameters verified, {written} of them written; {STORAGE[done.outcome.storage]}")
+        print_text(f"{len(rows)} parameters verified, {written} of them written; {STORAGE[done.outcome.storage]}")
     done.check()
 
 
@@ -94,9 +94,9 @@ def _show_plan(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbeat) 
     title = f"vehicle {vehicle.system}, component {vehicle.component}, {'armed' if vehicle.armed else 'disarmed'}"
     print_table(title, ["parameter", "unit", "on the vehicle", "new", "change"], rows)
     for name in (s.name for s in plan.settings if 0 < abs(s.value - held[s.name]) < SMALLEST_CHANGE):
-        print(f"note: {name}: PX4 and ArduPilot do not save a change below {SMALLEST_CHANGE:g}")
+        print_text(f"note: {name}: PX4 and ArduPilot do not save a change below {SMALLEST_CHANGE:g}")
     for note in plan.notes:
-        print(f"note: {note}")
+        print_text(f"note: {note}")
 
 
 def _print_json(done: Upload) -> None:

@@ -9,7 +9,7 @@ from mimopilot.sitl.campaign.plan import make_plan
 from mimopilot.sitl.campaign.variation import variation_from_toml
 from mimopilot.sitl.flight.scenario import doublet
 
-RUNS = 40 * CHUNK  # enough to interrupt the campaign while it flies
+RUNS = 16 * CHUNK  # enough to interrupt the campaign while it flies
 VARY = """
 mass = { normal = [1.0, 0.05], relative = true }
 delay = { uniform = [0.5, 3.5] }

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from mimopilot.tuning.design.many_logs import find_logs
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.logs.inspection import inspect_log
@@ -133,6 +134,12 @@ def test_sticks_in_acro_mode_are_the_external_signal(tmp_path):
     np.testing.assert_array_equal(signals["r_bar"].values, signals["r_i"].values)
     columns |= {f"setpoint[{i}]": np.round(3 * np.degrees(flown.angles[:, i])) for i in range(2)}  # angle mode
     assert "r_bar" not in open_log(write_decoded(tmp_path / "angle.csv", columns)).signals
+
+
+def test_the_file_of_the_settings_is_no_log(log):
+    with pytest.raises(TuningError, match=r"it holds the settings of btfl\.01\.csv; give that file"):
+        open_log(log.with_name("btfl.01.headers.csv"))
+    assert find_logs([log.parent]) == sorted(set(log.parent.glob("*.csv")) - {log.with_name("btfl.01.headers.csv")})
 
 
 def test_flown_gains_are_those_of_the_header(log):

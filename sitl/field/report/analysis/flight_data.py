@@ -118,7 +118,7 @@ class ReportedFlight:
         if angles is None:
             return ()
         tilt = np.arccos(np.clip(np.cos(angles.values[:, 0]) * np.cos(angles.values[:, 1]), -1.0, 1.0))
-        return self._inside(bridged(intervals(angles.time, tilt > TUMBLE), BRIDGE))
+        return bridged(intervals(angles.time, tilt > TUMBLE), BRIDGE)
 
     @cached_property
     def phases(self) -> dict[str, tuple[Interval, ...]]:
@@ -134,9 +134,15 @@ class ReportedFlight:
             "excitation": self._excited((self.recording.signals, self.recording.yaw)),
             "used": self._used(),
             "saturated": self._saturated(),
-            "crash": intersection(self.tumbles, self.airborne) if logged else self.tumbles,
+            "crash": self._crashed(),
             "gaps": self._gaps(),
         }
+
+    def _crashed(self) -> tuple[Interval, ...]:
+        """Tumbles in the air; one with which the log ends is shown as `SHORTEST`."""
+        last = self.span[1] - self.span[0] - SHORTEST
+        shown = self._inside(tuple((min(a, last), b) for a, b in self.tumbles))
+        return intersection(shown, self.airborne) if self.recording.airborne is not None else shown
 
     def _used(self) -> tuple[Interval, ...]:
         """What gains are tuned from, those of yaw, too; nothing in a log that they cannot be tuned from."""
@@ -270,7 +276,7 @@ def read_flights(logs: Sequence[Path], columns: Columns | None) -> list[Reported
     flights = []
     for path, label, (colour, dash) in zip(logs, labels, looks(_kinds(len(logs))), strict=True):
         found = inspect_log(path, columns)
-        samples = MOST_SAMPLES if len(logs) == 1 else 2 * MOST_SAMPLES // (len(logs) + 1)
+        samples = MOST_SAMPLES // len(logs)
         flights.append(ReportedFlight(label, found, further_signals(found.recording), colour, dash, samples))
     return flights
 

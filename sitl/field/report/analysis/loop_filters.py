@@ -96,6 +96,17 @@ def filters_of(parameters: Mapping[str, float], gains: Gains | None) -> list[Loo
     return found
 
 
+def moving_filters(parameters: Mapping[str, float]) -> list[str]:
+    """Filters whose frequency moves in flight, in words: their delay is not one number."""
+    told = []
+    if parameters.get("IMU_GYRO_DNF_EN", 0) > 0:
+        told.append("PX4's dynamic notches run (IMU_GYRO_DNF_EN): they move with the motors, and are not listed.")
+    for name in ("INS_HNTCH", "INS_HNTC2"):
+        if parameters.get(f"{name}_ENABLE", 0) == 1 and parameters.get(f"{name}_MODE", 0) > 0:
+            told.append(f"{name}'s notches move with the motors ({name}_MODE): listed at their lowest frequency.")
+    return told
+
+
 def _of_px4(parameters: Mapping[str, float]) -> list[LoopFilter]:
     """PX4 (VehicleAngularVelocity): low-pass and two static notches; dynamic notches move and are not listed."""
     found = []

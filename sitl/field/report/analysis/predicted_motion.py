@@ -24,7 +24,7 @@ BOTH = 2
 SHOWN, BEFORE = 2.1, 0.1
 #: Points of a curve; frequencies of the inverse transform, whose step repeats the motion after 2 pi over it: 50 s,
 #: on yaw 140 s.
-POINTS, FREQUENCIES = 261, 6000
+POINTS, FREQUENCIES = 161, 6000
 #: Plants drawn for the band: as many as a prediction's error uses.
 DRAWS = 12
 

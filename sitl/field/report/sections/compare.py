@@ -9,10 +9,11 @@ import numpy as np
 
 from mimopilot.common.figures import Chart, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.common.text_table import plus_minus
+from mimopilot.common.text_table import plain_zero, plus_minus
 from mimopilot.sitl.field.report.analysis.filters_advice import torque_rms
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
-from mimopilot.sitl.field.report.sections.prediction import BOTH, PREDICTED, YAW, attitude_model, predicted
+from mimopilot.sitl.field.report.analysis.predicted_motion import BOTH
+from mimopilot.sitl.field.report.sections.prediction import PREDICTED, YAW, attitude_model, predicted
 from mimopilot.sitl.field.report.sections.spectra import FlightSpectra
 from mimopilot.sitl.field.report.sections.steps import step_estimates
 from mimopilot.sitl.field.report.sections.tracking import tracking_error
@@ -32,12 +33,21 @@ class Compared:
     doubt: float = float("nan")
 
     def row(self, name: str) -> list[str]:
-        """Both, the difference with as many digits as its error justifies, and the difference in percent."""
+        """Both, the difference with as many digits as its error justifies, and the difference in percent.
+
+        Without errors, three digits of the larger value, and as many decimals of all.
+        """
         change = self.after - self.before
+        if np.isfinite(self.doubt) and self.doubt > 0:
+            values = zip((self.before, self.after), self.errors, strict=True)
+            cells = [*(plus_minus(value, error) for value, error in values), plus_minus(change, self.doubt)]
+        else:
+            size = max(abs(self.before), abs(self.after), 1e-9)
+            decimals = max(0, 2 - int(np.floor(np.log10(size))))
+            cells = [plain_zero(f"{value:.{decimals}f}") for value in (self.before, self.after, change)]
         share = f"{100 * change / self.before:+.0f} %" if self.before else "-"
-        cells = [plus_minus(value, error) for value, error in zip((self.before, self.after), self.errors, strict=True)]
-        text = plus_minus(change, self.doubt)
-        return [name, *cells, text if text.startswith("-") else f"+{text}", share]
+        cells[2] = cells[2] if cells[2].startswith("-") else f"+{cells[2]}"
+        return [name, *cells, plain_zero(share)]
 
 
 def compare_section(found: Sequence[FlightSpectra], cases: Sequence[GainCase]) -> Section | None:
@@ -119,19 +129,23 @@ def _set_figures(before: GainCase, after: GainCase) -> dict[str, Compared]:
             [(yaw["phase_margin_deg"], yaw["phase_margin_error_deg"]) for yaw in yaws]
         )
     for axes in (BOTH, YAW):
-        asked = attitude_model([before, after], axes)
-        pair = [predicted(case, asked[0], axes) for case in (before, after)] if asked else [None, None]
-        first, second = pair
-        if first is None or second is None:
-            continue
-        same = before.flight is after.flight
-        for name, title in PREDICTED.items():
-            for axis, text in enumerate(axis_names(axes) if axes == BOTH or name != "offaxis_deg" else ()):
-                values = [(one.value(name, axis), one.error(name, axis)) for one in (first, second)]
-                compared = _apart(values)
-                if same:  # around the same drawn plants
-                    compared = replace(compared, doubt=second.error(name, axis, first))
-                found[f"{text}: {title}"] = compared
+        found |= _predicted(before, after, axes)
+    return found
+
+
+def _predicted(before: GainCase, after: GainCase, axes: int) -> dict[str, Compared]:
+    """Predicted figures of two sets against one attitude model; empty: they cannot be had."""
+    asked = attitude_model([before, after], axes)
+    first, second = (predicted(case, asked[0], axes) if asked else None for case in (before, after))
+    found: dict[str, Compared] = {}
+    if first is None or second is None:
+        return found
+    for name, title in PREDICTED.items():
+        for number, axis in enumerate(axis_names(axes) if axes == BOTH or name != "offaxis_deg" else ()):
+            compared = _apart([(one.value(name, number), one.error(name, number)) for one in (first, second)])
+            if before.flight is after.flight:  # around the same drawn plants
+                compared = replace(compared, doubt=second.error(name, number, first))
+            found[f"{axis}: {title}"] = compared
     return found
 
 

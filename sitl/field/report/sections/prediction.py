@@ -11,7 +11,6 @@ from mimopilot.common.charts import MODEL_COLOUR, SETPOINT_COLOUR
 from mimopilot.common.figures import Chart, Line, Panel, Spread
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.common.text_table import plus_minus
-from mimopilot.sitl.field.check_flight import yaw_model
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
 from mimopilot.sitl.field.report.analysis.predicted_motion import (
     BOTH,
@@ -21,9 +20,11 @@ from mimopilot.sitl.field.report.analysis.predicted_motion import (
     period_of,
     predicted_motion,
 )
+from mimopilot.sitl.field.report.sections.tracking import MODEL_UNITS
 from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, family_of, manoeuvres
 from mimopilot.tuning.axes import axis_names, law_of
 from mimopilot.tuning.design.prediction import Prediction, predict
+from mimopilot.tuning.design.yaw_design import yaw_model
 from mimopilot.tuning.plant.frequency_response import SAME_PERIOD
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.reference_model import ReferenceModel
@@ -99,7 +100,7 @@ def attitude_model(cases: Sequence[GainCase], axes: int) -> tuple[ReferenceModel
     sets = [case.gains for case in cases]
     if axes == YAW:
         found = next((model for gains in reversed(sets) if (model := yaw_model(gains))), None)
-        return (found, f"{found.label}") if found else None
+        return (found, found.label) if found else None
     gains = next((one for one in reversed(sets) if one.provenance.outer_model), sets[0])
     model = gains.reference_models(0)[1]
     return model, model.label
@@ -200,6 +201,6 @@ def _figures(motions: Motions, axes: int) -> ReportTable | None:
             rows.append(
                 [f"{text}: {title}", *(plus_minus(one.value(name, axis), one.error(name, axis)) for _, one in found)]
             )
-    what = "of yaw, RMS" if axes == YAW else "RMS"
-    caption = f"Predicted figures {what} (+- two standard deviations); the model is {label}"
+    what = "yaw, RMS" if axes == YAW else "RMS"
+    caption = f"Predicted figures, {what} (+- two standard deviations); the model is {label} {MODEL_UNITS}"
     return ReportTable(caption, ("", *(case.label for case, _ in found)), rows)

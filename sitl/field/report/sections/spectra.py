@@ -12,7 +12,7 @@ from mimopilot.common.figures import Chart, HeatMap, LimitLine, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.sitl.field.report.analysis.filters_advice import NOISE_FROM, FilterChange, filter_changes, least_phase
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight
-from mimopilot.sitl.field.report.analysis.loop_filters import LoopFilter, filters_of
+from mimopilot.sitl.field.report.analysis.loop_filters import LoopFilter, filters_of, moving_filters
 from mimopilot.sitl.field.report.analysis.vibration import (
     AirSpectrum,
     Tone,
@@ -127,7 +127,8 @@ def filter_section(found: Sequence[FlightSpectra], cases: Sequence[GainCase], th
     columns += [f"phase at the crossover ({at:.0f} rad/s)"] if at else []
     tables = [ReportTable("Filters in the path of the rates", columns, rows)]
     total = sum(one.delay() for one in filters if one.acts_on != "derivative term")
-    points = [f"All filters of the rates together delay slow signals by {1e3 * total:.1f} ms."] if total else []
+    points = moving_filters(first.flight.recording.parameters)
+    points += [f"All filters of the rates together delay slow signals by {1e3 * total:.1f} ms."] if total else []
     if case is None or loops is None:
         points.append(
             "What a change of a filter costs or gives is not said: no gains have a certificate of this flight."

@@ -28,7 +28,7 @@ from mimopilot.tuning.small_matrices import singular_values
 HEADING = "Stability and margins"
 #: Half width of a Nyquist plot: the critical point and the unit circle, with some room.
 NYQUIST = 3.0
-#: Loops of drawn plants that are shown in the determinant's plot.
+#: Loops of drawn plants that are shown in the determinant's plot, of all sets together.
 SHOWN_DRAWS = 8
 #: Instead of a margin, for a loop whose gain is never 1.
 NEVER = "gain below 1"
@@ -304,7 +304,7 @@ def _determinant(found: Sequence[CaseLoops]) -> Panel:
         Line(np.array([-1.0]), np.array([0.0]), colour=LIMIT, width=0, marker="x", text=["-1"])
     ]
     for loops in found:
-        for draw in loops.draws[:SHOWN_DRAWS]:
+        for draw in loops.draws[: max(2, SHOWN_DRAWS // len(found))]:
             lines.append(_curve(np.linalg.det(np.eye(2) + draw.L_u) - 1, loops, width=0.6, label="", opacity=0.5))
         value = np.linalg.det(np.eye(2) + loops.nominal.L_u) - 1
         lines.append(_curve(value, loops, width=2.0, label=loops.case.label))

@@ -26,19 +26,22 @@ def usable(flight: ReportedFlight) -> tuple[Interval, ...]:
 
 
 def step_estimates(flight: ReportedFlight) -> tuple[dict[str, StepEstimate], list[str]]:
-    """Axis -> estimate from attitude (else rate) setpoint to answer; and why an axis has none."""
+    """Axis -> estimate from attitude (else rate) setpoint to answer; and why an axis has none.
+
+    Where an attitude setpoint is logged, the rate setpoint answers to the vehicle: it is no input to estimate from.
+    """
     for setpoint, answer, what in (("r_o", "y_o", "attitude"), ("r_i", "y_i", "rate")):
         r, y = flight.signal(setpoint), flight.signal(answer)
         if r is None or y is None:
             continue
-        found, reasons = {}, []
+        found, reasons = dict[str, StepEstimate](), dict[str, list[str]]()
         for axis, name in enumerate(AXES):
             estimate, why = estimate_step(r, y, usable(flight), axis)
             if estimate is not None:
                 found[name] = estimate
             else:
-                reasons.append(f"{flight.label}, {name} {what}: not shown: {why}.")
-        return found, reasons
+                reasons.setdefault(why, []).append(name)
+        return found, [f"{flight.label}, {what} of {' and '.join(n)}: not shown: {why}." for why, n in reasons.items()]
     return {}, [f"{flight.label}: not shown: the log lacks a setpoint, or the angles or rates that respond to it."]
 
 
@@ -47,7 +50,7 @@ def step_section(flights: Sequence[ReportedFlight]) -> Section:
     found = [step_estimates(flight) for flight in flights]
     reasons = [reason for _, some in found for reason in some]
     if not any(estimates for estimates, _ in found):
-        return Section(HEADING, " ".join(reasons))
+        return Section(HEADING, "Not shown.", points=reasons)
     panels, rows = [], []
     for name in AXES:
         lines: list[Line | Spread] = []

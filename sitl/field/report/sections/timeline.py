@@ -74,7 +74,7 @@ def timeline(flights: Sequence[ReportedFlight], number: int) -> Chart | None:
             shade = ("#bbbbbb", "#999999", "#777777", "#555555")[column % 4]
             x, y = thinned(motors.time, motors.values[:, column], flight.samples // 2)
             lines.append(Line(x, y, f"motor {column + 1}", shade, width=0.8))
-    if thrust is not None:
+    if thrust is not None and thrust.values.any():  # a column of zeros is no signal
         thrust = flight.since_begin(thrust)
         lines.append(Line(*thinned(thrust.time, thrust.values[:, 0], flight.samples), "thrust", "#1a1a1a", width=1.4))
     if lines:

@@ -20,6 +20,9 @@ DETAIL = 4.0
 #: Highest rate at which a reference model is run, Hz.
 MODEL_RATE = 250.0
 
+#: What the numbers in a model's name are.
+MODEL_UNITS = "(rad/s, damping, delay in samples)"
+
 Signal = NDArray[np.float64]
 
 
@@ -45,9 +48,8 @@ def tracking_charts(flight: ReportedFlight, number: int, count: int, model: Gain
         return []
     named = f" in {flight.label}" if count > 1 else ""
     source = _models(model) if model else None
-    reference = (
-        f" Reference: the attitude model of the new gains, {source}, driven by the flown setpoint." if source else ""
-    )
+    driven = f"the attitude model of the new gains, {source} {MODEL_UNITS}, driven by the flown setpoint."
+    reference = f" Reference: {driven}" if source else ""
     whole = (
         (flight.airborne[0][0], flight.airborne[-1][1]) if flight.airborne else (0.0, flight.span[1] - flight.span[0])
     )

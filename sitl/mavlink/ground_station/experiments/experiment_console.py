@@ -9,7 +9,7 @@ from pathlib import Path
 
 import typer
 
-from mimopilot.common.console import print_json, print_table
+from mimopilot.common.console import print_json, print_table, print_text
 from mimopilot.common.files import write_atomically
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
@@ -49,7 +49,7 @@ class _Snapshot:
         text = parameter_text("qgc", values, vehicle.system, vehicle.component, integers=self.integers)
         write_atomically(self.path, text)
         if first and not self.options.as_json:
-            print(f"old values saved: {self.path}")
+            print_text(f"old values saved: {self.path}")
 
 
 def experiment(options: LinkOptions, name: str, excitation: ExcitationOptions) -> None:
@@ -146,9 +146,9 @@ def _report(
     if options.as_json:
         print_json({**asdict(result), "notes": notes, "left": dict(restored.left), "parameters": profile.settings})
     elif result.complete:
-        print(f"excited for {result.seconds:.1f} s; {where}; then: mimopilot tune LOG")
+        print_text(f"excited for {result.seconds:.1f} s; {where}; then: mimopilot tune LOG")
         for note in notes:
-            print(f"note: {note}")
+            print_text(f"note: {note}")
     problems = [] if result.complete else [result.reason]
     if not result.stopped:
         stop = f"set {AXIS} to 0, leave the mode, or move a stick"

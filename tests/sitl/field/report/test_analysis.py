@@ -24,6 +24,7 @@ from mimopilot.sitl.field.report.analysis.loop_filters import (
     NOTCH,
     LoopFilter,
     filters_of,
+    moving_filters,
 )
 from mimopilot.sitl.field.report.analysis.predicted_motion import doublet_setpoint, predicted_motion
 from mimopilot.sitl.field.report.analysis.step_response import WIDEST, estimate_step
@@ -145,6 +146,9 @@ def test_filters_are_found_by_the_names_of_both_autopilots(gains):
     ardupilot = filters_of({"INS_GYRO_FILTER": 42.0, **harmonic}, None)
     assert [(one.kind, one.hertz) for one in ardupilot] == [(LOW_PASS, 42.0), (NOTCH, 58.8), (NOTCH, 117.6)]
     assert filters_of({"IMU_GYRO_CUTOFF": 0.0}, None) == []
+    assert "IMU_GYRO_DNF_EN" in moving_filters({"IMU_GYRO_DNF_EN": 3.0})[0]
+    assert "INS_HNTCH_MODE" in moving_filters(harmonic | {"INS_HNTCH_MODE": 1.0})[0]
+    assert moving_filters(harmonic | {"IMU_GYRO_DNF_EN": 0.0}) == []
 
 
 def test_the_interval_of_a_coherence_holds_it_and_shrinks_with_the_record():

@@ -88,7 +88,7 @@ def test_a_set_for_another_controller_is_refused(profile):
             {"limits": Limits(rate_max=(20.0, 1.0, 1.0))},
             "ATC_RATE_R_MAX: got 1145.92, expected 0 to 1080",
         ),
-        ("betaflight", {}, "--profile: got 'betaflight', expected one of mimo, px4-stock, ardupilot-stock"),
+        ("inav", {}, "--profile: got 'inav', expected one of mimo, px4-stock, ardupilot-stock"),
     ],
 )
 def test_values_out_of_range_that_a_vehicle_would_accept_are_refused(profile, change, message):

@@ -14,6 +14,7 @@ from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameters import PARAMETERS
 from tests.conftest import assert_one_clear_line, stock_gains
+from tests.readable import Printed
 from tests.sitl.mavlink.running import PATIENCE_S, QUICK, Pilot, running_sitl, wait_for
 from tests.sitl.mavlink.scripted_vehicle import (
     FAILING,
@@ -60,8 +61,8 @@ def test_gains_arrive_over_udp_tcp_and_serial(mimopilot, certified, old, new, tr
     assert read_parameters(certified.with_name("my.before-1.params")) == named(old, new)
 
 
-def test_a_dry_run_only_reads(mimopilot, certified, old, tmp_path):
-    files = sorted(tmp_path.iterdir())
+def test_a_dry_run_only_reads(mimopilot, certified, old, tmp_path, monkeypatch):
+    files, printed = sorted(tmp_path.iterdir()), Printed(monkeypatch)
     with UdpVehicle(ScriptedVehicle(old)) as link:
         link.vehicle.armed = True
         shown = mimopilot("upload", certified, "--connect", link.url, "--dry-run")
@@ -69,6 +70,7 @@ def test_a_dry_run_only_reads(mimopilot, certified, old, tmp_path):
     for word in ("armed", "on the vehicle", "MIMO_RP_RR", "0.15", "0.13125", "+0.01875"):
         assert word in shown.stdout
     assert sorted(tmp_path.iterdir()) == files
+    printed.check(shown.stdout)
 
 
 def test_json_is_one_object_for_success_and_for_failure(mimopilot, certified, old, new):
