@@ -87,7 +87,7 @@ def render(gains: Gains, target: str = "native", **options: str) -> dict[str, st
     files: dict[str, str] = {}
     for folder in kind.folders:
         for path in sorted((TEMPLATES / folder).rglob("*")):
-            if not path.is_file() or path.name == DESCRIPTION:
+            if not path.is_file() or path.name == DESCRIPTION or path.parent.name == "__pycache__":
                 continue
             name = path.relative_to(TEMPLATES).as_posix().removeprefix("package/")
             template = path.relative_to(TEMPLATES).as_posix()

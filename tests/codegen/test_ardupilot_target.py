@@ -1,7 +1,9 @@
 """The custom controller for ArduPilot: its script, its files, and its behaviour in stand-ins of ArduPilot."""
 
 import ast
+import compileall
 import math
+import shutil
 import sys
 from dataclasses import replace
 
@@ -136,6 +138,15 @@ def test_the_script_needs_nothing_but_python():
     imported = {n.name for node in ast.walk(source) if isinstance(node, ast.Import) for n in node.names}
     imported |= {node.module for node in ast.walk(source) if isinstance(node, ast.ImportFrom)}
     assert imported <= sys.stdlib_module_names
+
+
+def test_what_pip_compiles_of_the_script_is_not_emitted(gains, tmp_path, monkeypatch):
+    shutil.copytree(TEMPLATES, tmp_path / "templates")
+    compileall.compile_dir(tmp_path / "templates", quiet=1)
+    assert list((tmp_path / "templates" / "ardupilot").glob("__pycache__/*.pyc"))
+    expected = render(gains, "ardupilot")
+    monkeypatch.setattr("mimopilot.codegen.render.TEMPLATES", tmp_path / "templates")
+    assert render(gains, "ardupilot") == expected
 
 
 # The parameters
