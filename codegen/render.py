@@ -14,6 +14,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from mimopilot.codegen import ardupilot
 from mimopilot.codegen.crazyflie import crazyflie_context
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
@@ -89,7 +90,7 @@ def render(gains: Gains, target: str = "native", **options: str) -> dict[str, st
     files: dict[str, str] = {}
     for folder in kind.folders:
         for path in sorted((TEMPLATES / folder).rglob("*")):
-            if not path.is_file() or path.name == DESCRIPTION:
+            if not path.is_file() or path.name == DESCRIPTION or path.parent.name == "__pycache__":
                 continue
             name = path.relative_to(TEMPLATES).as_posix().removeprefix("package/")
             template = path.relative_to(TEMPLATES).as_posix()
@@ -121,6 +122,7 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
         "excitation_settings": EXCITATION,
         "settings": (*EXCITATION, ENABLE),
         "px4_parameters": entries(gains),
+        "ardupilot": ardupilot.context(gains),
         "literal": literal,
         "rows": ROWS,
         "offset": offset,

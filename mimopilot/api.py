@@ -616,7 +616,8 @@ def upload(
         ``udpin:HOST:PORT``, ``udpout:HOST:PORT``, ``tcp:HOST:PORT`` or ``DEVICE,BAUD``; of a Crazyflie
         ``radio://0/80/2M`` or ``usb://0``.
     profile : str
-        Controller that the gains are for: ``mimo``, our module, ``px4-stock`` or ``ardupilot-stock``.
+        Controller that the gains are for: ``mimo``, our module, ``ardupilot-custom``, our custom controller in
+        ArduCopter, ``px4-stock`` or ``ardupilot-stock``.
     moment_scale : tuple of 3 float (N m), or ``flown``, optional
         Unit of torque of a vehicle that does not publish it.
     dry_run, force_armed, uncertified : bool

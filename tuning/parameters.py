@@ -282,6 +282,27 @@ EXCITATION: tuple[Setting, ...] = (
 #: Which controller flies: this one or that of the flight stack; from 2 on, a switch chooses in flight.
 ENABLE = Setting("MIMO_EN", "", 0, 0, 7, True, "1: this controller flies; 0: the stock one; 2-7: RC AUX1-6 chooses")
 
+#: Prefix of a custom controller's parameters in ArduPilot: ours is number 3.
+ARDUPILOT_PREFIX = "CC3_"
+#: The experiment in ArduPilot, whose flight modes have other numbers.
+ARDUPILOT_EXCITATION: tuple[Setting, ...] = tuple(
+    replace(setting, default=5, description="excitation: only in this flight mode (2 AltHold, 5 Loiter)")
+    if setting.name == "MIMO_EX_MODE"
+    else setting
+    for setting in EXCITATION
+)
+
+
+def ardupilot_name(name: str) -> str:
+    """Name in ArduPilot of one of our parameters.
+
+    Examples
+    --------
+    >>> ardupilot_name("MIMO_RP_RR")
+    'CC3_RP_RR'
+    """
+    return ARDUPILOT_PREFIX + name.removeprefix(PREFIX)
+
 
 def check_names() -> None:
     """Refuse names that vehicles cannot store: PX4 and MAVLink truncate long ones silently.

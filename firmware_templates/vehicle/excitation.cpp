@@ -165,4 +165,42 @@ void Excitation::stop(End reason)
 	_left = 0;
 }
 
+const char *describe(Excitation::Phase phase)
+{
+	switch (phase) {
+	case Excitation::Phase::Roll: return "roll";
+
+	case Excitation::Phase::Pitch: return "pitch";
+
+	case Excitation::Phase::Pause: return "pause";
+
+	case Excitation::Phase::Yaw: return "yaw";
+
+	case Excitation::Phase::Waiting: return "waiting";
+
+	default: return "off";
+	}
+}
+
+const char *describe(Excitation::End end)
+{
+	switch (end) {
+	case Excitation::End::Finished: return "finished";
+
+	case Excitation::End::Cancelled: return "cancelled";
+
+	case Excitation::End::NotReady: return "stop: mode, ground or disarmed";
+
+	case Excitation::End::Tilt: return "stop: EX_TILT";
+
+	case Excitation::End::Turn: return "stop: turned";
+
+	case Excitation::End::Sticks: return "stop: a stick moved";
+
+	case Excitation::End::Settings: return "refused: EX_ out of range";
+
+	default: return "none yet";
+	}
+}
+
 }  // namespace mimopilot

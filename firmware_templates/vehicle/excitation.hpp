@@ -1,5 +1,5 @@
 // The excitation: a pseudo-random binary torque, added to the controller output on one axis, or on one after the
-// other. Needs no PX4, so that any machine can compile and test it.
+// other. Needs no autopilot, so that any machine can compile and test it.
 #pragma once
 
 #include <stdint.h>
@@ -91,5 +91,9 @@ private:
 	float _turned{0.0F}; // rad
 	float _sticks[4] {}; // at the start
 };
+
+// For the console and the ground station, without the prefix of the parameters.
+const char *describe(Excitation::Phase phase);
+const char *describe(Excitation::End end);
 
 }  // namespace mimopilot

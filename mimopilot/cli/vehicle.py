@@ -12,7 +12,6 @@ from mimopilot.cli.options import (
     GainsArgument,
     JsonOption,
     KeyOption,
-    ProfileOption,
     SystemOption,
     TimeoutOption,
     UncertifiedOption,
@@ -55,7 +54,14 @@ def register(app: typer.Typer) -> None:
 def upload(
     gains: GainsArgument,
     connect: ConnectOption,
-    profile: ProfileOption = None,
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            help="Controller: mimo (our module), ardupilot-custom (our custom controller in ArduCopter), px4-stock or "
+            "ardupilot-stock (the autopilot's own).",
+            show_default="mimo",
+        ),
+    ] = None,
     moment_scale: Annotated[
         str | None,
         typer.Option(

@@ -1,11 +1,9 @@
 """The files of the PX4 target: module.yaml by PX4's rules, start-up scripts, golden directories."""
 
 import dataclasses
-import difflib
 import json
 import re
 import subprocess
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +17,9 @@ from mimopilot.codegen.render import render
 from mimopilot.codegen.targets import TEMPLATES, targets
 from mimopilot.codegen.toolchain import find_compiler
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
+from tests.codegen.golden_files import check_golden
 from tests.codegen.px4_host import PX4_FLAGS, definitions
 
-GOLDEN = Path(__file__).parent / "golden"
 MODULE = "px4/src/modules/mc_mimo_pid"
 PLAIN = ("actuation", "sticks", "throttle")
 #: Units that PX4's validator accepts and we could need.
@@ -145,20 +143,7 @@ def templated(api, gains):
 @pytest.mark.parametrize("api", targets()["px4"].options["px4_api"])
 def test_the_rendered_files_match_the_golden_files(gains, api, request):
     files = templated(api, gains)
-    folder = GOLDEN / f"px4-{api}"
-    if request.config.getoption("--update-golden"):
-        for name, text in files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(text)
-    kept = {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
-    difference = [
-        line
-        for name in sorted(kept.keys() | files.keys())
-        for line in difflib.unified_diff(
-            kept.get(name, "").splitlines(), files.get(name, "").splitlines(), f"golden/{name}", name, lineterm=""
-        )
-    ]
-    assert not difference, "\n".join(["run pytest --update-golden if intended:", *difference])
+    check_golden(f"px4-{api}", files, request.config.getoption("--update-golden"))
 
 
 def test_the_px4_interfaces_differ_only_in_the_module_and_its_readme(gains):

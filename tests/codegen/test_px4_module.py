@@ -319,8 +319,8 @@ def test_one_axis_alone_can_be_excited(program, axis, column):
     [
         ("sticks 1 0.2 0 0 0", "a stick moved"),
         ("sticks 1 0 0 0 -0.2", "a stick moved"),
-        (f"attitude {text(*quaternion(0.6, 0, 0))} 0 1 0 0 0", "MIMO_EX_TILT"),
-        (f"attitude {text(*quaternion(0, -0.6, 0))} 0 1 0 0 0", "MIMO_EX_TILT"),
+        (f"attitude {text(*quaternion(0.6, 0, 0))} 0 1 0 0 0", "EX_TILT"),
+        (f"attitude {text(*quaternion(0, -0.6, 0))} 0 1 0 0 0", "EX_TILT"),
         (f"mode 0 0 1 1 {HOLD_MODE}", "disarmed"),
         ("mode 1 0 1 1 2", "mode"),
         ("land 0 1", "ground"),

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
+from mimopilot.tuning.logs.dataflash_custom import custom_flight, our_parameters
 from mimopilot.tuning.logs.dataflash_file import DataflashFile, open_dataflash
 from mimopilot.tuning.logs.flight_phase import intervals
 from mimopilot.tuning.logs.recording import MAX_OUTLIERS, RANGES, Recording
@@ -63,6 +64,10 @@ NOTE = (
     "the flown gains are ArduPilot's: it also filters the rate setpoint (FLTT) and the error of yaw (FLTE), which this "
     "controller does not, and its D acts on the error"
 )
+CUSTOM_NOTE = (
+    "our custom controller flew, in a part or all of the log (message MIMO): the flown gains are its own; its rate "
+    "setpoint and injected torque are those of MIMO, where it flew"
+)
 
 
 def record_dataflash(path: Path) -> Recording:
@@ -76,8 +81,8 @@ def record_dataflash(path: Path) -> Recording:
     Returns
     -------
     Recording
-        The excitation is the waveform of the system identification mode, if added to the torque (SID_AXIS 10 and
-        11, mixer).
+        The excitation is that of our custom controller, else the waveform of the system identification mode, if added
+        to the torque (SID_AXIS 10 and 11, mixer).
 
     Raises
     ------
@@ -89,7 +94,14 @@ def record_dataflash(path: Path) -> Recording:
         raise TuningError(f"{path}: {SDLOG2}")
     old = log.in_old_units()
     signals, yaw = _signals(log, LAYOUTS, old), _signals(log, YAW_LAYOUTS, old)
-    for name, excitation in _excitation(log).items():
+    custom = custom_flight(log.file)
+    excitations = _excitation(log)
+    if custom is not None:
+        excitations |= custom.injected(signals.get("u"))
+        for found, axes in ((signals, slice(0, 2)), (yaw, slice(2, 3))):
+            flown = custom.merged(found.get("r_i"), axes)
+            found |= {} if flown is None else {"r_i": flown}
+    for name, excitation in excitations.items():
         for found, axes in ((signals, slice(0, 2)), (yaw, slice(2, 3))):
             excited = excitation.values[:, axes].any(axis=0)
             # A rate injected on one axis only leaves the attitude setpoints as the signal that excites both.
@@ -99,7 +111,7 @@ def record_dataflash(path: Path) -> Recording:
         signal: " or ".join(_wanted(log, message, fields) for message, fields, _ in layouts)
         for signal, layouts in LAYOUTS.items()
     }
-    parameters, changes = _parameters(log)
+    parameters, changes = _parameters(log) if custom is None else our_parameters(*_parameters(log))
     now = parameters | {name: value for _, name, value in changes}
     texts = [*log.file.texts("MSG", "Message"), *log.file.texts("VER", "FWS")]
     modes = log.timed("MODE", ("ModeNum",))
@@ -119,7 +131,7 @@ def record_dataflash(path: Path) -> Recording:
         changes=changes,
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((damage,) if damage else ()), *vehicle.warnings),
-        notes=(NOTE, *_identification_notes(log)),
+        notes=(NOTE if custom is None else CUSTOM_NOTE, *_identification_notes(log)),
         yaw=yaw,
         span=_span(log),
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
@@ -18,7 +18,21 @@ from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains, Limits, Triple
 from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, BETAFLIGHT, MIMO, PX4_STOCK, StockFilters
 from mimopilot.tuning.parameter_row import PREFIX, Parameter, Shape
-from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, ROWS, Setting, rows
+from mimopilot.tuning.parameters import (
+    ARDUPILOT_EXCITATION,
+    ARDUPILOT_PREFIX,
+    ENABLE,
+    EXCITATION,
+    IDENTITY,
+    PARAMETERS,
+    ROWS,
+    Setting,
+    ardupilot_name,
+    rows,
+)
+
+#: Profile of our custom controller in ArduPilot, whose law is that of our module.
+ARDUPILOT_CUSTOM = "ardupilot-custom"
 
 
 @dataclass(frozen=True)
@@ -50,6 +64,8 @@ class UploadPlan:
         Key of `PROFILES` that the vehicle must fit; empty: any vehicle.
     integers : frozenset of str
         Parameters that may be whole numbers on the vehicle.
+    requires : dict
+        Name -> value of a setting of the vehicle without which the others do not exist.
     """
 
     settings: tuple[ParameterWrite, ...]
@@ -58,6 +74,7 @@ class UploadPlan:
     notes: tuple[str, ...] = ()
     profile: str = ""
     integers: frozenset[str] = frozenset()
+    requires: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def values(self) -> dict[str, float]:
@@ -73,6 +90,23 @@ def _mimo(gains: Gains) -> UploadPlan:
     )
     fixed = {p.name: single(elements[p.code]) for p in PARAMETERS if not p.writable}
     return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY))
+
+
+#: ArduPilot's choice of a custom controller: ours.
+CHOSEN = {"CC_TYPE": float(ARDUPILOT_PREFIX.strip("C_"))}
+
+
+def _ardupilot_custom(gains: Gains) -> UploadPlan:
+    """ArduPilot shows a custom controller's parameters only while it is chosen."""
+    plan = _mimo(gains)
+    return replace(
+        plan,
+        settings=tuple(replace(setting, name=ardupilot_name(setting.name)) for setting in plan.settings),
+        fixed={ardupilot_name(name): value for name, value in plan.fixed.items()},
+        scale=tuple(map(ardupilot_name, plan.scale)),
+        integers=frozenset(CHOSEN),
+        requires=CHOSEN,
+    )
 
 
 def _px4_stock(gains: Gains) -> UploadPlan:
@@ -141,7 +175,13 @@ PROFILES: dict[str, Callable[[Gains], UploadPlan]] = {
     MIMO: _mimo,
     PX4_STOCK: _px4_stock,
     ARDUPILOT_STOCK: _ardupilot_stock,
+    ARDUPILOT_CUSTOM: _ardupilot_custom,
 }
+
+
+def law_of(profile: str) -> str:
+    """Law that the gains of a profile are for, a key of `tuning.law_terms.LAWS`."""
+    return MIMO if profile == ARDUPILOT_CUSTOM else profile
 
 
 def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
@@ -168,7 +208,7 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
         )
     if profile not in PROFILES:
         raise SitlError(f"--profile: got {profile!r}, expected one of {', '.join(PROFILES)}")
-    if profile != gains.controller:
+    if law_of(profile) != gains.controller:
         raise SitlError(
             f"--profile {profile}: the gains are for {gains.controller}; upload them with --profile "
             f"{gains.controller}, or design gains for this one: mimopilot tune LOG --profile {profile}"
@@ -187,7 +227,14 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.
 _OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
 TABLE = {p.name: p for p in _OURS}
-PREFIXES = {MIMO: (PREFIX,), PX4_STOCK: ("MC_",), ARDUPILOT_STOCK: ("ATC_", "SID_")}
+_ON_ARDUPILOT: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *ARDUPILOT_EXCITATION)
+TABLE |= {ardupilot_name(p.name): p for p in _ON_ARDUPILOT}
+PREFIXES = {
+    MIMO: (PREFIX,),
+    PX4_STOCK: ("MC_",),
+    ARDUPILOT_STOCK: ("ATC_", "SID_"),
+    ARDUPILOT_CUSTOM: (ARDUPILOT_PREFIX,),
+}
 
 
 def violated_range(name: str, value: float) -> str:
@@ -218,16 +265,19 @@ def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
         if expected:
             raise SitlError(f"{source}: {name}: got {value:.6g}, expected {expected}")
     # A snapshot may be older than a row of the table that has a default.
-    required = {PREFIX + code for row in ROWS if row.default is None for code in row.codes}
-    writable = [p.name for p in PARAMETERS if p.writable and p.name in required]
-    lacking = [name for name in writable if name not in values]
-    if 0 < len(lacking) < len(writable):
-        raise SitlError(
-            f"{source}: holds {len(writable) - len(lacking)} of our {len(writable)} gains and lacks {lacking[0]}"
-            f"{f' and {len(lacking) - 1} more' if len(lacking) > 1 else ''}: restore a complete "
-            "set"
-        )
-    fixed = {p.name for p in (*PARAMETERS, *IDENTITY) if not p.writable}
+    required = {code for row in ROWS if row.default is None for code in row.codes}
+    for prefix in (PREFIX, ARDUPILOT_PREFIX):
+        writable = [prefix + p.code for p in PARAMETERS if p.writable and p.code in required]
+        lacking = [name for name in writable if name not in values]
+        if 0 < len(lacking) < len(writable):
+            raise SitlError(
+                f"{source}: holds {len(writable) - len(lacking)} of our {len(writable)} gains and lacks {lacking[0]}"
+                f"{f' and {len(lacking) - 1} more' if len(lacking) > 1 else ''}: restore a complete "
+                "set"
+            )
+    fixed = {
+        prefix + p.code for p in (*PARAMETERS, *IDENTITY) if not p.writable for prefix in (PREFIX, ARDUPILOT_PREFIX)
+    }
     settings = tuple(
         ParameterWrite(name, TABLE[name].unit if name in TABLE else "", value, -math.inf, math.inf)
         for name, value in values.items()
@@ -235,4 +285,6 @@ def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
     )
     profile = next((p for p, prefix in PREFIXES.items() if any(name.startswith(prefix) for name in values)), "")
     held = {name: values[name] for name in values if name in fixed}
-    return UploadPlan(settings, held, (), profile=profile, integers=frozenset(values))
+    requires = CHOSEN if profile == ARDUPILOT_CUSTOM else {}
+    integers = frozenset({*values, *requires})
+    return UploadPlan(settings, held, (), profile=profile, integers=integers, requires=requires)

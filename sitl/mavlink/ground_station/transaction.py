@@ -14,7 +14,12 @@ from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S
 from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, violated_range
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
 from mimopilot.sitl.mavlink.ground_station.set_switch import SWITCHES
-from mimopilot.sitl.mavlink.ground_station.upload import UploadOutcome, read_values, write_and_verify
+from mimopilot.sitl.mavlink.ground_station.upload import (
+    NoParametersError,
+    UploadOutcome,
+    read_values,
+    write_and_verify,
+)
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
@@ -133,6 +138,7 @@ def upload_and_verify(
             "ROLL,PITCH,YAW, or --moment-scale flown if the gains come from a log of this vehicle"
         )
     with open_session(options, plan.integers, crazyflie=True) as vehicle:
+        _check_choice(plan, vehicle)
         held = vehicle.read([*plan.values, *plan.fixed, *(plan.scale if ask_scale else ())], plan.profile)
         switch = SWITCHES.get(vehicle.vehicle.autopilot)
         if switch is not None and plan.profile == MIMO:
@@ -160,6 +166,23 @@ def upload_and_verify(
                 dialogue.saved(snapshot)
             outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch))
         return Upload(plan, held, vehicle.vehicle, outcome, snapshot, options.connect)
+
+
+def _check_choice(plan: UploadPlan, vehicle: Session) -> None:
+    """Refuse a vehicle on which another controller is chosen, or none."""
+    if not plan.requires:
+        return
+    firmware = "firmware with what `mimopilot generate --target ardupilot` emits"
+    try:
+        found = vehicle.read(list(plan.requires), plan.profile)
+    except NoParametersError as error:
+        raise SitlError(f"{error}; a custom controller needs {firmware}", exit_code=1) from error
+    for name, value in plan.requires.items():
+        if found[name] != value:
+            raise SitlError(
+                f"{name}: the vehicle has {found[name]:g}, expected {value:g}, our controller (in {firmware}); "
+                f"set it to {value:g}, reboot and upload again; nothing was written"
+            )
 
 
 def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session, options: LinkOptions) -> None:

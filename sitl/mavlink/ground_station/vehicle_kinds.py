@@ -24,7 +24,7 @@ MULTIROTORS = frozenset(
 #: MAV_AUTOPILOT -> its name, and the profiles that fit; the first is that of its own controller.
 AUTOPILOTS: dict[int, tuple[str, tuple[str, ...]]] = {
     mavlink.MAV_AUTOPILOT_GENERIC: ("generic autopilot", ("mimo",)),
-    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ("ArduPilot", ("ardupilot-stock",)),
+    mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: ("ArduPilot", ("ardupilot-stock", "ardupilot-custom")),
     mavlink.MAV_AUTOPILOT_PX4: ("PX4", ("px4-stock", "mimo")),
     CRAZYFLIE: ("Crazyflie firmware", ("mimo",)),
 }

@@ -8,7 +8,7 @@ import pytest
 
 from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, make_plan, make_restore_plan
+from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, law_of, make_plan, make_restore_plan
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
@@ -70,8 +70,8 @@ def test_ardupilots_parameters_are_the_gains_in_its_units():
 
 @pytest.mark.parametrize("profile", PROFILES)
 def test_a_set_for_another_controller_is_refused(profile):
-    for controller, other in zip(PROFILES, (coupled_gains(), *map(stock_gains, STOCK)), strict=True):
-        if controller != profile:
+    for controller, other in zip(("mimo", *STOCK), (coupled_gains(), *map(stock_gains, STOCK)), strict=True):
+        if controller != law_of(profile):
             message = f"--profile {profile}: the gains are for {controller}; upload them with --profile {controller}"
             with pytest.raises(SitlError, match=message):
                 make_plan(other, profile)

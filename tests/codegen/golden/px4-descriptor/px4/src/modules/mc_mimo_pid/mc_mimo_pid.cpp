@@ -25,44 +25,6 @@ constexpr uint32_t kBackup = static_cast<uint32_t>(1.0e7F * kGains.period);  // 
 // An optional field of a topic: NaN means not set.
 float optional(float value) { return PX4_ISFINITE(value) ? value : 0.0F; }
 
-const char *describe(Excitation::Phase phase)
-{
-	switch (phase) {
-	case Excitation::Phase::Roll: return "roll";
-
-	case Excitation::Phase::Pitch: return "pitch";
-
-	case Excitation::Phase::Pause: return "pause";
-
-	case Excitation::Phase::Yaw: return "yaw";
-
-	case Excitation::Phase::Waiting: return "waiting";
-
-	default: return "off";
-	}
-}
-
-const char *describe(Excitation::End end)
-{
-	switch (end) {
-	case Excitation::End::Finished: return "finished";
-
-	case Excitation::End::Cancelled: return "cancelled";
-
-	case Excitation::End::NotReady: return "stop: mode, ground or disarmed";
-
-	case Excitation::End::Tilt: return "stop: MIMO_EX_TILT";
-
-	case Excitation::End::Turn: return "stop: turned";
-
-	case Excitation::End::Sticks: return "stop: a stick moved";
-
-	case Excitation::End::Settings: return "refused: MIMO_EX_ out of range";
-
-	default: return "none yet";
-	}
-}
-
 }  // namespace
 
 ModuleBase::Descriptor McMimoPid::desc{task_spawn, custom_command, print_usage};
