@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import socket
 import subprocess
 import sys
 import tempfile
@@ -24,11 +26,14 @@ from mimopilot.sitl.mavlink.ground_station.events import run_exchange
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S, ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
 from mimopilot.sitl.mavlink.simulator_api import lockstep
+from mimopilot.sitl.mavlink.simulator_api.ardupilot_json import PACKETS
+from mimopilot.sitl.mavlink.simulator_api.json_server import JsonServer
 from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import SimulatedVehicle
 from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.fast_codec import ARMED, SENSOR, FastCodec
 from mimopilot.sitl.mavlink.wire.float32 import single
+from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, udp_socket
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 from mimopilot.sitl.studies.standard_faults import standard_faults
@@ -98,6 +103,29 @@ def plant_rows(airframe: Airframe) -> list[list[str]]:
     ]
 
 
+def ardupilot_rows(airframe: Airframe) -> list[list[str]]:
+    """Speed of the plant under ArduPilot's JSON protocol, over UDP: processor time of one core, the peer's included."""
+    rate, frames = 1200, 2400
+    vehicle = SimulatedVehicle(airframe, 1 / rate, 0, 0.0, print, sensor_noise=False)
+    magic, layout = next(iter(PACKETS.items()))
+    count = itertools.count()
+    with udp_socket(LOOPBACK, 0) as link, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.connect(link.getsockname())
+        server = JsonServer(vehicle, link, None, child=False)
+
+        def fly() -> float:
+            begin = time.process_time()
+            for _ in range(frames):
+                peer.send(layout.pack(magic, rate, next(count), *[1000] * 16))
+                server.answer_one()
+                peer.recv(4096)
+            return time.process_time() - begin
+
+        seconds = min(fly() for _ in range(5)) / frames
+    title = f"plant under ArduPilot's JSON protocol, {rate} Hz, one core"
+    return [[title, f"{1 / (seconds * rate):.1f} x real time, {seconds * 1e6:.0f} us a frame", "at least 2"]]
+
+
 def main() -> None:
     vehicle = load_airframe("adam0")
     gains, airframe = vehicle.default_gains(), vehicle.airframe
@@ -147,6 +175,7 @@ def main() -> None:
         rows.append(["the same as two processes over MAVLink", f"{over_wire:.0f} x real time", beside])
 
         rows += plant_rows(airframe)
+        rows += ardupilot_rows(airframe)
 
         inputs = random_inputs(2000, np.random.default_rng(0))
         native = best(lambda: NativeController(library, gains).run(inputs)) / len(inputs)

@@ -73,6 +73,7 @@ def stock_gains(controller: str = "px4-stock") -> Gains:
             setpoint_hz=(20.0, 22.0, 15.0),
             error_hz=(0.0, 30.0, 2.5),
             derivative_feedforward=(0.001, 0.002, 0.003),
+            shaping_s=(0.15, 0.15, 0.15),
         ),
         "betaflight": StockFilters("betaflight", (75.0, 70.0, 65.0), derivative2_hz=(100.0, 110.0, 120.0)),
     }

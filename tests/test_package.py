@@ -38,6 +38,8 @@ def test_it_works_outside_of_the_tree(wheel, tmp_path):
     use(programs, tmp_path, "generate", "my.gains.toml", "--target", "px4", "--out", "firmware")
     assert (tmp_path / "firmware/core/mimo_pid.cpp").is_file()
     assert "off-axis" in use(programs, tmp_path, "fly", "adam0", "--gains", "my.gains.toml")
+    use(programs, tmp_path, "report", "flight.ulg", "--gains", "my.gains.toml", "--out", "flight.html")
+    assert "plotly" in (tmp_path / "flight.html").read_text()
 
 
 MISSING = {

@@ -24,7 +24,7 @@ from mimopilot.common.files import sha256, write_atomically
 from mimopilot.common.toml import toml_entries, toml_value
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law_terms import MIMO, Filters, StockFilters
+from mimopilot.tuning.law_terms import LATER_FILTERS, MIMO, Filters, StockFilters
 from mimopilot.tuning.parameter_row import ANY, AXES, POSITIVE, Row, Shape, Valid
 from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, YAW_GAINS, rows
 from mimopilot.tuning.provenance import Provenance
@@ -319,7 +319,8 @@ class Gains:
                 numbers |= dict(zip(row.codes, (row.element(value, self.Ts) for value in values), strict=True))
                 numbers |= {row.key: values[0]} if row.shape is Shape.POLE else {}
         if self.filters.stock is not None:
-            content |= {"law": asdict(self.filters.stock)}
+            law = asdict(self.filters.stock)
+            content |= {"law": {k: v for k, v in law.items() if k not in LATER_FILTERS or any(v)}}
         return sha256(json.dumps([content, numbers, self.moment_scale], sort_keys=True, default=str))
 
     def verdict(self) -> tuple[Verdict, str]:

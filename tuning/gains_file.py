@@ -93,8 +93,10 @@ def _stock(table: dict[str, Any], controller: str) -> StockFilters | None:
     section, names = _get(table, FILTERS, ""), LAWS[controller].filters
     for key in sorted(set(section) - set(names)) if isinstance(section, dict) else ():
         raise TuningError(f"{FILTERS}.{shown_text(key)}: unknown entry; known: {', '.join(names)}")
+    # ArduPilot sets from before the shaping was known have none.
+    found = [name for name in names if name != "shaping_s" or name in section]
     return StockFilters(
-        controller, **{name: _triple(_get(section, name, FILTERS), f"{FILTERS}.{name}") for name in names}
+        controller, **{name: _triple(_get(section, name, FILTERS), f"{FILTERS}.{name}") for name in found}
     )
 
 

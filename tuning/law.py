@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mimopilot.tuning.first_order_filter import Chain, Filter, Response, Signal
 from mimopilot.tuning.law_terms import (
@@ -67,6 +68,8 @@ __all__ = [
     "rate_response",
     "regressors",
     "response",
+    "setpoint_rate_response",
+    "shaping_response",
     "state_space",
 ]
 #: Condition number above which a matrix counts as singular in double precision.
@@ -256,6 +259,25 @@ def model_response(filters: Filters, omega: Signal) -> tuple[Response, Response,
     return angle, difference * angle, difference**2 * angle
 
 
+def setpoint_rate_response(filters: Filters, n: int, omega: Signal) -> Response:
+    """Fixed feed-forward of a stock law from the logged attitude setpoint to the rate setpoint, (K, n, n), 1/s.
+
+    ArduPilot's shaping gives the rate by which the setpoint moves until the next period, and that acts a period later:
+    the setpoint's difference.
+    """
+    z = np.exp(1j * np.asarray(omega) * filters.Ts)[:, None, None]
+    on = np.diag([float(T > 0) for T in filters.shaping[:n]])
+    return np.asarray((1 - 1 / z) / filters.Ts * on, np.complex128)
+
+
+def shaping_response(filters: Filters, omega: Signal) -> NDArray[np.complex128]:
+    """Response (K,) of a stock law's shaping, from the given attitude setpoint to the logged one, of its first axis.
+
+    Without its limits of acceleration and jerk.
+    """
+    return np.asarray((1 + 1j * omega * filters.shaping[0]) ** -2, np.complex128)
+
+
 def cascade_response(gains: Matrices, omega: Signal) -> tuple[Response, Response, Response]:
     """Frequency response of both controllers: u = C_ref r_o - C_o y_o - C_y y_i.
 
@@ -267,12 +289,13 @@ def cascade_response(gains: Matrices, omega: Signal) -> tuple[Response, Response
     Returns
     -------
     C_ref, C_o, C_y : (..., K, 2, 2) arrays
-        Without model following C_ref is C_o.
+        Without model following C_ref is C_o, but for a stock law's feed-forward of the setpoint's rate.
     """
     of_r, of_y = rate_response(rate_matrices(gains), gains.filters, omega)
     of_angle = of_r @ attitude_matrix(gains) * attitude_response(gains.filters, omega)
     if gains.filters.followed is None:
-        return of_angle, of_angle, of_y
+        fixed = setpoint_rate_response(gains.filters, np.shape(of_r)[-1], omega)
+        return of_angle + of_r @ fixed, of_angle, of_y
     angle, rate, acceleration = model_response(gains.filters, omega)
     feedforward = of_r @ getattr(gains, ATTITUDE_FEEDFORWARD.matrix) * rate
     return of_angle * angle + feedforward + getattr(gains, TERMS["A"].matrix) * acceleration, of_angle, of_y
@@ -314,8 +337,12 @@ def response(gains: AllAxes, omega: Signal) -> Response:
     found = np.zeros((len(omega), 6, 12), np.complex128)
     found[:, :3] = np.hstack([none, -attitude, none, none])
     found[:, :3, :3] = attitude @ (angle + yaw) + whole(ATTITUDE_FEEDFORWARD.matrix) @ rate
+    fixed = setpoint_rate_response(gains.filters, 3, omega)
     of_r, of_y = rate_response(matrices, gains.filters, omega)
     found[:, 3:] = of_r @ found[:, :3] * attitude_response(gains.filters, omega)
+    found[:, 3:, :3] += of_r @ fixed
+    # The rate setpoint of this period acts in the next one.
+    found[:, :3, :3] += fixed / attitude_response(gains.filters, omega)
     found[:, 3:, :3] += whole(TERMS["A"].matrix) @ acceleration
     found[:, 3:, 6:9] -= of_y
     found[:, 3:, 9:] = eye

@@ -11,6 +11,10 @@ The stock laws, in the order of their own code, at the control period:
   (MC_YAW_TQ_CUTOFF).
 - ArduCopter 4.6 (AC_PID.cpp, AC_AttitudeControl_Multi.cpp): low-pass of the setpoint (FLTT) and of the error (FLTE); D
   is the filtered error's difference behind a low-pass (FLTD); feed-forward of the filtered setpoint and its difference.
+  With ATC_RATE_FF_ENAB the attitude setpoint is shaped (attitude_command_model in AC_AttitudeControl.cpp and
+  shape_pos_vel_accel in control.cpp, 4.8): below its limits of acceleration and jerk, with x the shaped setpoint, s the
+  given one and T = ATC_INPUT_TC, T^2 x'' = s - x - 2 T x', critically damped. x is what the log holds as setpoint, and
+  x' is added to the rate setpoint.
 
 Both run the rate controller before the attitude controller in a period, so a rate setpoint acts one period later. The
 logged rate is that behind the gyro's own filters (IMU_GYRO_CUTOFF, INS_GYRO_FILTER): those are part of the measured
@@ -56,6 +60,8 @@ class StockFilters:
         of a second one of the derivative; 0: no filter.
     derivative_feedforward : tuple of float, s^2
         Torque from the derivative of the rate setpoint.
+    shaping_s : tuple of float, s
+        Time constant of the attitude setpoint's shaping, whose rate is fed forward; 0: neither.
     """
 
     controller: str
@@ -64,6 +70,7 @@ class StockFilters:
     error_hz: tuple[float, ...] = (0.0, 0.0, 0.0)
     torque_hz: tuple[float, ...] = (0.0, 0.0, 0.0)
     derivative_feedforward: tuple[float, ...] = (0.0, 0.0, 0.0)
+    shaping_s: tuple[float, ...] = (0.0, 0.0, 0.0)
     derivative2_hz: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
@@ -86,8 +93,11 @@ STOCK_FILTERS = (
     "error_hz",
     "torque_hz",
     "derivative_feedforward",
+    "shaping_s",
     "derivative2_hz",
 )
+#: Those that were not known from the beginning: at 0 they change no certificate.
+LATER_FILTERS = ("shaping_s", "derivative2_hz")
 
 
 @dataclass(frozen=True)
@@ -129,6 +139,11 @@ class Filters:
     def followed(self) -> ReferenceModel | None:
         """Attitude model of roll and of pitch; None: no model following."""
         return followed_model(self.model_omega, self.model_damping, self.Ts) if self.model_omega else None
+
+    @property
+    def shaping(self) -> tuple[float, ...]:
+        """Time constant (s) of the stock law's shaping of the setpoint, for each axis; 0: none."""
+        return (0.0, 0.0, 0.0) if self.stock is None else self.stock.shaping_s
 
     @property
     def law(self) -> ControlLaw:
@@ -184,6 +199,9 @@ class ControlLaw:
         Keys of the parameter table that it does not have.
     largest : mapping
         Gain -> largest value that the autopilot accepts: roll, pitch, yaw. None: the ranges of our parameter table.
+    least_attitude : tuple of 3 float, 1/s
+        Least Kp_o of a design, unless the flown one is less: where the setpoint's rate is fed forward, following asks
+        for none, and the angle's error after a gust would stay long.
     step : mapping
         Gain -> value of 1 on an autopilot whose gains are whole numbers; empty: they are not.
     shared : tuple of str
@@ -198,6 +216,7 @@ class ControlLaw:
     filters: tuple[str, ...] = ()
     lacks: tuple[str, ...] = field(default=("derivative_cutoff_hz", "Kff_o", "Kaff_i", SLEW, "model_damping", MODEL))
     largest: Mapping[str, tuple[float, float, float]] | None = None
+    least_attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
     step: Mapping[str, float] = field(default_factory=dict)
     shared: tuple[str, ...] = ()
 
@@ -329,11 +348,12 @@ LAWS = {
         _ARDUPILOT_TERMS,
         (
             "# mimopilot gains for ArduPilot's stock controllers: ATC_RAT_*_P, I, D, FF; diagonal, roll then pitch.",
-            "# r_i = Kp_o (r_o - y_o), low-passed at setpoint_hz;  e = r_i - y_i, low-passed at error_hz;",
+            "# r_i = Kp_o (r_o - y_o) + dr_o/dt, low-passed at setpoint_hz; shaping_s 0: no dr_o/dt;",
+            "# e = r_i - y_i, low-passed at error_hz;",
             "# u = Kp_i e + I + Kd_i de/dt + Kff_i r_i + derivative_feedforward dr_i/dt; de/dt at derivative_hz",
         ),
         setpoint=lambda f: _low_pass(_stock(f).setpoint_hz, f.Ts),
-        filters=("derivative_hz", "setpoint_hz", "error_hz", "derivative_feedforward"),
+        filters=("derivative_hz", "setpoint_hz", "error_hz", "derivative_feedforward", "shaping_s"),
         lacks=("derivative_cutoff_hz", "Kff_o", "Kaff_i", SLEW, "model_damping", MODEL, "yaw_weight"),
         # ArduPilot's parameter reference, ArduCopter 4.6; it enforces none.
         largest={
@@ -343,6 +363,8 @@ LAWS = {
             "Kd_i": (0.05, 0.05, 0.02),
             "Kff_i": (0.5, 0.5, 0.5),
         },
+        # The same reference; not for yaw, whose torque is weak.
+        least_attitude=(3.0, 3.0, 0.0),
     ),
     BETAFLIGHT: ControlLaw(
         _BETAFLIGHT_TERMS,

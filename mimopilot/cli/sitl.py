@@ -118,9 +118,25 @@ def sitl(
 
 def plant(
     airframe: AirframeArgument,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port to listen on; 0: any free one.")] = 4560,
-    rate: Annotated[float, typer.Option(help="Frames per second (the autopilot's control rate), Hz.")] = 250.0,
-    speed: SpeedOption = "1",
+    protocol: Annotated[
+        str, typer.Option(help="px4: PX4's simulator API, over TCP. ardupilot-json: ArduPilot's, over UDP.")
+    ] = "px4",
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=65535, help="Port to listen on; 0: any free one.", show_default="4560; ardupilot-json: 9002"
+        ),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Frames per second (the autopilot's control rate), Hz.", show_default="250; ardupilot-json: its own"
+        ),
+    ] = None,
+    speed: Annotated[
+        str | None,
+        typer.Option(help="Times real time, or max: as fast as possible.", show_default="1; ardupilot-json: max"),
+    ] = None,
     altitude: Annotated[
         float, typer.Option(min=0, max=1000, help="Initial hover altitude, m; 0: on the ground, rotors standing.")
     ] = 0.0,
@@ -131,32 +147,51 @@ def plant(
         str | None, typer.Option(help="DEVICE,BAUD of a board in HITL mode, in place of the TCP port; in real time.")
     ] = None,
 ) -> None:
-    """Serve the plant alone over PX4's simulator API to one autopilot after another, in lockstep over TCP."""
+    """Serve the plant alone to PX4's or ArduPilot's simulation, one autopilot after another, in lockstep."""
     import mimopilot as mp
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.faults.kinds import parse_faults
     from mimopilot.sitl.mavlink.simulator_api.hitl import SerialPlant
+    from mimopilot.sitl.mavlink.simulator_api.json_server import FRAME_RATE, PORT, JsonServer, check_json_faults
     from mimopilot.sitl.mavlink.simulator_api.plant_server import PlantServer
     from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import SimulatedVehicle
-    from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, listen
-
-    times = _times(speed)
-    if not 1 <= rate <= 1e4:
-        raise SitlError(f"--rate {rate}: expected 1 to 10000 Hz")
-    if serial and times != 1.0:
-        raise SitlError(f"--speed {speed}: a board on a serial port flies in real time")
+    from mimopilot.sitl.mavlink.wire.sockets import LOOPBACK, listen, udp_socket
 
     def report(text: str) -> None:
         print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
 
+    if protocol not in ("px4", "ardupilot-json"):
+        raise SitlError(f"--protocol: got {protocol!r}, expected px4 or ardupilot-json")
+    json = protocol == "ardupilot-json"
+    if json:
+        check_not_given(
+            "not with ardupilot-json: ArduPilot sets the rate (SIM_RATE_HZ), and boots on the ground",
+            rate=rate,
+            altitude=altitude or None,
+            serial=serial,
+        )
+    rate = FRAME_RATE if json else 250.0 if rate is None else rate
+    times = _times(speed or ("max" if json else "1"))
+    if not 1 <= rate <= 1e4:
+        raise SitlError(f"--rate {rate}: expected 1 to 10000 Hz")
+    if serial and times != 1.0:
+        raise SitlError(f"--speed {speed}: a board on a serial port flies in real time")
     faults = parse_faults(fault or (), ("plant", "link"), "the plant")
-    vehicle = SimulatedVehicle(mp.load_airframe(airframe), round(1 / rate, 9), seed, altitude, report, faults)
+    if json:
+        check_json_faults(faults)
+    body = mp.load_airframe(airframe)
+    vehicle = SimulatedVehicle(body, round(1 / rate, 9), seed, altitude, report, faults, sensor_noise=not json)
     try:
+        if json:
+            advice = "is another simulator running? Choose another port with --port, and the same for arducopter"
+            with udp_socket(LOOPBACK, PORT if port is None else port, advice) as link:
+                print(f"plant of {airframe} listens on UDP {LOOPBACK}:{link.getsockname()[1]}", flush=True)
+                JsonServer(vehicle, link, times, child).serve()
         if serial:
             board = SerialPlant(vehicle, serial)
             print(f"plant of {airframe}: serial port {serial}", flush=True)
             board.serve()
-        with listen(LOOPBACK, port) as socket:
+        with listen(LOOPBACK, 4560 if port is None else port) as socket:
             print(f"plant of {airframe} listens on TCP {LOOPBACK}:{socket.getsockname()[1]}", flush=True)
             PlantServer(vehicle, socket, times, child).serve()
     except KeyboardInterrupt:

@@ -26,6 +26,7 @@ NAN = math.nan
 # Times are chosen.
 COMMAND_TIMEOUT_S = 12.0  # without an answer; 24 tries, as for parameters
 READY_TIMEOUT_S = 30.0  # until a vehicle that has just started lets itself be armed
+HOVERED_S = 1.0  # of a hover, until it counts as one
 CLIMB_S_PER_M, CLIMB_MARGIN_S = 4.0, 20.0  # of a take-off: at least 0.25 m/s
 ARRIVED = 0.3  # m, from the asked height; and m/s
 LAND_TIMEOUT_S = 180.0  # from the command to the disarmed vehicle
@@ -169,10 +170,13 @@ def wait_until_disarmed(watch: FlightWatch, seconds: float = PILOT_TIMEOUT_S, ca
 
 
 def wait_until_hovering(watch: FlightWatch) -> Exchange[None]:
-    """Wait until a pilot has taken off and hovers."""
-    yield from wait_for(
-        watch,
-        lambda: watch.flying and watch.landed == IN_AIR and abs(watch.climb) < ARRIVED,
-        PILOT_TIMEOUT_S,
-        "take off and hover",
-    )
+    """Wait until a pilot has taken off and has hovered for a while: a vehicle that lifts off climbs slowly, too."""
+    since = math.inf
+
+    def hovers() -> bool:
+        nonlocal since
+        still = watch.flying and watch.landed == IN_AIR and abs(watch.climb) < ARRIVED
+        since = min(since, watch.client.now) if still else math.inf
+        return watch.client.now - since >= HOVERED_S
+
+    yield from wait_for(watch, hovers, PILOT_TIMEOUT_S, "take off and hover")

@@ -15,7 +15,7 @@ from mimopilot.sitl.field.flight_commands import land, send_command, take_off, w
 from mimopilot.sitl.field.flight_watch import POLL_S, FlightWatch, start_watch
 from mimopilot.sitl.field.ground_steps import Found, list_logs
 from mimopilot.sitl.field.vehicle_set import NEW, compare_set
-from mimopilot.sitl.mavlink.ground_station.events import Exchange
+from mimopilot.sitl.mavlink.ground_station.events import ARDUPILOT, Exchange
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
 from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import experiment_profile
 from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
@@ -220,6 +220,7 @@ def _hand_over(session: Session) -> Exchange[dict[str, float]]:
 
 
 def _enter_mode(session: Session, mode: int) -> Any:
-    """Back to a mode (custom_mode) of PX4's numbers."""
-    main, sub = float(mode >> 16 & 0xFF), float(mode >> 24 & 0xFF)
+    """Back to a mode (custom_mode): PX4's number holds main and sub mode."""
+    plain = session.vehicle.autopilot == ARDUPILOT
+    main, sub = (float(mode), 0.0) if plain else (float(mode >> 16 & 0xFF), float(mode >> 24 & 0xFF))
     return send_command(session.client, mavlink.MAV_CMD_DO_SET_MODE, (1.0, main, sub), "leave the mode of setpoints")

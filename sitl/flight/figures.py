@@ -62,7 +62,7 @@ def manoeuvre_figure(flights: Mapping[str, Flight], inner: ReferenceModel, outer
         panel.set_ylabel(text)
         panel.grid(alpha=0.3)
         panel.axvspan(0, (scenario.window[1] - scenario.window[0]) * scenario.Ts, color="#000000", alpha=0.04)
-    panels[0].legend(loc="upper right", fontsize=9, ncols=2)
+    _legend_below(figure, panels[0])
     panels[0].set_title(f"{AXES[axis].capitalize()} {scenario.name}", loc="left")
     panels[3].set_xlabel("time from the start of the manoeuvre [s] (shaded: window of the performance figures)")
     panels[3].set_xlim(time[0], time[-1])
@@ -94,7 +94,7 @@ def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
                 panel.step(time, values[:, axis], where="post", **line)
             panel.grid(alpha=0.3)
         row[0].set_ylabel(text)
-    panels[0, 1].legend(loc="upper right", fontsize=9, ncols=3)
+    _legend_below(figure, panels[0, 1])
     panels[0, 0].set_title("Closed-loop experiment", loc="left")
     panels[0, 1].set_title("where roll ends and pitch begins", loc="left")
     for column, limits in enumerate(((time[0], time[-1]), (middle - zoom_s / 2, middle + zoom_s / 2))):
@@ -102,3 +102,8 @@ def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
         panels[3, column].set_xlim(*limits)
     figure.align_ylabels(panels)
     return figure
+
+
+def _legend_below(figure: Figure, panel: Any) -> None:
+    """The legend of one panel below all of them, where it lies over no curve."""
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=5, fontsize=9)

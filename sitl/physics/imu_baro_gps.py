@@ -133,16 +133,18 @@ class ImuBaroGps:
         Interval between readings.
     seed : int
         Seed of noise and biases.
+    noise : bool
+        False: all but the barometer and the GPS are exact.
     """
 
-    def __init__(self, state: NDArray[np.float64], Ts: float, seed: int) -> None:
+    def __init__(self, state: NDArray[np.float64], Ts: float, seed: int, noise: bool = True) -> None:
         self.Ts = Ts
         self._generator, self._gps_generator = (np.random.default_rng([seed, which]) for which in (1, 2))
         bandwidth = math.sqrt(0.5 / Ts)
         deviations = ACCELEROMETER_DENSITY * bandwidth, GYRO_DENSITY * bandwidth, MAGNETOMETER_NOISE
-        self.deviations = np.repeat(deviations, 3)
+        self.deviations = np.repeat(deviations, 3) * noise
         spread = np.repeat((ACCELEROMETER_BIAS, GYRO_BIAS, MAGNETOMETER_BIAS), 3)
-        self.biases = spread * np.clip(self._generator.standard_normal(9), -2.0, 2.0)
+        self.biases = noise * spread * np.clip(self._generator.standard_normal(9), -2.0, 2.0)
         self.before = state.copy()
         self.out = np.zeros(READINGS)
 

@@ -175,7 +175,8 @@ def true_figures(airframe: Airframe, gains: Mapping[str, Gains]) -> dict[str, di
     """Exact figures of gain sets, one of which is `DEFAULT`, see `AttitudeRun.truth`."""
     Ts = gains[DEFAULT].Ts
     plant, truth = true_response(airframe, Ts), TruePlant(airframe, Ts)
-    task = manoeuvres(plant, SecondOrder(10.0, 0.7).discretise(Ts))  # does not matter for the noise
+    model = SecondOrder(10.0, 0.7).discretise(Ts)  # does not matter for the noise
+    task = manoeuvres(plant, model, gains[DEFAULT].filters)
     flown = predict(gains[DEFAULT], plant, task)
     return {
         method: {

@@ -221,7 +221,7 @@ def run_vehicle(seed: int) -> dict[str, Any]:
 def _predictions(vehicle: DrawnVehicle, model: ReferenceModel, gusts: float, *sets: Gains) -> list[Prediction]:
     """Exact figures on the true plant, see `Prediction`."""
     plant = true_response(vehicle.airframe, vehicle.gains.Ts, gusts)
-    task = manoeuvres(plant, model)
+    task = manoeuvres(plant, model, vehicle.gains.filters)
     return [predict(one, plant, task) for one in sets]
 
 

@@ -10,7 +10,17 @@ from mimopilot.codegen.render import render
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import gains_to_toml
 from mimopilot.tuning.gains_file import gains_from_toml
-from mimopilot.tuning.law import ERROR, RATE, SETPOINT, rate_matrices, regressors, response, state_space
+from mimopilot.tuning.law import (
+    ERROR,
+    RATE,
+    SETPOINT,
+    rate_matrices,
+    regressors,
+    response,
+    setpoint_rate_response,
+    shaping_response,
+    state_space,
+)
 from mimopilot.tuning.parameters import YAW_GAINS
 from tests.conftest import stock_gains
 
@@ -138,9 +148,55 @@ def test_the_response_of_all_axes_is_that_of_the_documented_law(controller):
             Kp_o = gains.yaw.Kp_o if axis == 2 else gains.Kp_o[axis, axis]
             assert law[3 + axis, 6 + axis] == pytest.approx(of_rate, rel=1e-6)
             # A rate setpoint acts one period after the attitude that it is made of, but for Betaflight.
-            late = Kp_o * of_setpoint * (1.0 if controller == "betaflight" else np.exp(-1j * omega * gains.Ts))
-            assert law[3 + axis, axis] == pytest.approx(late, rel=1e-6)
+            delay = 1.0 if controller == "betaflight" else np.exp(-1j * omega * gains.Ts)
+            late = Kp_o * of_setpoint * delay
             assert law[3 + axis, 3 + axis] == pytest.approx(-late, rel=1e-6)
+            if any(gains.filters.shaping):  # ArduPilot: so does the rate at which the setpoint moves on
+                late += of_setpoint * (1 / delay - 1) / gains.Ts * delay
+            assert law[3 + axis, axis] == pytest.approx(late, rel=1e-6)
+
+
+def shaped(given, T, Ts):
+    """ArduCopter's attitude_command_model, below its limits: the setpoint (N,) and the rate that is fed forward."""
+    angle = speed = acceleration = 0.0
+    angles, rates = [], []
+    for wanted in given:
+        angle += speed * Ts  # update_attitude_target
+        asked = (wanted - angle) / T - speed  # the square root controller, and the closing rate behind k_v
+        acceleration = (asked - speed) / T
+        speed += acceleration * Ts
+        angles.append(angle)
+        rates.append(speed)
+    return np.array(angles), np.array(rates)
+
+
+def test_the_shaping_is_that_of_arducopters_recursion():
+    gains = stock_gains("ardupilot-stock")
+    T, Ts, samples = gains.filters.shaping[0], gains.Ts, 800
+    omega = 2 * np.pi / samples / Ts
+    k = np.arange(20 * samples)
+    angles, rates = shaped(np.sin(2 * np.pi * k / samples), T, Ts)
+    used = slice(10 * samples, None)
+    found, moving = (2j * np.mean(s[used] * np.exp(-2j * np.pi * k[used] / samples)) for s in (angles, rates))
+    # Continuous against discrete: about a period of delay in two seconds.
+    assert shaping_response(gains.filters, np.array([omega]))[0] == pytest.approx(found, abs=0.02)
+    # What is fed forward is the setpoint's own difference, a period ahead.
+    late = setpoint_rate_response(gains.filters, 1, np.array([omega]))[0, 0, 0] * np.exp(1j * omega * Ts)
+    assert late * found == pytest.approx(moving, rel=1e-6)
+
+
+def test_a_file_without_the_shaping_has_none_and_keeps_its_certificate():
+    gains = stock_gains("ardupilot-stock")
+    none = dataclasses.replace(
+        gains,
+        filters=gains.filters.stock
+        and dataclasses.replace(
+            gains.filters, stock=dataclasses.replace(gains.filters.stock, shaping_s=(0.0, 0.0, 0.0))
+        ),
+    )
+    text = gains_to_toml(none)
+    line = next(line for line in text.splitlines() if line.startswith("shaping_s"))
+    assert gains_from_toml(text.replace(line + "\n", ""), "x").filters == none.filters
 
 
 @pytest.mark.parametrize("controller", STOCK)

@@ -1,6 +1,7 @@
 """The manoeuvres that a gain set is judged by: doublets of several lengths on each axis, and a step of torque.
 
-All figures are energies by Parseval's theorem, so the time after a manoeuvre counts until everything is at rest.
+All figures are energies by Parseval's theorem, so the time after a manoeuvre counts until everything is at rest. Where
+a stock law shapes its setpoints, the doublets are those behind the shaping, as they are logged.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import doublet_spectrum
+from mimopilot.tuning.law import Filters, shaping_response
 from mimopilot.tuning.plant.rigid_body_fit import LOWEST
 from mimopilot.tuning.plant.wide_response import WideResponse, hat_weights
 from mimopilot.tuning.reference_model import ReferenceModel
@@ -116,7 +118,7 @@ class Manoeuvres:
         return weight
 
 
-def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
+def manoeuvres(plant: WideResponse, model: ReferenceModel, filters: Filters) -> Manoeuvres:
     """The doublets and the step of torque of its axes on the frequencies of a plant.
 
     Parameters
@@ -124,10 +126,13 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
     plant : WideResponse
     model : ReferenceModel
         Of the attitude.
+    filters : Filters
+        Of the law whose shaping the setpoints have.
     """
     family = family_of(plant.axes)
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, FINE)
-    spectra = np.array([np.abs(doublet_spectrum(fine, period)) ** 2 / np.pi for period in family.periods])
+    shaped = np.abs(shaping_response(filters, fine)) ** 2
+    spectra = np.array([np.abs(doublet_spectrum(fine, period)) ** 2 * shaped / np.pi for period in family.periods])
     logarithmic = np.geomspace(LOWEST, fine[-1], FINE)
     step = hat_weights(plant.omega, logarithmic, logarithmic**-2.0 / np.pi)
     torque = family.acceleration / np.abs(np.diag(plant.body.B))
@@ -140,7 +145,9 @@ def manoeuvres(plant: WideResponse, model: ReferenceModel) -> Manoeuvres:
     )
 
 
-def doublet_torque(plant: WideResponse, amplitude: float, lags: Sequence[float] = (0.0,)) -> list[Complex]:
+def doublet_torque(
+    plant: WideResponse, filters: Filters, amplitude: float, lags: Sequence[float] = (0.0,)
+) -> list[Complex]:
     """For each lag the weights (T, K) whose product with U gives, in its real part, the torque in the doublets.
 
     At the times when it is largest: after the setpoint jumps.
@@ -148,16 +155,19 @@ def doublet_torque(plant: WideResponse, amplitude: float, lags: Sequence[float] 
     Parameters
     ----------
     plant : WideResponse
+    filters : Filters
+        Of the law whose shaping the setpoints have.
     amplitude : float, rad
     lags : sequence of float, s
         Of the rotors, for the torque behind them; 0: as commanded.
     """
     fine = np.linspace(LOWEST, HIGHEST * np.pi / plant.Ts, COARSE)
     found: list[list[Complex]] = [[] for _ in lags]
+    shaped = shaping_response(filters, fine)
     for period in family_of(plant.axes).periods:
         times = [begin + (k + 0.5) * plant.Ts for begin in (0.0, period / 2, period) for k in AFTER]
         waves = np.exp(1j * np.outer(fine, times))
-        spectrum = amplitude * doublet_spectrum(fine, period) / np.pi
+        spectrum = amplitude * doublet_spectrum(fine, period) * shaped / np.pi
         for rows, lag in zip(found, lags, strict=True):
             rows.append(hat_weights(plant.omega, fine, (spectrum / (1 + 1j * fine * lag))[:, None] * waves).T)
     return [np.concatenate(rows) for rows in found]

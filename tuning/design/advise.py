@@ -170,7 +170,7 @@ def _alternatives(best: Gains, bandwidth: float, spec: TuningSpec) -> list[Alter
 
 def _candidate(name: str, gains: Gains, model: ContinuousModel, bench: ResponseDesign) -> Candidate:
     plant = bench.plants[0]
-    prediction = predict(gains, plant, manoeuvres(plant, model.discretise(plant.Ts)))
+    prediction = predict(gains, plant, manoeuvres(plant, model.discretise(plant.Ts), gains.filters))
     return Candidate(name, gains, model.bandwidth, prediction)
 
 

@@ -12,6 +12,7 @@ REGULARISATION = 1e-9
 #: Relative accuracy of a step: the next one corrects it.
 TOLERANCE = 1e-6
 
+Complex = NDArray[np.complex128]
 Signal = NDArray[np.float64]
 
 
@@ -39,6 +40,14 @@ class ConicProblem:
     def cone(self, slope: Signal, value: Signal) -> None:
         """Require v_0 + t >= |(v_1, ... v_k-1)|, v = value + slope d, of m cones: slope (m, k, n), value (m, k)."""
         self._cones.append((slope, value))
+
+    def below_one(self, slope: Complex, value: Complex) -> None:
+        """Require |value + slope d| <= 1 + t of one long vector: slope (n, M), value (M,)."""
+        n, whole = self.size, np.vstack([slope, value])
+        # The square as that of a vector of n + 1 numbers.
+        sizes, directions = np.linalg.eigh(np.real(whole.conj() @ whole.T))
+        root = (np.sqrt(np.maximum(sizes, 0.0)) * directions).T
+        self.cone(np.vstack([np.zeros(n), root[:, :n]])[None], np.append(1.0, root[:, n])[None])
 
     def solve(self, gradient: Signal, curvature: Signal, penalty: float, radius: float) -> Signal:
         """The best step with no element above `radius`, (n,)."""

@@ -152,16 +152,11 @@ class NoiseLimit:
     def add(self, problem: ConicProblem, loop: LoopGradient) -> None:
         """See `Constraint`."""
         weight = np.sqrt(np.where(loop.plant.omega > self.above, loop.plant.noise_weight, 0.0))[:, None]
-        n, d = problem.size, loop.dnoise
+        d = loop.dnoise
         for axis, limit in enumerate(self.limit):
             value = (weight * loop.noise[:, axis]).ravel() / limit
-            slopes = (weight[:, None] * d.left[:, :, axis, None] * d.right).transpose(1, 0, 2).reshape(n, -1) / limit
-            whole = np.vstack([slopes, value])
-            # |value + slopes d|^2 as the square of a vector of n + 1 numbers.
-            sizes, directions = np.linalg.eigh(np.real(whole.conj() @ whole.T))
-            root = (np.sqrt(np.maximum(sizes, 0.0)) * directions).T
-            cone = np.vstack([np.zeros(n), root[:, :n]])
-            problem.cone(cone[None], np.append(1.0, root[:, n])[None])
+            slopes = (weight[:, None] * d.left[:, :, axis, None] * d.right).transpose(1, 0, 2) / limit
+            problem.below_one(slopes.reshape(problem.size, -1), value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,9 @@
 """The closed loop around a plant and its exact derivatives with respect to the gains.
 
 u = C_ref r_o - C_o y_o - C_y y_i, with C_ref = C_r (Kp_o m + Kff_o m_w) + Kaff_i m_a: m, m_w and m_a are the attitude
-model's angle, rate and acceleration, or 1, 0 and 0 without one. Each gain adds the product of a column and a row to the
-controller, dL = alpha beta' and dC_ref = alpha gamma', so all derivatives are such products:
+model's angle, rate and acceleration, or 1, 0 and 0 without one. ArduPilot's law adds C_r times the setpoint's rate.
+Each gain adds the product of a column and a row to the controller, dL = alpha beta' and dC_ref = alpha gamma', so all
+derivatives are such products:
 
     S = (I + L)^-1,  L = C_y G_i + C_o G_o        dS = -(S alpha) (beta' S)
     U = S C_ref,     T = G_o U                    dU = (S alpha) (gamma' - beta' U)
@@ -27,6 +28,7 @@ from mimopilot.tuning.law import (
     fixed_matrices,
     model_response,
     rate_response,
+    setpoint_rate_response,
 )
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.small_matrices import inverse
@@ -137,7 +139,8 @@ class LoopGradient:
     def _rate_setpoint(self) -> Complex:
         """From the attitude setpoint to the rate setpoint, without the measured angles, (K, n, n)."""
         angle, rate, _ = self._model
-        found: Complex = self.matrices[ATTITUDE.matrix] * angle * self._delay
+        fixed = setpoint_rate_response(self.free.base.filters, self.plant.axes, self.plant.omega)
+        found: Complex = self.matrices[ATTITUDE.matrix] * angle * self._delay + fixed
         return found + self.matrices[ATTITUDE_FEEDFORWARD.matrix] * rate if self._follows else found
 
     @property

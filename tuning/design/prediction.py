@@ -107,7 +107,7 @@ def bandwidth(gains: Law, plant: WideResponse, candidates: Sequence[float], damp
     """Bandwidth (rad/s) of the attitude model that a set follows best, of some candidates."""
     free = free_gains(gains, plant.body)
     T = LoopGradient(plant, free, free.vector(gains)).T
-    task = manoeuvres(plant, second_order(candidates[0], damping, 0, plant.Ts))
+    task = manoeuvres(plant, second_order(candidates[0], damping, 0, plant.Ts), gains.filters)
 
     def error(omega: float) -> float:
         asked = replace(task, model=second_order(omega, damping, 0, plant.Ts))

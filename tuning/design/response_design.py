@@ -31,13 +31,14 @@ from mimopilot.tuning.design.constraints import (
     structural_modes,
 )
 from mimopilot.tuning.design.descent import INFEASIBLE, LARGEST_RADIUS, DesignTask, PlantTask, descend
+from mimopilot.tuning.design.disturbance_limit import no_softer_than
 from mimopilot.tuning.design.free_gains import FreeGains, free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.design.positive_integral import MIN_INTEGRAL_RATIO
 from mimopilot.tuning.design.prediction import FAST, SLOWEST, bandwidth, sensitivity_peak
 from mimopilot.tuning.experiment import Experiment, manoeuvre_size
 from mimopilot.tuning.gains import Gains, Limits
-from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS
+from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS, Filters
 from mimopilot.tuning.motors import Motors
 from mimopilot.tuning.plant.noise_spectrum import flown_torque_noise
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
@@ -296,15 +297,16 @@ class ResponseDesign:
     def task(self, free: FreeGains, starts: Sequence[Law], bandwidth: float) -> DesignTask:
         """Cost and constraints around every plant."""
         model = SecondOrder(bandwidth, DAMPING).discretise(free.base.Ts)
+        asked = [manoeuvres(plant, model, free.base.filters) for plant in self.plants]
         return DesignTask(
             _following(free, bandwidth),
             [
-                PlantTask(plant, manoeuvres(plant, model), self._constraints(free, starts, place))
-                for place, plant in enumerate(self.plants)
+                PlantTask(plant, one, self._constraints(free, starts, place, one.step))
+                for place, (plant, one) in enumerate(zip(self.plants, asked, strict=True))
             ],
         )
 
-    def _constraints(self, free: FreeGains, starts: Sequence[Law], place: int) -> list[Constraint]:
+    def _constraints(self, free: FreeGains, starts: Sequence[Law], place: int, step: Signal) -> list[Constraint]:
         """The constraints around one of the plants."""
         plant, noise = self.plants[place], self.noise[place]
         B, floor = plant.body.B, 1 / self.limits.Ms
@@ -319,7 +321,7 @@ class ResponseDesign:
             ),
             gain_above_band(plant),
             structural_modes(plant, self.limited[place]),
-            Definite(ATTITUDE.matrix, np.eye(plant.axes), 0.0),
+            self._least_attitude(free.base, place),
         ]
         if TERMS["I"].matrix in free.units:
             found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
@@ -328,9 +330,22 @@ class ResponseDesign:
         largest = free.base.filters.law.largest or {}
         axes = axes_slice(plant.axes)
         found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
-        return found + self._actuators(place)
+        found += self._actuators(place, free.base.filters)
+        flown = flown_law(self.experiments[place])
+        if flown is not None and any(free.base.filters.shaping):  # else following asks for stiffness
+            found += no_softer_than(_loop_of(flown, plant), step, found)
+        return found
 
-    def _actuators(self, place: int) -> list[Constraint]:
+    def _least_attitude(self, base: Law, place: int) -> Definite:
+        """The law's least attitude gain, or the flown one."""
+        axes, flown = self.plants[place].axes, flown_law(self.experiments[place])
+        least = base.filters.law.least_attitude[2 if axes == 1 else 0]
+        if flown is not None:
+            least = min(least, float(np.diag(getattr(flown, ATTITUDE.matrix)).min()))
+        name = f"the autopilot's range of {ATTITUDE.matrix}" if least else ""
+        return Definite(ATTITUDE.matrix, np.eye(axes), least, name)
+
+    def _actuators(self, place: int, filters: Filters) -> list[Constraint]:
         """Limits of the motors in the manoeuvres of the flown size; for yaw those of its torque and its rate."""
         plant, experiment = self.plants[place], self.experiments[place]
         size, flown, found = flown_amplitude(experiment), flown_law(experiment), list[Constraint]()
@@ -345,7 +360,8 @@ class ResponseDesign:
             name = "range of the motors"
         loop = None if flown is None else _loop_of(flown, plant)
         # The rotors' torque stays within the range. Their command may exceed it for less than their lag.
-        for share, torque in zip((RANGE, PEAK), doublet_torque(plant, size, (plant.shape[1], 0.0)), strict=True):
+        torques = doublet_torque(plant, filters, size, (plant.shape[1], 0.0))
+        for share, torque in zip((RANGE, PEAK), torques, strict=True):
             limit = MotorLimit(torque, mixer, share * room, name)
             # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
             used = 1.0 if loop is None else max(1.0, 1 - limit.margin(loop))

@@ -140,7 +140,8 @@ def comparison(
 
     ``keep_flown`` says why the flown gains are better; it is empty if they are not.
     """
-    tasks = [(plant, manoeuvres(plant, found.model.discretise(plant.Ts))) for plant in bench.plants]
+    filters = found.law.filters
+    tasks = [(plant, manoeuvres(plant, found.model.discretise(plant.Ts), filters)) for plant in bench.plants]
     new = [predict(found.gains, *task) for task in tasks]
     shown = {"tuned": new}
     if spec.profile != MIMO:

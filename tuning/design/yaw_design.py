@@ -161,7 +161,9 @@ def _comparison(
     design: Design, measured: Sequence[PlantEstimates], bench: ResponseDesign, spec: TuningSpec
 ) -> tuple[dict[str, Any], list[str]]:
     """Predicted figures of the design and of the flown gains as plain values, and why the flown ones are better."""
-    tasks = [(plant, manoeuvres(plant, design.model.discretise(plant.Ts))) for plant in bench.plants]
+    tasks = [
+        (plant, manoeuvres(plant, design.model.discretise(plant.Ts), design.law.filters)) for plant in bench.plants
+    ]
     new = [predict(design.law, *task) for task in tasks]
     laws = [law for law in (flown_law(one.experiment) for one in measured) if law is not None]
     if len(laws) < len(tasks):

@@ -57,6 +57,7 @@ DEFAULTS: dict[str, dict[str, float]] = {
 INTEGERS = frozenset(
     {PX4.rate, ARDUPILOT.rate, "MC_BAT_SCALE_EN", "IMU_GYRO_DNF_EN", "MAV_TYPE", "FRAME_CLASS", "ATC_RATE_FF_ENAB"}
     | {"INS_HNTCH_ENABLE", "INS_HNTC2_ENABLE", "INS_GYRO_FILTER"}
+    | {f"ATC_RAT_{axis}_{notch}" for axis in ARDUPILOT.axes for notch in ("NTF", "NEF")}
 )
 #: Largest relative difference of the rate in the parameters from that of a log: loggers' clocks differ by less.
 SAME_RATE = 0.02

@@ -42,6 +42,8 @@ class StockController:
         Scalar of our table -> parameter.
     unlimited : mapping
         Limit -> value where the parameter is 0, which means that there is no limit.
+    switches : mapping
+        Filter -> parameter without which it is off.
     fixed : mapping
         Element of the table -> value where it has no parameter.
     """
@@ -58,6 +60,7 @@ class StockController:
     later: tuple[str, ...]
     scalars: Mapping[str, str] = field(default_factory=dict)
     unlimited: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    switches: Mapping[str, str] = field(default_factory=dict)
     fixed: Mapping[str, float] = field(default_factory=dict)
 
     @property
@@ -68,9 +71,10 @@ class StockController:
 
     def stock_filters(self, values: Mapping[str, float]) -> StockFilters:
         """The filters of its law; `values` hold all `filter_names`."""
+        on = {name: axes for name, axes in self.filters.items() if values.get(self.switches.get(name, ""), 1.0)}
         return StockFilters(
             self.profile,
-            **{name: tuple(values.get(one, 0.0) for one in axes) for name, axes in self.filters.items()},
+            **{name: tuple(values.get(one, 0.0) for one in axes) for name, axes in on.items()},
         )
 
     def maps(self, row: Row) -> bool:
@@ -174,9 +178,11 @@ ARDUPILOT = StockController(
         "setpoint_hz": _of_axes("FLTT"),
         "error_hz": _of_axes("FLTE"),
         "derivative_feedforward": _of_axes("D_FF"),
+        "shaping_s": ("ATC_INPUT_TC",) * 3,
     },
-    later=_of_axes("D_FF"),
+    later=(*_of_axes("D_FF"), "ATC_INPUT_TC"),
     unlimited={"rate_max": Limits().rate_max},
+    switches={"shaping_s": "ATC_RATE_FF_ENAB"},
 )
 
 _BETAFLIGHT_AXES = ("roll", "pitch", "yaw")

@@ -57,7 +57,7 @@ def differences(stock: StockController, values: Mapping[str, float], exact: bool
         The gains are for this stock controller itself.
     """
     if exact:  # what its own set holds is not missing from it
-        held = {name for axes in stock.filters.values() for name in axes}
+        held = {name for axes in stock.filters.values() for name in axes} | set(stock.switches.values())
         values = {name: value for name, value in values.items() if name not in held}
     return _of_px4(values, exact) if stock is PX4 else _of_ardupilot(values, exact)
 

@@ -114,7 +114,9 @@ def _ardupilot_stock(gains: Gains) -> UploadPlan:
         if stock.derivative_feedforward[axis]:  # older versions have none
             value = stock.derivative_feedforward[axis]
             settings.append(ParameterWrite(f"ATC_RAT_{name}_D_FF", "s^2", value, 0.0, 0.02))
-    notes = ("ArduPilot replaces the angle P by a square root for large errors, and shapes the setpoint",)
+    if stock.shaping_s[0]:  # with ATC_RATE_FF_ENAB, which stays as it is
+        settings.append(ParameterWrite("ATC_INPUT_TC", "s", stock.shaping_s[0], 0.0, 1.0))
+    notes = ("ArduPilot replaces the angle P by a square root for large errors, and limits a setpoint's acceleration",)
     return UploadPlan(tuple(settings), {}, (), notes)
 
 

@@ -1,1 +1,1 @@
-"""PX4's simulator API: the plant as a separate process, and the autopilot's end of the link."""
+"""The plant as a process of its own: PX4's simulator API, with both ends of the link, and ArduPilot's JSON protocol."""

@@ -33,6 +33,42 @@ class ParentGoneError(Exception):
     """The process that started this one has ended."""
 
 
+def end_with_parent(ready: list[Any]) -> None:
+    """Look for the end of standard input among what is ready to be read.
+
+    Raises
+    ------
+    ParentGoneError
+    """
+    if sys.stdin in ready and not os.read(sys.stdin.fileno(), 4096):
+        raise ParentGoneError
+
+
+class Pace:
+    """Keeps simulated time from running faster than asked for.
+
+    Parameters
+    ----------
+    speed : float or None
+        Times real time; None: as fast as possible.
+    """
+
+    def __init__(self, speed: float | None) -> None:
+        self.speed, self.begin, self.passed = speed, time.monotonic(), 0.0
+
+    def wait(self, seconds: float) -> None:
+        """Let this much simulated time pass, s; a long delay is not caught up."""
+        if self.speed is None:
+            return
+        self.passed += seconds / self.speed
+        now = time.monotonic()
+        ahead = self.begin + self.passed - now
+        if ahead > 0:
+            time.sleep(ahead)
+        elif ahead < -MAX_CATCH_UP_S:
+            self.begin, self.passed = now, 0.0
+
+
 class PlantServer:
     """Serves a simulated vehicle at a listening socket.
 
@@ -65,17 +101,12 @@ class PlantServer:
     def _accept(self) -> socket.socket:
         while True:
             ready, _, _ = select.select(self.watched, [], [])
-            self._end_with_parent(ready)
+            end_with_parent(ready)
             if self.listener in ready:
                 try:
                     return self.listener.accept()[0]
                 except OSError:  # it has disconnected already
                     continue
-
-    @staticmethod
-    def _end_with_parent(ready: list[Any]) -> None:
-        if sys.stdin in ready and not os.read(sys.stdin.fileno(), 4096):
-            raise ParentGoneError
 
     def _serve_one(self, connection: socket.socket) -> None:
         vehicle = self.vehicle
@@ -102,7 +133,7 @@ class PlantServer:
             return
         self.next_poll = now + POLL_S
         ready, _, _ = select.select(self.watched, [], [], 0)
-        self._end_with_parent(ready)
+        end_with_parent(ready)
         if self.listener in ready:
             try:
                 self.listener.accept()[0].close()
@@ -129,19 +160,12 @@ class LockstepSession:
         OSError
             When it does.
         """
-        vehicle, speed = self.vehicle, self.server.speed
+        vehicle = self.vehicle
         answer = self._first_answer()
-        begin, count = time.monotonic(), 0
+        pace = Pace(self.server.speed)
         while True:
             vehicle.fly(answer[2:18], answer[18])
-            count += 1
-            if speed is not None:
-                now = time.monotonic()
-                ahead = begin + count * vehicle.Ts / speed - now
-                if ahead > 0:
-                    time.sleep(ahead)
-                elif ahead < -MAX_CATCH_UP_S:
-                    begin, count = now, 0
+            pace.wait(vehicle.Ts)
             messages = vehicle.pack_messages()
             if vehicle.copies:
                 self.connection.sendall(messages * vehicle.copies)

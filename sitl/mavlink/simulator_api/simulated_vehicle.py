@@ -1,6 +1,7 @@
-"""The simulated vehicle behind PX4's simulator API: messages out, motor commands in, one period at a time.
+"""The simulated vehicle behind a simulator protocol: sensors and messages out, motor commands in, period by period.
 
-It has no sockets and no clock: see `sitl.mavlink.simulator_api.plant_server` and `sitl.mavlink.simulator_api.hitl`.
+It has no sockets and no clock: see `sitl.mavlink.simulator_api.plant_server`, `sitl.mavlink.simulator_api.hitl` and
+`sitl.mavlink.simulator_api.json_server`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from mimopilot.sitl.physics.imu_baro_gps import (
     centi,
     global_position,
 )
-from mimopilot.sitl.physics.rigid_body import GRAVITY, MAX_ROTORS
+from mimopilot.sitl.physics.rigid_body import COMMAND_HISTORY, GRAVITY, MAX_ROTORS
 
 NOISE_BLOCK = 250  # periods of sensor noise drawn at once: one second at 250 Hz
 EPOCH_US = 1_000_000  # us, start of the simulated clock: autopilots treat time zero as "no time"
@@ -60,6 +61,8 @@ class SimulatedVehicle:
         Called with each message for the user.
     faults : sequence of Fault
         Faults to inject, in seconds from the first answer of an autopilot.
+    sensor_noise : bool
+        False: accelerometer and gyro are exact, for an autopilot that adds noise itself.
 
     Attributes
     ----------
@@ -76,13 +79,18 @@ class SimulatedVehicle:
     """
 
     def __init__(
-        self, airframe: Airframe, Ts: float, seed: int, altitude: float, report: Report, faults: Sequence[Fault] = ()
+        self,
+        airframe: Airframe,
+        Ts: float,
+        seed: int,
+        altitude: float,
+        report: Report,
+        faults: Sequence[Fault] = (),
+        sensor_noise: bool = True,
     ) -> None:
         self.airframe, self.Ts, self.seed, self.altitude, self.report = airframe, Ts, seed, altitude, report
-        self.faults = faults
+        self.faults, self.sensor_noise = faults, sensor_noise
         self.rotors = len(airframe.rotors)
-        self.mag_and_baro_every = max(1, round(MAG_AND_BARO_PERIOD / Ts))
-        self.fix_every = max(1, round(GPS_PERIOD / Ts))
         self.restart()
         # Compile what each period calls, so that the first frames are on time.
         self.pack_messages()
@@ -96,13 +104,34 @@ class SimulatedVehicle:
         if self.altitude == 0:
             self.simulator.state[:] = ground_state(self.simulator.plant)
             self.simulator.history[:] = 0.0
-        self.instruments = ImuBaroGps(self.simulator.state, self.Ts, self.seed)
+        self.mag_and_baro_every = max(1, round(MAG_AND_BARO_PERIOD / self.Ts))
+        self.fix_every = max(1, round(GPS_PERIOD / self.Ts))
+        self.instruments = ImuBaroGps(self.simulator.state, self.Ts, self.seed, self.sensor_noise)
         self.injection = FaultInjection(self.faults, self.airframe, self.simulator, self.Ts, self.seed)
         self.codec = FastCodec(SYSTEM, mavlink.MAV_COMP_ID_USER1)
         self.periods = self.flown = 0
         self.crashed = self.nonfinite_reported = False
         self.copies, self.gyro = 1, [0.0, 0.0, 0.0]
         self._measure()
+
+    def change_period(self, Ts: float) -> None:
+        """Fly on with another control period, s; motion, time and faults stay.
+
+        Raises
+        ------
+        SitlError
+            When a filter of the airframe does not run at this period; the vehicle is then lost.
+        """
+        before, seconds, crashed = self.simulator, self.seconds, self.crashed
+        self.Ts = Ts
+        self.restart()
+        after, self.flown, self.crashed = self.simulator, round(seconds / Ts), crashed
+        for _ in self.injection.segments(1, self.flown + 1):  # the faults so far, in order
+            pass
+        after.state[:] = self.instruments.before[:] = before.state
+        after.history[:] = before.history[(before.count - 1) % COMMAND_HISTORY]
+        after.count = self.flown
+        after.sensors.bend[:] = before.sensors.bend
 
     @property
     def stamp(self) -> int:
@@ -165,7 +194,7 @@ class SimulatedVehicle:
         tilt = math.degrees(math.acos(min(1.0, max(-1.0, level))))
         self.report(
             f"crashed at {self.seconds:.2f} s of flight: touchdown at {speed:.1f} m/s (at most {HARD_LANDING:g}), "
-            f"tilted by {tilt:.0f} deg (at most {MAX_LANDING_TILT:g}); motors stopped until an autopilot reconnects"
+            f"tilted by {tilt:.0f} deg (at most {MAX_LANDING_TILT:g}); motors stopped until an autopilot restarts"
         )
 
     def _inject_gyro_faults(self, rates: list[float]) -> list[float]:
@@ -175,14 +204,19 @@ class SimulatedVehicle:
         self.gyro = np.where(sensors.failed, np.nan, np.where(sensors.stuck, self.gyro, biased)).tolist()
         return self.gyro
 
-    def pack_messages(self, estimate: bool = True) -> bytes:
-        """Read the sensors, and pack HIL_SENSOR, HIL_GPS when due and, with `estimate`, HIL_STATE_QUATERNION."""
-        stamp, state = self.stamp, self.simulator.state
-        readings = self.instruments.read(state)
+    def read_sensors(self) -> list[float]:
+        """Read all sensors but the GPS, once in a period: see `ImuBaroGps.read`; with the frame's bend and faults."""
+        readings = self.instruments.read(self.simulator.state)
         for i in range(2):
             readings[3 + i] += float(self.simulator.sensors.bend[i, 1])
         if self.faults:
             readings[3:6] = self._inject_gyro_faults(readings[3:6])
+        return readings
+
+    def pack_messages(self, estimate: bool = True) -> bytes:
+        """Read the sensors, and pack HIL_SENSOR, HIL_GPS when due and, with `estimate`, HIL_STATE_QUATERNION."""
+        stamp, state = self.stamp, self.simulator.state
+        readings = self.read_sensors()
         fields = INERTIAL | (MAG_AND_BARO if self.periods % self.mag_and_baro_every == 0 else 0)
         data = self.codec.pack(SENSOR, stamp, *readings[:10], 0.0, *readings[10:12], fields, 0)
         if self.periods % self.fix_every == 0:

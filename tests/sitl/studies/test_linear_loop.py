@@ -56,7 +56,7 @@ def test_the_noise_is_that_of_the_spectra(name):
     vehicle = load_airframe(name)
     gains, plant = vehicle.default_gains(), true_response(vehicle.airframe, TS)
     found = TruePlant(vehicle.airframe, TS).loop(gains).noise
-    assert found == pytest.approx(predict(gains, plant, manoeuvres(plant, MODEL)).noise, rel=2e-3)
+    assert found == pytest.approx(predict(gains, plant, manoeuvres(plant, MODEL, gains.filters)).noise, rel=2e-3)
 
 
 def test_the_damping_is_that_of_the_least_damped_slow_poles():

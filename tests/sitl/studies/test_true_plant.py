@@ -50,7 +50,7 @@ def test_the_noise_of_the_torque_is_that_of_a_simulated_hover():
     vehicle = load_airframe("px4_sih")
     airframe, gains = vehicle.airframe, vehicle.default_gains()
     plant = true_response(airframe, TS)
-    found = predict(gains, plant, manoeuvres(plant, SecondOrder(10.0, 0.7).discretise(TS))).noise
+    found = predict(gains, plant, manoeuvres(plant, SecondOrder(10.0, 0.7).discretise(TS), gains.filters)).noise
     flown = fly(airframe, Autopilot(airframe, gains), hover("roll", 120.0, TS), 0).record["moment"][500:, :2]
     assert found == pytest.approx(flown.std(axis=0), rel=0.05)
 
@@ -69,7 +69,7 @@ def test_the_optimum_keeps_its_limits_on_the_true_plant_and_follows_better_than_
     assert truth.spectral_radius(best.gains) < 1
     assert truth.margins(best.gains)[0] < 1.6 * 1.01
     plant = true_response(airframe, TS)
-    task = manoeuvres(plant, best.model.discretise(TS))
+    task = manoeuvres(plant, best.model.discretise(TS), best.law.filters)
     ours, before = (predict(one, plant, task) for one in (best.gains, flown))
     assert max(np.divide(ours.noise, before.noise)) < 1.5 * 1.01
     assert np.hypot(*ours.follow_deg) < 0.8 * np.hypot(*before.follow_deg)

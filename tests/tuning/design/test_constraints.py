@@ -19,6 +19,7 @@ from mimopilot.tuning.design.constraints import (
     gain_above_band,
     structural_modes,
 )
+from mimopilot.tuning.design.disturbance_limit import DisturbanceLimit
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
@@ -56,6 +57,7 @@ def constraints(plant):
         "rate": Distance(Cut.RATE_LOOP, slice(0, plant.band.stop), 1 / 1.6),
         "attitude": Distance(Cut.ATTITUDE, slice(0, plant.band.stop), 1 / 1.6),
         "noise": NoiseLimit(np.array([0.008, 0.008])),
+        "disturbance": DisturbanceLimit(np.full((len(plant.omega), 2), 1e-3), np.array([0.02, 0.02])),
         "above": gain_above_band(plant),
         "integral": Definite("Ki_i", plant.body.B, 1.0),
         "derivative": Definite("Kd_i", np.eye(2), 0.0),
@@ -67,7 +69,8 @@ def constraints(plant):
 
 
 @pytest.mark.parametrize(
-    "name", ["torque", "rate", "attitude", "noise", "above", "integral", "derivative", "parameter", "motors"]
+    "name",
+    ["torque", "rate", "attitude", "noise", "disturbance", "above", "integral", "derivative", "parameter", "motors"],
 )
 def test_the_constraint_of_the_next_step_has_the_sign_of_the_margin(plant, free, name):
     """At a step of zero, for gains that keep the limit and for gains that do not."""
@@ -99,6 +102,17 @@ def test_a_step_that_keeps_the_convex_constraint_keeps_the_distance(plant, free,
     near = singular_values(np.eye(2) + loop.L_u[plant.band])[1] < 0.5 + 0.2
     if problem.least(step) >= 0:
         assert singular_values(np.eye(2) + moved.L_u[plant.band])[1][near].min() >= 0.5 - 1e-9
+
+
+def test_the_disturbance_of_the_next_step_is_that_of_moved_gains(plant, free):
+    constraint, vector = constraints(plant)["disturbance"], free.vector(free.base)
+    problem = Recorded(len(vector))
+    constraint.add(problem, LoopGradient(plant, free, vector))
+    step = 1e-3 * np.random.default_rng(1).standard_normal(len(vector))
+    moved = constraint.margin(LoopGradient(plant, free, vector + step))
+    now = constraint.margin(LoopGradient(plant, free, vector))
+    assert moved - now == pytest.approx(problem.least(step) - problem.least(0 * step), rel=0.01)
+    assert problem.least(0 * step) == pytest.approx(now, abs=1e-9)
 
 
 def test_margins_are_relative_distances_to_the_limits(plant, free):

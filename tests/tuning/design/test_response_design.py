@@ -94,7 +94,7 @@ def test_the_predicted_figures_are_those_of_flights(logs, tuned):
     log, airframe = logs["adam0"], load_airframe("adam0").airframe
     plant, model = wide_response(PlantEstimates(log)), SecondOrder(10.0, 0.7).discretise(log.Ts)
     for gains in (log.flown, tuned["adam0"]):
-        found = predict(gains, plant, manoeuvres(plant, model))
+        found = predict(gains, plant, manoeuvres(plant, model, gains.filters))
         for column, axis in enumerate(("roll", "pitch")):
             follow, other = [], []
             for period in ROLL_PITCH_FAMILY.periods:

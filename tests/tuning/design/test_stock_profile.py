@@ -9,14 +9,19 @@ from mimopilot.common.errors import Error
 from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.tuning.analysis.certify import certify
+from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.design.cascade import certify_from_log, tune
+from mimopilot.tuning.design.disturbance_limit import ROOM
+from mimopilot.tuning.design.prediction import predict
+from mimopilot.tuning.design.response_design import ResponseDesign
 from mimopilot.tuning.design.stock_profile import in_digits
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.law_terms import StockFilters
+from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.spec import TuningSpec, load_spec
 from tests.tuning.analysis.loops import MODELS, airframe, defaults, exact, grid
 from tests.tuning.truth import TS, Truth, experiment
@@ -84,6 +89,66 @@ def test_the_certificates_margin_is_that_of_the_documented_law(controller):
     assert figures["Ms"] == pytest.approx(1 / smallest.min(), rel=1e-6)
     ours = certify(gains.for_our_law(), plant, *MODELS).figures
     assert abs(ours["Ms"] / figures["Ms"] - 1) > 0.003  # so that the law matters
+
+
+def arducopter_flight(gains, plant, given):
+    """ArduCopter's recursions in closed loop around a plant, from a given to the shaped setpoint and the angle, (N, 2).
+
+    In the order of its own loop: the rate controller first, then the attitude controller.
+    """
+    T, Ts, n = gains.filters.shaping[0], gains.Ts, 2
+    Kp_o, Kp, Ki, Kd = (np.diag(getattr(gains, name)) for name in ("Kp_o", "Kp_i", "Ki_i", "Kd_i"))
+    stock = gains.filters.stock
+    a, c = (Ts / (Ts + 1 / (2 * np.pi * hertz[0])) for hertz in (stock.setpoint_hz, stock.derivative_hz))
+    state = np.zeros(len(plant.A))
+    rate, target, error, slope, integral, angle, speed = (np.zeros(n) for _ in range(7))
+    setpoints, angles = [], []
+    for wanted in given:
+        out = plant.C @ state
+        target = target + a * (rate - target)
+        last, error = error, target - out[:n]
+        slope = slope + c * ((error - last) / Ts - slope)
+        integral = integral + Ki * error * Ts
+        angle = angle + speed * Ts
+        setpoints.append(angle)
+        angles.append(out[n:])
+        speed = speed + ((wanted - angle) / T - 2 * speed) / T * Ts
+        rate = Kp_o * (angle - out[n:]) + speed
+        state = plant.A @ state + plant.B @ (Kp * error + integral + Kd * slope)
+    return np.array(setpoints), np.array(angles)
+
+
+def test_arducopters_feed_forward_is_in_the_predicted_following():
+    """The angle's answer to the logged setpoint, while both axes' given ones move as a sine."""
+    gains = stock_set("ardupilot-stock")
+    stock = dataclasses.replace(gains.filters.stock, shaping_s=(0.15,) * 3)
+    gains = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, stock=stock))
+    samples, periods = 200, 40
+    k, omega = np.arange(samples * periods), np.array([2 * np.pi / samples / TS])
+    truth = Truth.of(airframe(VEHICLE)).plant
+    flown = arducopter_flight(gains, truth, np.outer(np.sin(omega[0] * TS * k), [1.0, -0.5]))
+    used = slice(len(k) // 2, None)
+    setpoint, angle = (2j * np.exp(-1j * omega[0] * TS * k[used]) @ s[used] / len(k[used]) for s in flown)
+    T = cascade_loop(gains, exact(truth, omega)).T_o[0]
+    assert T @ setpoint == pytest.approx(angle, abs=1e-3 * np.abs(angle).max())
+    without = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, stock=FILTERS["ardupilot-stock"]))
+    slower = cascade_loop(without, exact(truth, omega)).T_o[0]
+    assert np.linalg.norm(slower @ setpoint - angle) > 0.2 * np.linalg.norm(angle)
+
+
+def test_a_design_for_arducopter_follows_better_and_is_no_softer_in_gusts(log):
+    """Its setpoint's rate is fed forward, so following alone would ask for next to no angle P."""
+    shaped = dataclasses.replace(FILTERS["ardupilot-stock"], shaping_s=(0.15,) * 3)
+    flown = stock_set("ardupilot-stock")
+    flown = dataclasses.replace(flown, Kp_o=4.5 * np.eye(2), filters=dataclasses.replace(flown.filters, stock=shaped))
+    bench = ResponseDesign.of([PlantEstimates(dataclasses.replace(log, flown=flown))], TuningSpec().design)
+    found = bench.design([flown], "PID", full=False)
+    task = found.task.plants[0].manoeuvres
+    new, old = (predict(gains, bench.plants[0], task) for gains in (found.gains, flown))
+    assert found.feasible
+    assert max(np.divide(new.disturbance_deg, old.disturbance_deg)) < ROOM * 1.01
+    assert np.linalg.norm(new.follow_deg) < np.linalg.norm(old.follow_deg)
+    assert np.diag(found.gains.Kp_o).min() > 3.0 * 0.99
 
 
 def test_a_stock_set_is_diagonal_certified_at_both_rates_and_in_few_digits(tuned):

@@ -12,6 +12,7 @@ from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, HIGHEST, family_of
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
+from mimopilot.tuning.law import shaping_response
 from mimopilot.tuning.plant.frequency_response import SAME_PERIOD
 from mimopilot.tuning.plant.wide_response import WideResponse
 
@@ -66,7 +67,7 @@ def predicted_motion(law: Law, plant: WideResponse) -> PredictedMotion | None:
     fine: Signal = np.asarray((np.arange(FREQUENCIES) + 0.5) * (top / FREQUENCIES), np.float64)
     step = fine[1] - fine[0]
     turn = np.exp(1j * np.outer(time, fine)) * (step / np.pi)
-    sharp = AMPLITUDE * doublet_spectrum(fine, period)
+    sharp = AMPLITUDE * doublet_spectrum(fine, period) * shaping_response(law.filters, fine)
     torque = family_of(n).acceleration / np.abs(np.diag(plant.body.B))
 
     def motion(around: WideResponse) -> tuple[Signal, Signal]:

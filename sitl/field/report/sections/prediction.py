@@ -91,7 +91,8 @@ def predicted(case: GainCase, model: ReferenceModel, axes: int = BOTH) -> Predic
     plant = _plant(case, axes)
     if plant is None or abs(case.gains.Ts / plant.Ts - 1) > SAME_PERIOD:
         return None
-    task, law = manoeuvres(plant, model), law_of(case.gains, axes)
+    law = law_of(case.gains, axes)
+    task = manoeuvres(plant, model, law.filters)
     return PredictedFigures(predict(law, plant, task), tuple(predict(law, one, task) for one in drawn_plants(plant)))
 
 

@@ -20,6 +20,11 @@ def test_a_vehicle_is_read_and_others_are_refused(tmp_path, quick_mimopilot):
     assert gains.Kp_i == pytest.approx(np.diag([0.225, 0.32]))
     assert "not on the vehicle, or not answered: MC_YAW_TQ_CUTOFF" in done.stderr
     assert (vehicle.writes, json.loads(done.stdout)["source"]) == (0, f"PX4, vehicle {link.url}")
+    copter = ScriptedVehicle(ARDUPILOT_VALUES | {"ATC_RAT_RLL_NTF": 0.0})
+    copter.autopilot, copter.type, copter.fault, copter.faulty = 3, 2, "integer", "ATC_RAT_RLL_NTF"
+    with UdpVehicle(copter) as link:
+        done = quick_mimopilot("import-params", "--connect", link.url, "--timeout", "2", "--out", "copter.gains.toml")
+    assert done.returncode == 0, done.stderr
     lacking = ScriptedVehicle({name: value for name, value in PX4_VALUES.items() if name != "MC_YAW_P"})
     plane = ScriptedVehicle(ARDUPILOT_VALUES)
     plane.autopilot, plane.type = 3, 1

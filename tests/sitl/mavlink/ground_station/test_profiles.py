@@ -62,7 +62,8 @@ def test_ardupilots_parameters_are_the_gains_in_its_units():
         held = (stock.setpoint_hz, stock.error_hz, stock.derivative_hz, stock.derivative_feedforward)
         assert filters == [single(one[axis]) for one in held]
         assert values[f"ATC_RATE_{name[0]}_MAX"] == single(math.degrees(gains.limits.rate_max[axis]))
-    assert len(values) == 33
+    assert values["ATC_INPUT_TC"] == single(stock.shaping_s[0])
+    assert len(values) == 34
     free = dataclasses.replace(gains, limits=dataclasses.replace(gains.limits, rate_max=Limits().rate_max))
     assert [make_plan(free, profile).values[f"ATC_RATE_{axis}_MAX"] for axis in "RPY"] == [0.0, 0.0, 0.0]
 
