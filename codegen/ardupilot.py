@@ -90,7 +90,8 @@ def _entry(source: Parameter | Setting, index: int, value: float) -> GroupEntry:
 
 
 def context(gains: Gains) -> dict[str, Any]:
-    """What the templates of this target use beside those of all targets."""
+    """What only the templates in ``firmware_templates/ardupilot`` use."""
     entries = group(gains)
     places = [entry.name for entry in entries if entry.index > len(PARAMETERS)]
-    return {"prefix": ARDUPILOT_PREFIX, "entries": entries, "places": places, "settings": ARDUPILOT_EXCITATION}
+    table = {"prefix": ARDUPILOT_PREFIX, "entries": entries, "places": places, "settings": ARDUPILOT_EXCITATION}
+    return {"ardupilot": table}

@@ -44,8 +44,8 @@ class CParameter:
     writable: bool
 
 
-def crazyflie_context(gains: Gains) -> dict[str, Any]:
-    """Names of the templates in ``firmware_templates/crazyflie`` and their values.
+def context(gains: Gains) -> dict[str, Any]:
+    """What only the templates in ``firmware_templates/crazyflie`` use.
 
     Raises
     ------

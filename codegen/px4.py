@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +57,11 @@ def entries(gains: Gains) -> list[YamlEntry]:
         *(_of_parameter(parameter, scales[parameter.name]) for parameter in IDENTITY if parameter.name in scales),
         *(_of_setting(setting) for setting in (*EXCITATION, ENABLE)),
     ]
+
+
+def context(gains: Gains) -> dict[str, Any]:
+    """What only the templates in ``firmware_templates/px4`` use."""
+    return {"px4_parameters": entries(gains)}
 
 
 def _of_parameter(parameter: Parameter, value: float) -> YamlEntry:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -14,12 +14,10 @@ from typing import Any
 import jinja2
 import numpy as np
 
-from mimopilot.codegen import ardupilot
-from mimopilot.codegen.crazyflie import crazyflie_context
+from mimopilot.codegen import ardupilot, crazyflie, px4
 from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
 from mimopilot.codegen.literals import float_literal
-from mimopilot.codegen.px4 import entries
 from mimopilot.codegen.targets import DESCRIPTION, TEMPLATES, Target, find_target
 from mimopilot.codegen.toolchain import CORTEX_M4_FLAGS, CXX_FLAGS, WARNINGS
 from mimopilot.codegen.vectors import emitted_vectors
@@ -33,6 +31,12 @@ from mimopilot.tuning.parameters import ENABLE, EXCITATION, PARAMETERS, ROWS, ch
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
 MANIFEST = "manifest.json"
 MANIFEST_SCHEMA = 1
+#: Folder of templates -> what only its templates use.
+CONTEXTS: Mapping[str, Callable[[Gains], dict[str, Any]]] = {
+    "ardupilot": ardupilot.context,
+    "crazyflie": crazyflie.context,
+    "px4": px4.context,
+}
 
 
 def generator_version() -> str:
@@ -85,8 +89,8 @@ def render(gains: Gains, target: str = "native", **options: str) -> dict[str, st
         loader=jinja2.FileSystemLoader(TEMPLATES),
     )
     context = _context(gains, kind) | chosen
-    if "crazyflie" in kind.folders:
-        context |= crazyflie_context(gains)
+    for name in CONTEXTS.keys() & set(kind.folders):
+        context |= CONTEXTS[name](gains)
     files: dict[str, str] = {}
     for folder in kind.folders:
         for path in sorted((TEMPLATES / folder).rglob("*")):
@@ -121,8 +125,6 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
         "identity": list(gains.identity()),
         "excitation_settings": EXCITATION,
         "settings": (*EXCITATION, ENABLE),
-        "px4_parameters": entries(gains),
-        "ardupilot": ardupilot.context(gains),
         "literal": literal,
         "rows": ROWS,
         "offset": offset,
