@@ -10,7 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mimopilot.codegen import ardupilot
 from mimopilot.codegen.ardupilot import LARGEST_INDEX, group
+from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.layout import INPUT
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.render import render
@@ -157,7 +159,34 @@ def test_the_group_has_every_parameter_within_ardupilots_limits(gains):
     entries = group(gains)
     assert [ARDUPILOT_PREFIX + entry.name for entry in entries] == [ardupilot_name(p.name) for p in table]
     assert all(len(ardupilot_name(p.name)) <= NAME_LENGTH for p in table)
-    assert [entry.index for entry in entries] == list(range(1, len(table) + 1)) and len(table) <= LARGEST_INDEX
+    indices = [entry.index for entry in entries]
+    assert len(set(indices)) == len(table) and min(indices) >= 1 and max(indices) <= LARGEST_INDEX
+
+
+#: As first emitted, in 2026. Vehicles have values stored under these indices: never change a line, only add.
+EMITTED = """
+AP_RR AP_RP AP_PR AP_PP RP_RR RP_RP RP_PR RP_PP RI_RR RI_RP RI_PR RI_PP RD_RR RD_RP RD_PR RD_PP RF_RR RF_RP RF_PR RF_PP
+AF_RR AF_RP AF_PR AF_PP RA_RR RA_RP RA_PR RA_PP AP_YY RP_YY RI_YY RD_YY RF_YY RMAX_R RMAX_P RMAX_Y UMAX_R UMAX_P UMAX_Y
+IMAX_R IMAX_P IMAX_Y YAW_W SP_SLEW D_POLE TS M_DAMP M_OMEGA SCALE_R SCALE_P SCALE_Y EX_AX EX_AMP EX_AMPY EX_HMIN EX_HMAX
+EX_DUR EX_SEED EX_MODE EX_TILT
+""".split()
+
+
+def test_a_parameter_keeps_its_index_in_all_versions(gains):
+    indices = {entry.name: entry.index for entry in group(gains)}
+    # A parameter that no longer exists leaves its index unused.
+    assert [indices.get(name, place) for place, name in enumerate(EMITTED, 1)] == list(range(1, len(EMITTED) + 1))
+    assert all(index > len(EMITTED) for name, index in indices.items() if name not in EMITTED)
+
+
+def test_a_new_row_of_the_table_moves_no_index_and_needs_one_of_its_own(gains, monkeypatch):
+    before = {entry.name: entry.index for entry in group(gains)}
+    row = replace(ARDUPILOT_EXCITATION[0], name="MIMO_NEW")
+    monkeypatch.setattr(ardupilot, "ARDUPILOT_EXCITATION", (row, *ARDUPILOT_EXCITATION))
+    with pytest.raises(CodegenError, match="MIMO_NEW: has no index in ArduPilot; append it"):
+        group(gains)
+    monkeypatch.setitem(ardupilot.INDEX, "NEW", len(EMITTED) + 1)
+    assert {entry.name: entry.index for entry in group(gains)} == before | {"NEW": len(EMITTED) + 1}
 
 
 def test_an_index_does_not_depend_on_the_gains(gains):
