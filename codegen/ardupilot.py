@@ -21,7 +21,7 @@ from mimopilot.tuning.parameters import (
 
 #: Largest index in a parameter group: ArduPilot's AP_Param has 6 bits for it.
 LARGEST_INDEX = 63
-#: Names after the prefix in the order of their indices, from 1 on. A vehicle stores a value under its index alone, so an
+#: Names after the prefix in the order of their indices, from 1 on. A vehicle stores a value under its index alone: an
 #: index belongs to its parameter for ever: append new names, and leave the name of a parameter that no longer exists.
 ORDER = (
     *("AP_RR", "AP_RP", "AP_PR", "AP_PP", "RP_RR", "RP_RP", "RP_PR", "RP_PP", "RI_RR", "RI_RP", "RI_PR", "RI_PP"),

@@ -25,7 +25,7 @@ from mimopilot.common.toml import toml_entries, toml_value
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law_terms import LATER_FILTERS, MIMO, Filters, StockFilters
-from mimopilot.tuning.parameter_row import ANY, AXES, POSITIVE, Row, Shape, Valid
+from mimopilot.tuning.parameter_row import ANY, AXES, NOT_NEGATIVE, POSITIVE, Row, Shape, Valid
 from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, YAW_GAINS, rows
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
@@ -153,6 +153,10 @@ class Gains:
                         f"{row.largest_in_period / self.Ts:g}{_unit(row)}"
                     )
         self._check_law()
+        shaping = self.filters.shaping_s
+        if not NOT_NEGATIVE.holds(shaping) or (shaping and self.filters.stock):
+            expected = 0 if self.filters.stock else NOT_NEGATIVE
+            raise TuningError(f"shaping_s: got {shaping} s, expected {expected}; a stock set has it in its filters")
         for axis, value in zip(AXES, self.moment_scale or (), strict=False):
             if not POSITIVE.holds(value):
                 raise TuningError(f"moment_scale ({axis}): got {value} N m, expected {POSITIVE}")
@@ -170,10 +174,12 @@ class Gains:
                 )
 
     @classmethod
-    def from_rows(cls, values: Mapping[Row, Any], stock: StockFilters | None = None, **others: Any) -> Gains:
+    def from_rows(
+        cls, values: Mapping[Row, Any], stock: StockFilters | None = None, shaping_s: float = 0.0, **others: Any
+    ) -> Gains:
         """A set from what it holds for the rows of the parameter table, see `of`; `others`: the other attributes.
 
-        A row with a default may be left out.
+        A row with a default may be left out; `stock` and `shaping_s` are those of `Filters`.
         """
         parts: dict[Shape, dict[str, Any]] = {shape: {} for shape in Shape}
         for row, value in values.items():
@@ -182,7 +188,7 @@ class Gains:
         return cls(
             **parts[Shape.MATRIX],
             yaw=YawGains(**parts[Shape.YAW]),
-            filters=Filters(**parts[Shape.POLE], **parts[Shape.SCALAR], stock=stock),
+            filters=Filters(**parts[Shape.POLE], **parts[Shape.SCALAR], stock=stock, shaping_s=shaping_s),
             limits=Limits(**parts[Shape.AXES]),
             **others,
         )
@@ -210,10 +216,15 @@ class Gains:
         return MIMO if self.filters.stock is None else self.filters.stock.controller
 
     def for_our_law(self) -> Gains:
-        """The gains in our law, without a certificate; of a stock law's filters only that of D, roll's, is kept."""
+        """The gains in our law, without a certificate; a stock law's filter of D, roll's, and its shaping are kept."""
         if self.filters.stock is None:
             return self
-        filters = replace(self.filters, stock=None, derivative_cutoff_hz=self.derivative_cutoff_hz)
+        filters = replace(
+            self.filters,
+            stock=None,
+            derivative_cutoff_hz=self.derivative_cutoff_hz,
+            shaping_s=self.filters.shaping[0],
+        )
         return replace(self, filters=filters, certificate=None)
 
     def of(self, row: Row) -> Any:
@@ -287,7 +298,11 @@ class Gains:
                 moved = {row.code, "TS"} & changes.keys()
                 values[row] = row.value(changed[0], elements["TS"]) if moved else self.of(row)
         return Gains.from_rows(
-            values, moment_scale=self.moment_scale, certificate=self.certificate, provenance=self.provenance
+            values,
+            shaping_s=self.filters.shaping_s,
+            moment_scale=self.moment_scale,
+            certificate=self.certificate,
+            provenance=self.provenance,
         )
 
     def reference_models(self, axis: int) -> tuple[ReferenceModel, ReferenceModel]:
@@ -414,6 +429,9 @@ def _expectation(valid: Valid) -> str:
     return str(valid) if valid != ANY else f"{valid}; tune again or correct the file"
 
 
+#: Key of `Filters.shaping_s` in the file of our law.
+SHAPING = "shaping_s"
+_SHAPING_COMMENT = ("# r_o is shaped by ArduPilot (shaping_s) and dr_o/dt added to r_i, as in the flight of the log.",)
 #: The law of a set with model following, in its file.
 _MODEL_COMMENT = (
     "# Model following, roll and pitch: th is the angle of the attitude model, second order from r_o (model_omega,",
@@ -437,14 +455,17 @@ def gains_to_toml(gains: Gains) -> str:
         return [line(row) for row in rows(shape) if not left_out(row)]
 
     following, law, stock = bool(gains.filters.model_omega), gains.filters.law, gains.filters.stock
+    shaping = gains.filters.shaping_s
     scale = toml_value(list(gains.moment_scale)) if gains.moment_scale else '"unknown"'
     lines = [
         *law.text,
         *(_MODEL_COMMENT if following else ()),
+        *(_SHAPING_COMMENT if shaping else ()),
         f"schema = {SCHEMA}",
         *(() if stock is None else (f"controller = {toml_value(stock.controller)}",)),
         *lines_of(Shape.SCALAR),
         *lines_of(Shape.POLE),
+        *((f"{SHAPING} = {toml_value(shaping)}  # s",) if shaping else ()),
         f"moment_scale = {scale}  # N m that u = 1 stands for: roll, pitch, yaw",
     ]
     for shape, head in ((Shape.MATRIX, ""), (Shape.YAW, ""), (Shape.AXES, "  # roll, pitch, yaw")):

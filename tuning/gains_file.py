@@ -12,7 +12,7 @@ from mimopilot.common.errors import Error
 from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, Gains
+from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, SHAPING, Gains
 from mimopilot.tuning.law_terms import LAWS, MIMO, StockFilters
 from mimopilot.tuning.parameter_row import Row, Shape
 from mimopilot.tuning.parameters import ROWS, rows
@@ -62,7 +62,7 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
         raise TuningError(f"{where}: controller: got {shown(controller)}, expected one of {', '.join(LAWS)}")
     lacks = LAWS[controller].lacks
     scalars = {row.key for row in rows(Shape.POLE, Shape.SCALAR)} - set(lacks)
-    known = {*OTHERS, *SECTIONS, *scalars, *(() if controller == MIMO else (FILTERS,))}
+    known = {*OTHERS, *SECTIONS, *scalars, SHAPING if controller == MIMO else FILTERS}
     for key in sorted(set(table) - known):
         raise TuningError(f"{where}: {shown_text(key)}: unknown entry; known: {', '.join(sorted(known))}")
     for name in ("certificate", "provenance"):
@@ -78,6 +78,7 @@ def _gains(table: dict[str, Any], where: str) -> Gains:
         return Gains.from_rows(
             values,
             stock=_stock(table, controller),
+            shaping_s=_number(table.get(SHAPING, 0.0), SHAPING),
             moment_scale=None if scale == "unknown" else _triple(scale, "moment_scale"),
             certificate=certificate,
             provenance=Provenance.from_table(table.get("provenance", {})),

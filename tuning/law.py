@@ -260,18 +260,19 @@ def model_response(filters: Filters, omega: Signal) -> tuple[Response, Response,
 
 
 def setpoint_rate_response(filters: Filters, n: int, omega: Signal) -> Response:
-    """Fixed feed-forward of a stock law from the logged attitude setpoint to the rate setpoint, (K, n, n), 1/s.
+    """Fixed feed-forward from ArduPilot's logged attitude setpoint to the rate setpoint, (K, n, n), 1/s.
 
     ArduPilot's shaping gives the rate by which the setpoint moves until the next period, and that acts a period later:
-    the setpoint's difference.
+    the setpoint's difference. With model following, that of roll and pitch is the model's.
     """
     z = np.exp(1j * np.asarray(omega) * filters.Ts)[:, None, None]
-    on = np.diag([float(T > 0) for T in filters.shaping[:n]])
+    of_model = 0 if filters.followed is None else 2
+    on = np.diag([float(T > 0 and axis >= of_model) for axis, T in enumerate(filters.shaping[:n])])
     return np.asarray((1 - 1 / z) / filters.Ts * on, np.complex128)
 
 
 def shaping_response(filters: Filters, omega: Signal) -> NDArray[np.complex128]:
-    """Response (K,) of a stock law's shaping, from the given attitude setpoint to the logged one, of its first axis.
+    """Response (K,) of the autopilot's shaping, from the given attitude setpoint to the logged one, of its first axis.
 
     Without its limits of acceleration and jerk.
     """
@@ -289,7 +290,7 @@ def cascade_response(gains: Matrices, omega: Signal) -> tuple[Response, Response
     Returns
     -------
     C_ref, C_o, C_y : (..., K, 2, 2) arrays
-        Without model following C_ref is C_o, but for a stock law's feed-forward of the setpoint's rate.
+        Without model following C_ref is C_o, but for ArduPilot's feed-forward of the setpoint's rate.
     """
     of_r, of_y = rate_response(rate_matrices(gains), gains.filters, omega)
     of_angle = of_r @ attitude_matrix(gains) * attitude_response(gains.filters, omega)

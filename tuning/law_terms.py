@@ -120,6 +120,9 @@ class Filters:
         Slew limit of the attitude setpoint; 0 means none.
     stock : StockFilters or None
         The stock law that the gains are for. None: ours.
+    shaping_s : float, s
+        Of our law where ArduPilot gives its setpoints: time constant of their shaping; their rate is fed forward. 0:
+        neither. It is outside of the loop.
     """
 
     Ts: float
@@ -129,6 +132,7 @@ class Filters:
     yaw_weight: float = YAW_WEIGHT
     setpoint_slew: float = 0.0
     stock: StockFilters | None = None
+    shaping_s: float = 0.0
 
     @property
     def derivative_pole(self) -> float:
@@ -142,8 +146,13 @@ class Filters:
 
     @property
     def shaping(self) -> tuple[float, ...]:
-        """Time constant (s) of the stock law's shaping of the setpoint, for each axis; 0: none."""
-        return (0.0, 0.0, 0.0) if self.stock is None else self.stock.shaping_s
+        """Time constant (s) of the autopilot's shaping of the setpoint, for each axis; 0: none."""
+        return (self.shaping_s,) * 3 if self.stock is None else self.stock.shaping_s
+
+    @property
+    def least_attitude(self) -> tuple[float, float, float]:
+        """Least Kp_o of a design, see `ControlLaw`; also of our law where the setpoint's rate is fed forward."""
+        return (self.law if self.stock or not self.shaping_s else LAWS[ARDUPILOT_STOCK]).least_attitude
 
     @property
     def law(self) -> ControlLaw:

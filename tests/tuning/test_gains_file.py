@@ -90,9 +90,24 @@ def test_a_parameter_that_is_newer_than_the_file_has_the_default_of_the_table(mo
     assert gains_from_toml(text, "old").derivative_cutoff_hz == 12.0
 
 
+def test_arducopters_shaping_is_kept_and_changes_no_certificate():
+    gains = coupled_gains()
+    shaped = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, shaping_s=0.15))
+    shaped = shaped.with_certificate(Certificate(Verdict.CERTIFIED, "assumed"))
+    text = gains_to_toml(shaped)
+    assert "shaping_s = 0.15" in text and "shaping_s" not in gains_to_toml(gains)
+    again = gains_from_toml(text, "x")
+    assert gains_to_toml(again) == text and again.filters == shaped.filters
+    assert again.with_elements({"RP_RR": 0.2}).filters == shaped.filters
+    # It is outside of the loop.
+    assert gains_from_toml(text.replace("shaping_s = 0.15", "shaping_s = 0.0"), "x").verdict()[0] == "certified"
+    with pytest.raises(TuningError, match=r"shaping_s: got -1\.0 s, expected at least 0"):
+        gains_from_toml(text.replace("shaping_s = 0.15", "shaping_s = -1.0"), "x")
+
+
 def test_every_row_has_its_place_in_the_types_of_the_gains():
     for kind, shapes in ((YawGains, [Shape.YAW]), (Limits, [Shape.AXES]), (Filters, [Shape.POLE, Shape.SCALAR])):
-        keys = {field.name for field in dataclasses.fields(kind)} - {"stock"}
+        keys = {field.name for field in dataclasses.fields(kind)} - {"stock", "shaping_s"}
         assert keys == {row.key for row in rows(*shapes)}
     # There are no default gains, except of an option that is off.
     assert all(row.default is None or row.option for row in rows(Shape.MATRIX, Shape.YAW))

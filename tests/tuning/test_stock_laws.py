@@ -185,6 +185,23 @@ def test_the_shaping_is_that_of_arducopters_recursion():
     assert late * found == pytest.approx(moving, rel=1e-6)
 
 
+def test_our_law_in_arducopter_has_its_feed_forward_also():
+    gains = stock_gains("ardupilot-stock").for_our_law()
+    assert gains.filters.shaping == stock_gains("ardupilot-stock").filters.shaping
+    omega = np.array([0.5, 5.0])
+    without = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, shaping_s=0.0))
+    more = response(gains, omega) - response(without, omega)
+    difference = (1 - np.exp(-1j * omega * gains.Ts)) / gains.Ts
+    assert more[:, :3, :3] == pytest.approx(difference[:, None, None] * np.eye(3), rel=1e-9)
+    assert not more[:, :, 3:].any()
+    # With model following the model makes the rates of roll and pitch.
+    following = {"model_omega": 8.0, "shaping_s": 0.15}
+    model = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, **following))
+    without = dataclasses.replace(model, filters=dataclasses.replace(model.filters, shaping_s=0.0))
+    more = response(model, omega) - response(without, omega)
+    assert more[:, 2, 2] == pytest.approx(difference, rel=1e-9) and not more[:, :2].any()
+
+
 def test_a_file_without_the_shaping_has_none_and_keeps_its_certificate():
     gains = stock_gains("ardupilot-stock")
     none = dataclasses.replace(

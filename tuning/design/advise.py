@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from mimopilot.tuning.analysis.certify_axes import certify_axes
 from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.design.prediction import Prediction, predict
-from mimopilot.tuning.design.response_design import BANDWIDTHS, ResponseDesign
+from mimopilot.tuning.design.response_design import ResponseDesign
 from mimopilot.tuning.design.tune_by_design import tune_by_design
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
@@ -141,7 +141,7 @@ def advise(
     if experiment.flown is not None:
         flown = replace(experiment.flown, filters=replace(experiment.flown.filters, Ts=experiment.Ts))
         found.append(_candidate("flown", certified(flown, outer), outer, bench))
-    for one in watch(_alternatives(best, outer.bandwidth, spec)):
+    for one in watch(_alternatives(best, outer.bandwidth, spec, bench.bandwidths)):
         limits = spec.design.model_copy(update={"noise": one.noise})
         start = replace(best, filters=replace(best.filters, derivative_cutoff_hz=one.cutoff_hz))
         try:
@@ -153,14 +153,14 @@ def advise(
     return Advice(tuple(found), refused, _slowest_zero(experiment, best.derivative_cutoff_hz))
 
 
-def _alternatives(best: Gains, bandwidth: float, spec: TuningSpec) -> list[Alternative]:
+def _alternatives(best: Gains, bandwidth: float, spec: TuningSpec, bandwidths: tuple[float, ...]) -> list[Alternative]:
     """What could be asked for instead of the recommended set."""
     same = Alternative("", bandwidth, spec.method == "mimo", best.derivative_cutoff_hz, spec.design.noise)
-    place = min(range(len(BANDWIDTHS)), key=lambda k: abs(BANDWIDTHS[k] - bandwidth))
+    place = min(range(len(bandwidths)), key=lambda k: abs(bandwidths[k] - bandwidth))
     found = [replace(same, name="SISO", full=False)] if same.full else []
     for name, other in (("slower", place - STEPS), ("faster", place + STEPS)):
-        if 0 <= other < len(BANDWIDTHS):
-            found.append(replace(same, name=name, bandwidth=BANDWIDTHS[other]))
+        if 0 <= other < len(bandwidths):
+            found.append(replace(same, name=name, bandwidth=bandwidths[other]))
     found.append(replace(same, name="quieter", noise=QUIET))
     for cutoff in CUTOFFS:
         if same.cutoff_hz == 0 or cutoff < same.cutoff_hz:

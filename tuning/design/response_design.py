@@ -50,6 +50,9 @@ from mimopilot.tuning.spec import DesignLimits
 #: position controller or pilot uses a faster attitude.
 _DECADE = (2.8, 3.2, 3.6, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.2, 12.5, 14.0, 16.0, 18.0, 20.0)
 BANDWIDTHS: tuple[float, ...] = (*_DECADE, 22.4, 25.0)
+#: Those where an autopilot shapes the setpoint and feeds its rate forward. The shaping makes the attitude slow; the
+#: model stands for the lag behind it only, and flown gains may have less lag than 25 rad/s.
+SHAPED_BANDWIDTHS = (*BANDWIDTHS, 28.0, 31.5, 35.5, 40.0, 45.0, 50.0)
 #: Where the search begins, rad/s, and its first step along the table.
 FIRST_BANDWIDTH, FIRST_STRIDE = 10.0, 2
 #: Share of the limit of noise that is used: the ratio of two predictions errs by 1 to 2 % (simulated airframes).
@@ -154,9 +157,11 @@ class ResponseDesign:
 
     @classmethod
     def of(
-        cls, measured: Sequence[PlantEstimates], limits: DesignLimits, bandwidths: tuple[float, ...] = BANDWIDTHS
+        cls, measured: Sequence[PlantEstimates], limits: DesignLimits, bandwidths: tuple[float, ...] = ()
     ) -> ResponseDesign:
         """Designs on the responses measured in one or more flights.
+
+        By default with the bandwidths of roll and pitch.
 
         Raises
         ------
@@ -172,9 +177,12 @@ class ResponseDesign:
         plants: Sequence[WideResponse],
         experiments: Sequence[Experiment],
         limits: DesignLimits,
-        bandwidths: tuple[float, ...] = BANDWIDTHS,
+        bandwidths: tuple[float, ...] = (),
     ) -> ResponseDesign:
         """Designs on given responses; of the experiments only the flown gains, motors and attitudes are used."""
+        if not bandwidths:
+            shaped = all(one.flown is not None and any(one.flown.filters.shaping) for one in experiments)
+            bandwidths = SHAPED_BANDWIDTHS if shaped else BANDWIDTHS
         noise = [flown_noise(one, plant) for one, plant in zip(experiments, plants, strict=True)]
         limited = [np.zeros(len(one.response.omega), bool) for one in plants]
         flown = [flown_law(one) for one in experiments]
@@ -337,9 +345,9 @@ class ResponseDesign:
         return found
 
     def _least_attitude(self, base: Law, place: int) -> Definite:
-        """The law's least attitude gain, or the flown one."""
+        """The least attitude gain of a design, or the flown one."""
         axes, flown = self.plants[place].axes, flown_law(self.experiments[place])
-        least = base.filters.law.least_attitude[2 if axes == 1 else 0]
+        least = base.filters.least_attitude[2 if axes == 1 else 0]
         if flown is not None:
             least = min(least, float(np.diag(getattr(flown, ATTITUDE.matrix)).min()))
         name = f"the autopilot's range of {ATTITUDE.matrix}" if least else ""

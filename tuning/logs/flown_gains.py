@@ -73,7 +73,8 @@ def flown_gains(parameters: Mapping[str, float], Ts: float) -> Gains | None:
         found[row] = numbers[0] if len(numbers) == 1 else numbers
     scale: Any = tuple(values.get(f"{PREFIX}{SCALE}_{letter}") for letter in AXIS_LETTERS)
     try:
-        gains = Gains.from_rows(found, stock=filters, provenance=Provenance("flown", details=details))
+        shaping = stock.shaping(values) if filters is None else 0.0
+        gains = Gains.from_rows(found, filters, shaping, provenance=Provenance("flown", details=details))
     except TuningError:  # such as an attitude model that is too fast for the period of the log
         return None
     return replace(gains, moment_scale=None if None in scale else scale)

@@ -77,6 +77,11 @@ class StockController:
             **{name: tuple(values.get(one, 0.0) for one in axes) for name, axes in on.items()},
         )
 
+    def shaping(self, values: Mapping[str, float]) -> float:
+        """Time constant (s) of the setpoint's shaping whose rate is fed forward; 0: neither."""
+        name = self.filters.get("shaping_s", ("",))[0]
+        return values.get(name, 0.0) if values.get(self.switches.get("shaping_s", ""), 1.0) else 0.0
+
     def maps(self, row: Row) -> bool:
         """Whether it has parameters for a row of our table."""
         return any(row.key in table for table in (self.gains, self.limits, self.cutoffs, self.scalars))

@@ -14,7 +14,7 @@ from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.design.disturbance_limit import ROOM
 from mimopilot.tuning.design.prediction import predict
-from mimopilot.tuning.design.response_design import ResponseDesign
+from mimopilot.tuning.design.response_design import BANDWIDTHS, ResponseDesign
 from mimopilot.tuning.design.stock_profile import in_digits
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
@@ -148,6 +148,25 @@ def test_a_design_for_arducopter_follows_better_and_is_no_softer_in_gusts(log):
     assert found.feasible
     assert max(np.divide(new.disturbance_deg, old.disturbance_deg)) < ROOM * 1.01
     assert np.linalg.norm(new.follow_deg) < np.linalg.norm(old.follow_deg)
+    assert np.diag(found.gains.Kp_o).min() > 3.0 * 0.99
+
+
+def test_our_gains_for_arducopter_are_designed_for_its_shaped_setpoints(log):
+    """Their setpoint's rate is fed forward, too: without that the same gains would follow much worse."""
+    stock = dataclasses.replace(FILTERS["ardupilot-stock"], shaping_s=(0.15,) * 3)
+    flown = stock_set("ardupilot-stock")
+    flown = dataclasses.replace(flown, Kp_o=4.5 * np.eye(2), filters=dataclasses.replace(flown.filters, stock=stock))
+    ours = flown.for_our_law()
+    bench = ResponseDesign.of([PlantEstimates(dataclasses.replace(log, flown=ours))], TuningSpec().design)
+    assert bench.bandwidths[-1] > BANDWIDTHS[-1]
+    found = bench.design([ours], "PID", full=False, bandwidth=BANDWIDTHS[-1])
+    without = dataclasses.replace(ours, filters=dataclasses.replace(ours.filters, shaping_s=0.0))
+    task = found.task.plants[0].manoeuvres
+    new, old, lagging = (
+        float(np.linalg.norm(predict(gains, bench.plants[0], task).follow_deg))
+        for gains in (found.gains, ours, without)
+    )
+    assert new < old < lagging / 2
     assert np.diag(found.gains.Kp_o).min() > 3.0 * 0.99
 
 

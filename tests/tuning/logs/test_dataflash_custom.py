@@ -10,6 +10,8 @@ from tests.tuning.logs.flights import ardupilot_messages, dataflash_bytes, make_
 FIELDS = ("TimeUS", "Ph", "RR", "RP", "RY", "UR", "UP", "UY", "XR", "XP", "XY")
 #: Our controller takes over 4 s after the start of the log, and hands back 2 s before its end.
 BEGIN, END = 14.0, 28.0
+#: Of the main controller, whose shaping makes our setpoints, too.
+MAIN = {"ATC_RAT_RLL_P": 0.135, "ATC_INPUT_TC": 0.15, "ATC_RATE_FF_ENAB": 1.0}
 
 
 def inject(t):
@@ -32,7 +34,7 @@ def custom_messages(flight, rates_setpoint):
 
 
 def parameters(gains):
-    values = {ardupilot_name(p.name): gains.elements()[p.code] for p in PARAMETERS} | {"ATC_RAT_RLL_P": 0.135}
+    values = {ardupilot_name(p.name): gains.elements()[p.code] for p in PARAMETERS} | MAIN
     names = [name.encode() for name in values]
     return ("PARM", "QNf", ("TimeUS", "Name", "Value"), [np.zeros(len(names)), names, list(values.values())])
 
@@ -53,6 +55,7 @@ def test_the_injected_torque_the_rate_setpoint_and_the_gains_are_those_of_our_co
     assert any("our custom controller flew" in note for note in recording.notes)
     log = read_log(path)
     assert log.flown.Kp_i == pytest.approx(gains.Kp_i, rel=1e-6)
+    assert log.flown.filters.shaping == (0.15, 0.15, 0.15)
     assert np.abs(log.u_bar).max(axis=0) == pytest.approx([0.1, 0.1])
 
 
