@@ -11,7 +11,6 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import GAINS, SNAPSHOT, AutotuneRun
 from mimopilot.sitl.field.flight_commands import wait_until_disarmed
 from mimopilot.sitl.field.flight_watch import start_watch
-from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import EXPERIMENTS
 from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, make_plan, make_restore_plan
 from mimopilot.sitl.mavlink.ground_station.session import Session
 from mimopilot.sitl.mavlink.ground_station.stock_parameters import read_stock_parameters
@@ -24,18 +23,6 @@ from mimopilot.tuning.logs.imported_gains import import_gains
 from mimopilot.tuning.parameters import PARAMETERS
 
 OLD, NEW, NEITHER = "old", "new", "neither"
-
-
-def check_profile(profile: str) -> None:
-    """Refuse a profile without an experiment.
-
-    Raises
-    ------
-    SitlError
-        Naming those that are known.
-    """
-    if profile not in EXPERIMENTS:
-        raise SitlError(f"--profile: got {profile!r}, expected one of {', '.join(EXPERIMENTS)}")
 
 
 def _set_names(run: AutotuneRun) -> list[str]:

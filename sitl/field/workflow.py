@@ -29,7 +29,8 @@ from mimopilot.sitl.field.ground_steps import (
     tune_gains,
     upload_gains,
 )
-from mimopilot.sitl.field.vehicle_set import NEITHER, NEW, OLD, check_profile, held_set, old_plan, write_set
+from mimopilot.sitl.field.vehicle_set import NEITHER, NEW, OLD, held_set, old_plan, write_set
+from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import EXPERIMENTS, check_experiment
 
 
 class AutotuneStep(NamedTuple):
@@ -80,7 +81,10 @@ def autotune(options: AutotuneOptions, dialogue: AutotuneDialogue) -> Decisions:
     SitlError
         If not: with the reason, and the set that the vehicle holds.
     """
-    check_profile(options.profile)
+    check_experiment(options.profile)
+    pilot = EXPERIMENTS[options.profile].pilot
+    if pilot and options.take_off is not None:
+        raise SitlError(f"--take-off: not with --profile {options.profile}: {pilot}, and leave --take-off out")
     run = AutotuneRun(options, load_decisions(options.folder, options.profile), dialogue)
     if run.decisions.result == "old":
         raise SitlError(

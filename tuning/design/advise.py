@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from mimopilot.tuning.analysis.certify_axes import certify_axes
 from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.design.prediction import Prediction, predict
-from mimopilot.tuning.design.response_design import ResponseDesign
+from mimopilot.tuning.design.response_design import BANDWIDTHS, ResponseDesign
 from mimopilot.tuning.design.tune_by_design import tune_by_design
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
@@ -135,7 +135,7 @@ def advise(
     best = tune_by_design([measured], spec)
     assert best.provenance.inner_model is not None and best.provenance.outer_model is not None
     inner, outer = best.provenance.inner_model[0], best.provenance.outer_model[0]
-    bench = ResponseDesign.of([measured], spec.design)
+    bench = ResponseDesign.of([measured], spec.design, BANDWIDTHS if spec.follow_model else ())
     found = [_candidate("recommended", best, outer, bench)]
     refused: dict[str, str] = {}
     if experiment.flown is not None:
@@ -145,7 +145,9 @@ def advise(
         limits = spec.design.model_copy(update={"noise": one.noise})
         start = replace(best, filters=replace(best.filters, derivative_cutoff_hz=one.cutoff_hz))
         try:
-            design = ResponseDesign.of([measured], limits).design([start], spec.structure, one.full, one.bandwidth)
+            design = ResponseDesign.of([measured], limits, bench.bandwidths).design(
+                [start], spec.structure, one.full, one.bandwidth
+            )
         except TuningError as error:
             refused[one.name] = str(error)
             continue

@@ -52,7 +52,7 @@ _DECADE = (2.8, 3.2, 3.6, 4.0, 4.5, 5.0, 5.6, 6.3, 7.1, 8.0, 9.0, 10.0, 11.2, 12
 BANDWIDTHS: tuple[float, ...] = (*_DECADE, 22.4, 25.0)
 #: Those where an autopilot shapes the setpoint and feeds its rate forward. The shaping makes the attitude slow; the
 #: model stands for the lag behind it only, and flown gains may have less lag than 25 rad/s.
-SHAPED_BANDWIDTHS = (*BANDWIDTHS, 28.0, 31.5, 35.5, 40.0, 45.0, 50.0)
+SHAPED_BANDWIDTHS = (*BANDWIDTHS, 28.0, 31.5, 35.5, 40.0, 45.0, 50.0, 56.0, 63.0, 71.0, 80.0, 90.0, 100.0)
 #: Where the search begins, rad/s, and its first step along the table.
 FIRST_BANDWIDTH, FIRST_STRIDE = 10.0, 2
 #: Share of the limit of noise that is used: the ratio of two predictions errs by 1 to 2 % (simulated airframes).

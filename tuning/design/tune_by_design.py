@@ -14,7 +14,7 @@ from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
 from mimopilot.tuning.design.certified_design import certified_design, rate_model, uncertified, weakest
 from mimopilot.tuning.design.prediction import Prediction, offaxis_doubt, predict, reasons_to_keep
-from mimopilot.tuning.design.response_design import FIRST_BANDWIDTH, Design, ResponseDesign, vehicle_damps
+from mimopilot.tuning.design.response_design import BANDWIDTHS, FIRST_BANDWIDTH, Design, ResponseDesign, vehicle_damps
 from mimopilot.tuning.design.stock_profile import WORTH, at_loop_rates, our_module, stock_starts, worth
 from mimopilot.tuning.design.yaw_design import tune_yaw, with_yaw
 from mimopilot.tuning.errors import TuningError
@@ -59,7 +59,8 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
     TuningError
         When no gains of the structure are certified.
     """
-    bench = ResponseDesign.of(measured, spec.design)
+    # A model that the vehicle itself follows is no faster.
+    bench = ResponseDesign.of(measured, spec.design, BANDWIDTHS if spec.follow_model else ())
     inner = rate_model(bench)
     starts, origin = starting_points(measured, spec, inner, bench)
     found, certificates = certified_design(bench, measured, spec, starts, inner)

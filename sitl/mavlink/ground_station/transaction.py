@@ -139,7 +139,9 @@ def upload_and_verify(
         )
     with open_session(options, plan.integers, crazyflie=True) as vehicle:
         _check_choice(plan, vehicle)
-        held = vehicle.read([*plan.values, *plan.fixed, *(plan.scale if ask_scale else ())], plan.profile)
+        held = vehicle.read([*plan.values, *plan.fixed], plan.profile)
+        if ask_scale:
+            held |= _read_scale(plan, vehicle)
         switch = SWITCHES.get(vehicle.vehicle.autopilot)
         if switch is not None and plan.profile == MIMO:
             held |= vehicle.run(read_values(vehicle.client, [switch.enable]))
@@ -183,6 +185,19 @@ def _check_choice(plan: UploadPlan, vehicle: Session) -> None:
                 f"{name}: the vehicle has {found[name]:g}, expected {value:g}, our controller (in {firmware}); "
                 f"set it to {value:g}, reboot and upload again; nothing was written"
             )
+
+
+def _read_scale(plan: UploadPlan, vehicle: Session) -> dict[str, float]:
+    """The vehicle's unit of torque; it has our other parameters."""
+    try:
+        return vehicle.run(read_values(vehicle.client, plan.scale))
+    except NoParametersError as error:
+        raise SitlError(
+            f"{plan.scale[0]}: the vehicle does not have it, so its unit of torque is not known: its firmware was "
+            'generated from gains with moment_scale "unknown"; give --moment-scale flown if the gains come from a log '
+            "of this vehicle, else --moment-scale ROLL,PITCH,YAW in N m; nothing was written",
+            exit_code=1,
+        ) from error
 
 
 def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session, options: LinkOptions) -> None:

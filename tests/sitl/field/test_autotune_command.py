@@ -3,6 +3,11 @@
 import json
 import subprocess
 
+import pytest
+
+from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.field.autotune_run import AutotuneOptions
+from mimopilot.sitl.field.workflow import autotune
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.tuning.gains_file import load_gains
 from tests.conftest import assert_one_clear_line
@@ -33,3 +38,25 @@ def test_without_a_terminal_the_command_asks_for_yes(mimopilot):
     assert_one_clear_line(done, "no terminal to ask", "--yes")
     done = mimopilot("autotune", "--connect", "tcp:127.0.0.1:1", "--out", "tuned", "--yes", "--profile", "betaflight")
     assert_one_clear_line(done, "--profile: got 'betaflight'", "px4-stock")
+
+
+@pytest.mark.parametrize(
+    ("profile", "words"),
+    [
+        (
+            "ardupilot-custom",
+            ("ardupilot-custom: our custom controller's experiment is started by hand", "CC3_EX_AX to 5"),
+        ),
+        (
+            "ardupilot-stock",
+            ("--take-off: not with --profile ardupilot-stock", "only from Stabilize", "take off by hand"),
+        ),
+    ],
+)
+def test_what_only_a_pilot_can_fly_is_refused_before_a_link_is_opened(profile, words, tmp_path):
+    options = AutotuneOptions("no link", tmp_path / "out", profile=profile, take_off=3.0)
+    with pytest.raises(SitlError) as refused:
+        autotune(options, dialogue=None)
+    for word in words:
+        assert word in str(refused.value)
+    assert not (tmp_path / "out").exists()

@@ -147,6 +147,8 @@ class ExperimentProfile(ABC):
         As of the profiles of an upload.
     integers : frozenset of str
         Parameters that may be whole numbers on the vehicle; a session needs them.
+    pilot : str
+        Why a pilot must fly the vehicle, and what to do; empty: none need.
     old : dict
         Parameter -> value before it was changed; what `restore` writes.
 
@@ -158,6 +160,7 @@ class ExperimentProfile(ABC):
 
     name: ClassVar[str]
     integers: ClassVar[frozenset[str]]
+    pilot: ClassVar[str] = ""
 
     def __init__(self, options: ExcitationOptions, save: SaveValues) -> None:
         self.options, self.save = options, save

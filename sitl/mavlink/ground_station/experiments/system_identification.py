@@ -72,6 +72,10 @@ class SystemIdentification(ExperimentProfile):
 
     name: ClassVar[str] = "ardupilot-stock"
     integers: ClassVar[frozenset[str]] = frozenset({SID_AXIS, LOG_BITMASK})
+    pilot: ClassVar[str] = (
+        "ArduCopter enters SystemID on the mixer's axes only from Stabilize, in which a pilot holds the height; take "
+        "off by hand, hover in Stabilize"
+    )
 
     def __init__(self, options: ExcitationOptions, save: SaveValues) -> None:
         super().__init__(options, save)

@@ -82,6 +82,22 @@ def test_an_armed_vehicle_and_firmware_without_custom_controllers_are_refused(mi
     assert armed.writes == plain.writes == 0
 
 
+def test_firmware_that_does_not_say_its_unit_of_torque_needs_it_from_the_user(mimopilot, certified, old):
+    """It was generated from gains without a moment scale."""
+    vehicle = CustomVehicle({name: value for name, value in old.items() if "SCALE" not in name})
+    refused = upload(mimopilot, certified, vehicle, "--timeout", "1")
+    parts = ("CC3_SCALE_R: the vehicle does not have it", 'moment_scale "unknown"', "--moment-scale flown")
+    assert_one_clear_line(refused, *parts, code=1)
+    assert vehicle.writes == 0
+    done = upload(mimopilot, certified, vehicle, "--moment-scale", "flown")
+    assert done.returncode == 0, done.stderr
+
+
+def test_its_experiment_is_started_by_hand(mimopilot):
+    refused = mimopilot("experiment", "--connect", "tcp:127.0.0.1:1", "--yes", "--profile", PROFILE)
+    assert_one_clear_line(refused, "ardupilot-custom: our custom controller's experiment", "set CC3_EX_AX to 5")
+
+
 def test_half_a_set_is_not_restored(gains):
     from mimopilot.sitl.errors import SitlError
 
