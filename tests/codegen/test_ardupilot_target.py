@@ -122,8 +122,68 @@ def test_the_script_refuses_another_controller_with_our_number_and_a_folder_that
     header.write_text(header.read_text().replace("CONT_PID             = 2,", "CONT_PID = 2,\n        CONT_OTHER = 3,"))
     before = contents(ardupilot)
     assert "another custom controller has number 3" in install(tree, ardupilot).stderr
+    header.write_text(header.read_text().replace("CONT_OTHER = 3,", "CONT_OTHER=3"))
+    assert "another custom controller has number 3" in install(tree, ardupilot).stderr
+    header.write_text(header.read_text().replace("CONT_OTHER=3", "CONT_OTHER = 3,"))
     assert contents(ardupilot) == before
     assert "give the folder of ArduPilot's source" in install(tree, tmp_path).stderr
+
+
+def test_the_script_refuses_a_place_that_is_there_twice(tree, tmp_path):
+    ardupilot = stand_in("master", tmp_path)
+    source = ardupilot / "libraries" / "AC_CustomControl" / "AC_CustomControl.cpp"
+    source.write_text(source.read_text() + '#include "AC_CustomControl_PID.h"\n')
+    before = contents(ardupilot)
+    refused = install(tree, ardupilot)
+    assert refused.returncode == 1 and "found 2 lines like" in refused.stderr and "expected one" in refused.stderr
+    assert contents(ardupilot) == before
+
+
+def test_the_script_completes_an_earlier_run_and_removes_what_that_left(tree, tmp_path):
+    ardupilot = stand_in("master", tmp_path)
+    before = contents(ardupilot)
+    install(tree, ardupilot)
+    complete = contents(ardupilot)
+    library = ardupilot / "libraries" / "AC_CustomControl"
+    # An earlier version had a file more, which would be compiled, too; a line and a file of ours were lost.
+    note = library / "utility" / "mimopilot.txt"
+    (library / "utility" / "older.cpp").touch()
+    note.write_text(note.read_text() + "utility/older.cpp\n../AC_PID/AC_PID.cpp\n")
+    other = library.parent / "AC_PID" / "AC_PID.cpp"
+    other.parent.mkdir()
+    other.touch()
+    (library / "utility" / "excitation.cpp").unlink()
+    header = library / "AC_CustomControl.h"
+    header.write_text("".join(line for line in header.read_text().splitlines(True) if "CONT_MIMO" not in line))
+    assert install(tree, ardupilot).returncode == 0
+    assert other.exists()
+    other.unlink()
+    assert contents(ardupilot) == complete
+    install(tree, ardupilot, "--remove")
+    assert contents(ardupilot) == before
+
+
+def test_the_script_alone_and_a_source_that_cannot_be_written_are_refused(tree, tmp_path):
+    ardupilot = stand_in("master", tmp_path)
+    before = contents(ardupilot)
+    alone = tmp_path / "alone"
+    shutil.copytree(tree / "ardupilot", alone / "ardupilot")
+    assert "run the script where `mimopilot generate` wrote it" in install(alone, ardupilot).stderr
+    (ardupilot / "libraries" / "AC_CustomControl" / "AC_CustomControl_MIMO.cpp").mkdir()
+    refused = install(tree, ardupilot)
+    assert refused.returncode == 1 and "Traceback" not in refused.stderr and "nothing was changed" in refused.stderr
+    assert contents(ardupilot) == before
+
+
+def test_the_script_keeps_mixed_line_ends(tree, tmp_path):
+    ardupilot = stand_in("master", tmp_path)
+    header = ardupilot / "libraries" / "AC_CustomControl" / "AC_CustomControl.h"
+    header.write_bytes(header.read_bytes().replace(b"\n", b"\r\n", 1))
+    before = header.read_bytes()
+    assert install(tree, ardupilot).returncode == 0
+    assert header.read_bytes().count(b"\r\n") == 1
+    install(tree, ardupilot, "--remove")
+    assert header.read_bytes() == before
 
 
 def test_the_script_keeps_windows_line_ends(tree, tmp_path):
