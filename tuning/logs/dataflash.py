@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.logs.dataflash_custom import custom_flight, our_parameters
+from mimopilot.tuning.logs.dataflash_custom import CUSTOM_NOTE, IDLE_NOTE, custom_flight, our_parameters
 from mimopilot.tuning.logs.dataflash_file import DataflashFile, open_dataflash
 from mimopilot.tuning.logs.flight_phase import intervals
 from mimopilot.tuning.logs.recording import MAX_OUTLIERS, RANGES, Recording
@@ -64,10 +64,6 @@ NOTE = (
     "the flown gains are ArduPilot's: it also filters the rate setpoint (FLTT) and the error of yaw (FLTE), which this "
     "controller does not, and its D acts on the error"
 )
-CUSTOM_NOTE = (
-    "our custom controller flew, in a part or all of the log (message MIMO): the flown gains are its own; its rate "
-    "setpoint and injected torque are those of MIMO, where it flew"
-)
 
 
 def record_dataflash(path: Path) -> Recording:
@@ -94,8 +90,10 @@ def record_dataflash(path: Path) -> Recording:
         raise TuningError(f"{path}: {SDLOG2}")
     old = log.in_old_units()
     signals, yaw = _signals(log, LAYOUTS, old), _signals(log, YAW_LAYOUTS, old)
-    custom = custom_flight(log.file)
-    excitations = _excitation(log)
+    custom, excitations = custom_flight(log.file), _excitation(log)
+    note = NOTE if custom is None else CUSTOM_NOTE
+    if custom is not None and excitations and not custom.excitation.any():
+        custom, note = None, f"{NOTE}; {IDLE_NOTE}"
     if custom is not None:
         excitations |= custom.injected(signals.get("u"))
         for found, axes in ((signals, slice(0, 2)), (yaw, slice(2, 3))):
@@ -131,7 +129,7 @@ def record_dataflash(path: Path) -> Recording:
         changes=changes,
         faults=(f"not a multirotor: {vehicle.fault}; gains are tuned for multirotors only",) if vehicle.fault else (),
         warnings=(*((damage,) if damage else ()), *vehicle.warnings),
-        notes=(NOTE if custom is None else CUSTOM_NOTE, *_identification_notes(log)),
+        notes=(note, *_identification_notes(log)),
         yaw=yaw,
         span=_span(log),
     )

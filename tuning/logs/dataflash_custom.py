@@ -20,6 +20,15 @@ from mimopilot.tuning.parameters import ARDUPILOT_PREFIX
 MESSAGE = "MIMO"
 MICROSECOND = 1e-6  # s
 _FIELDS = ("TimeUS", "RR", "RP", "RY", "XR", "XP", "XY")
+CUSTOM_NOTE = (
+    "our custom controller flew, in a part or all of the log (message MIMO): the flown gains are its own; its rate "
+    "setpoint and injected torque are those of MIMO, where it flew"
+)
+#: System identification adds nothing to the torque of a custom controller.
+IDLE_NOTE = (
+    "our custom controller flew in a part of the log (message MIMO), but the excitation of system identification is "
+    "the main controller's, and so are the flown gains"
+)
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,3 +65,21 @@ def test_without_our_message_the_flown_gains_are_the_main_controllers(tmp_path, 
     recording = open_log(path)
     assert "u_bar" not in recording.signals
     assert not any(name.startswith("MIMO_") for name in recording.parameters)
+
+
+def test_system_identification_in_the_same_log_is_the_main_controllers(tmp_path, flight, gains):
+    """It adds nothing to the torque of a custom controller."""
+    name, kinds, fields, columns = custom_messages(flight, np.zeros((len(flight.t), 2)))
+    columns[-3:] = [np.zeros(len(columns[0]))] * 3
+    stamps = np.arange(BEGIN - 3.0, BEGIN - 1.0, 0.0025)
+    identification = [
+        ("SIDD", "Qf", ("TimeUS", "Targ"), [microseconds(stamps), np.full(len(stamps), 0.1)]),
+        ("SIDS", "QB", ("TimeUS", "Ax"), [microseconds(stamps[:1]), [10]]),
+    ]
+    path = tmp_path / "x.bin"
+    ours = (name, kinds, fields, columns)
+    path.write_bytes(dataflash_bytes([*ardupilot_messages(flight), ours, *identification, parameters(gains)]))
+    recording = open_log(path)
+    assert recording.signals["u_bar"].values.max() == pytest.approx(0.1)
+    assert not any(name.startswith("MIMO_") for name in recording.parameters)
+    assert any("the main controller's, and so are the flown gains" in note for note in recording.notes)
