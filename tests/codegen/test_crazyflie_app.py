@@ -194,6 +194,17 @@ def test_a_yaw_rate_turns_the_heading_to_hold_from_the_measured_one_on(host):
     assert host.log("yawSp") == pytest.approx(-(170 + 20 - 360) * DEGREE, abs=1e-4)
 
 
+@pytest.mark.parametrize("mode", [1, 2])
+def test_a_single_yaw_setpoint_that_is_no_number_does_not_stay_in_the_heading(host, mode):
+    host.setpoint.mode.yaw = mode
+    host.setpoint.attitude.yaw = host.setpoint.attitudeRate.yaw = math.nan
+    host.run(2)
+    host.setpoint.mode.yaw = 2
+    host.setpoint.attitudeRate.yaw = 0.0
+    host.run(200)
+    assert host.log("yawSp") == 0 and host.log("fault") == 0
+
+
 def test_thrust_0_gives_no_torque_and_empties_the_integrators(host):
     host.sensors.gyro.x = 5.0
     host.run(400)

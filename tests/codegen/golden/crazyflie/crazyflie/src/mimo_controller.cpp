@@ -47,7 +47,7 @@ struct Controller {
 
 Controller flight;
 
-// Rounded; -1 if it is no whole number of 0 to a million.
+// Rounded; -1 if it is not between 0 and a million, or no number.
 int32_t integer(float value)
 {
 	return value >= 0.0F && value <= 1.0e6F ? static_cast<int32_t>(value + 0.5F) : -1;
