@@ -101,7 +101,7 @@ ANOTHER_SET = {
     ControllerState.CHANGED: "a parameter had changed since",
     ControllerState.REFUSED: "the parameters were refused",
 }
-NO_TORQUE = f"{STATUS} is {ControllerState.WRONG_PERIOD.value}: the gains are for another rate, so the controller gave no torque"
+NO_TORQUE = f"{STATUS} is {ControllerState.WRONG_PERIOD.value}: the gains are for another rate, so there was no torque"
 
 
 def record_usd(path: Path) -> Recording:
