@@ -57,7 +57,7 @@ def read_values(client: ParameterClient, names: Sequence[str]) -> Exchange[dict[
 
     Raises
     ------
-    NoneHeldError
+    NoParametersError
         If the vehicle is present, but answers for none of them.
     SitlError
         If one is not answered, refused, or not a float.
