@@ -143,6 +143,11 @@ def upload_and_verify(
         switch = SWITCHES.get(vehicle.vehicle.autopilot)
         if switch is not None and plan.profile == MIMO:
             held |= vehicle.run(read_values(vehicle.client, [switch.enable]))
+            if held[switch.enable] not in (0.0, 1.0):
+                raise SitlError(
+                    f"{switch.enable}: the vehicle holds {held[switch.enable]:.6g}, expected 0 or 1: it could not be "
+                    "switched back; set it by hand first"
+                )
         _check_vehicle(plan, held, vehicle, options)
         if ask_scale and gains is not None:
             check_moment_scale(gains, [held[name] for name in plan.scale], "the vehicle")

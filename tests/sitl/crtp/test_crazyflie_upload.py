@@ -1,5 +1,6 @@
 """Uploads to a scripted Crazyflie, by the command: the same transaction as over MAVLink, with its faults."""
 
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -164,6 +165,11 @@ REFUSALS = {
     "armed by hand": (lambda v: setattr(v, "state_bits", v.state_bits & ~AUTO | ARMED), "the vehicle is armed", 1),
     "another period": (lambda v: v.values.update({"mimo.TS": 0.004}), "MIMO_TS: the vehicle has 0.004", 2),
     "another unit": (lambda v: v.values.update({"mimo.SCALE_P": 0.5}), "moment_scale: the gains are for", 2),
+    "a switch that is no number": (
+        lambda v: v.values.update({"mimo.EN": math.nan}),
+        "MIMO_EN: the vehicle holds nan",
+        2,
+    ),
     "old firmware": (lambda v: setattr(v, "protocol", 11), "version 11 of CRTP", 2),
     "silent": (
         lambda v: setattr(v, "fault", "silent"),
