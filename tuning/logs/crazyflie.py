@@ -261,6 +261,8 @@ def _airborne(blocks: Sequence[LogBlock]) -> tuple[tuple[Interval, ...] | None, 
     for name, bit in FLYING:
         for block in blocks:
             if name in block.variables:
-                flying = (block.variables[name].astype(np.int64) >> bit) & 1 == 1
+                values = block.variables[name]
+                bits = np.where(np.abs(values) < 1 << 16, values, 0.0).astype(np.int64)  # text may hold anything
+                flying = (bits >> bit) & 1 == 1
                 return intervals(block.time, flying), name
     return None, ""

@@ -213,6 +213,15 @@ def test_a_csv_file_that_ends_within_a_line_is_used_up_to_there_and_other_damage
         read_log(path)
 
 
+def test_time_stamps_that_begin_again_after_24_bits_go_on_and_a_status_that_is_no_number_is_no_flight(tmp_path):
+    status = ("f", np.array([0x1F, 0x1F, np.nan, 0x0F]))
+    path = write_csv_block(tmp_path / "a.csv", 16777.210 + 0.01 * np.arange(4), {"supervisor.info": status})
+    path.write_text(path.read_text().replace("16777220", "4").replace("16777230", "14").replace("16777240", "24"))
+    found = open_log(path)
+    assert found.span == pytest.approx((16777.21, 16777.24))
+    assert found.airborne == ((-np.inf, pytest.approx(16777.23)),)
+
+
 LITTLE = usd_bytes(np.arange(4) * 0.002, {"gyro.x": ("f", np.arange(4.0)), "sys.isFlying": ("B", np.ones(4, int))})
 
 
