@@ -97,6 +97,19 @@ def test_a_quaternion_setpoint_is_in_the_newer_frame_without_the_inverted_pitch(
     assert logged(host, SETPOINTS) == pytest.approx([degrees * DEGREE for degrees in expected], abs=1e-6)
 
 
+def test_the_supervisors_level_out_after_a_full_state_setpoint_is_level(host):
+    """The supervisor then sets the modes of roll, pitch and yaw, and leaves that of the quaternion as it was."""
+    mode = host.setpoint.mode
+    mode.x = mode.y = mode.z = mode.quat = 1
+    mode.roll = mode.pitch = mode.yaw = 0
+    turn(host.setpoint.attitudeQuaternion, "x", 25.0)
+    host.run()
+    mode.x = mode.y = 0
+    mode.roll, mode.pitch, mode.yaw = 1, 1, 2
+    host.run()
+    assert logged(host, SETPOINTS[:2]) == [0, 0]
+
+
 @pytest.mark.parametrize(("name", "expected"), [("roll", (1, 0, 0)), ("pitch", (0, 1, 0)), ("yaw", (0, 0, -1))])
 def test_rate_setpoints_are_in_the_older_frame_and_flown_without_the_attitude(host, name, expected):
     host.setpoint.mode.roll = host.setpoint.mode.pitch = 2

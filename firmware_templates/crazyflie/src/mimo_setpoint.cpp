@@ -23,6 +23,13 @@ constexpr float kFullThrust = 65535.0F;
 
 bool position_held(const setpoint_t &setpoint) { return setpoint.mode.x != modeDisable && setpoint.mode.y != modeDisable; }
 
+// The supervisor levels a vehicle out by the modes of roll and pitch, and leaves that of the quaternion as it was.
+bool quaternion_flown(const setpoint_t &setpoint)
+{
+	return setpoint.mode.quat == modeAbs && setpoint.mode.roll == modeDisable && setpoint.mode.pitch == modeDisable
+	       && !position_held(setpoint);
+}
+
 void reset_position_controller(const state_t &state)
 {
 	positionControllerResetAllPID(state.position.x, state.position.y, state.position.z);
@@ -117,7 +124,7 @@ void Setpoint::step(const setpoint_t &setpoint, const state_t &state, uint32_t s
 	angles_from_legacy(legacy, angles);
 	angles[2] = _heading;
 
-	if (setpoint.mode.quat == modeAbs && !position_held(setpoint)) {
+	if (quaternion_flown(setpoint)) {
 		load(setpoint.attitudeQuaternion, input.attitude_setpoint);
 
 	} else {
