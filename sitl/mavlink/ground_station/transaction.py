@@ -30,7 +30,7 @@ STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it",
     "autosave": f"storage was not acknowledged: waited {AUTOSAVE_S:g} s, in which PX4 and ArduPilot save by themselves",
     "denied": "not stored: the vehicle refused it (PREFLIGHT_STORAGE: MAV_RESULT_DENIED)",
-    "failed": "not stored: the vehicle reported a failure, or stored a part in time",
+    "failed": "not stored: the vehicle failed to (over MAVLink: MAV_RESULT_FAILED)",
     "": "the link was lost before storage was acknowledged",
 }
 #: Results of storage after which the vehicle loses the values when it restarts.
