@@ -202,7 +202,9 @@ def test_a_vehicle_that_does_not_publish_its_unit_of_torque_needs_moment_scale(m
     silent = {name: value for name, value in old.items() if not name.startswith("MIMO_SCALE")}
     with UdpVehicle(ScriptedVehicle(silent)) as link:
         arguments = ("upload", certified, "--connect", link.url, "--yes", "--timeout", "3")
-        assert_one_clear_line(mimopilot(*arguments), "MIMO_SCALE_R", "no answer", code=1)
+        assert_one_clear_line(
+            mimopilot(*arguments), "MIMO_SCALE_R", "its unit of torque is not known", "--moment-scale flown", code=1
+        )
         assert mimopilot(*arguments, "--moment-scale", "2.546,2.546,0.2736").returncode == 0
         assert named(link.vehicle.values, new) == new
 
