@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from mimopilot.common.extras import REPORT
 from mimopilot.common.files import inside
 from mimopilot.common.html_report import Section, write_report
 from mimopilot.common.long_work import Piece, run_pieces
@@ -61,8 +62,9 @@ def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = No
     Raises
     ------
     Error
-        When the folder is in use, or a vehicle was lost; exit code 130 after Ctrl-C.
+        When the folder is in use, a vehicle was lost, or plotly is not installed; exit code 130 after Ctrl-C.
     """
+    REPORT.need()
     chosen = STUDIES if name == ALL else (name,)
     for study in {name, *chosen}:
         inside(out, f"{study}.html")
