@@ -43,11 +43,13 @@ def test_it_works_outside_of_the_tree(wheel, tmp_path):
 
 
 MISSING = {
-    "pymavlink": ("autotune --connect udpin:127.0.0.1:14550 --out tuned",),
+    "pymavlink": ("autotune --connect udpin:127.0.0.1:14550 --out tuned", "demo --out x"),
     "plotly": (
         "report x.ulg --out x.html",
         "tune x.ulg --out x --report x.html",
         "autotune --connect udpin:127.0.0.1:14550 --out tuned",
+        "demo --out x",
+        "reproduce numerical-example --out x",
     ),
     "pyarrow": ("campaign adam0 --out x",),
     "unicorn": ("pil my.gains.toml",),

@@ -56,7 +56,9 @@ def manoeuvre_chart(
         Line(time, np.degrees(model[shown]), "reference", MODEL_COLOUR, width=3.0, opacity=0.6),
         Line(time, setpoint, "setpoint", SETPOINT_COLOUR, width=1.0, step=True),
     ]
-    off_axis, rate, torque = [], [], []
+    off_axis: list[Line] = []
+    rate: list[Line] = []
+    torque: list[Line] = []
     for label, flight in flights.items():
         colour, dash = looks[label]
         truth, moment = flight.truth[shown], flight.record["moment"][shown, axis]
@@ -85,7 +87,7 @@ def manoeuvre_chart(
 
 def experiment_chart(name: str, flight: Flight) -> Chart:
     """An experiment: injected and total torque, rates and angles of all axes; a detail on the right."""
-    time = np.arange(len(flight.record)) * flight.scenario.Ts
+    time = np.asarray(np.arange(len(flight.record)) * flight.scenario.Ts, np.float64)
     record, excitation = flight.record, flight.scenario.excitation
     axes = [axis for axis in range(3) if axis < 2 or excitation[:, axis].any()]
     middle = time[-1] / 2

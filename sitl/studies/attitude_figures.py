@@ -55,7 +55,9 @@ SAME_MODEL, SAME_MODEL_LABEL = "J_M_o_design", "J_M,o, MIMO's model"
 #: Percentiles at the ends of the bars.
 LOW, HIGH = 5, 95
 #: Height of a panel with one row per method: of its frame, and of a row, px.
-FRAME, ROW = 110, 22
+FRAME, ROW = 130, 22
+#: Figures over all runs; the others are of one run.
+OF_ALL_RUNS = ("gains", "costs")
 #: Height of a motor's panel, px.
 MOTOR = 170
 #: Length of the detail of the motors in an experiment, s.
@@ -117,7 +119,7 @@ def motors_chart(found: AttitudeRun, rotors: int, name: str) -> Chart:
 
 def experiment_motors_chart(flight: Flight, rotors: int, name: str) -> Chart:
     """Commands of all motors in the experiment, with the mean of each; a detail where roll ends and pitch begins."""
-    time = np.arange(len(flight.record)) * flight.scenario.Ts
+    time = np.asarray(np.arange(len(flight.record)) * flight.scenario.Ts, np.float64)
     middle = time[-1] / 2
     detail = (middle - MOTOR_DETAIL / 2, middle + MOTOR_DETAIL / 2)
     near = (time >= detail[0]) & (time <= detail[1])
@@ -148,7 +150,7 @@ def gains_chart(found: StudyStatistics, printed: Mapping[str, Any], table: str) 
                 for place, method in enumerate(methods)
             ]
             crosses = {
-                place: float(np.ravel(printed[key][name])[element])
+                float(place): float(np.ravel(printed[key][name])[element])
                 for place, method in enumerate(methods)
                 if (key := PRINTED_KEYS.get(method, "")) in printed
             }

@@ -55,7 +55,7 @@ def sensitivity_chart(
     return Chart(name, caption, panels)
 
 
-def _reference(x: NDArray[np.float64], y: NDArray[np.float64], step: bool = False) -> Line:
+def _reference(x: NDArray[Any], y: NDArray[Any], step: bool = False) -> Line:
     return Line(x, y, "reference", MODEL_COLOUR, width=3.0, step=step, opacity=0.6)
 
 
