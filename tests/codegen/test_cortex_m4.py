@@ -17,6 +17,7 @@ from mimopilot.codegen.layout import INPUT, to_array
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.toolchain import CXX_FLAGS
 from mimopilot.codegen.vectors import random_inputs
+from mimopilot.common.errors import Error
 from mimopilot.sitl.physics.airframe import FOLDER
 from mimopilot.tuning.gains_file import load_gains
 from mimopilot.tuning.parameter_row import Shape
@@ -242,7 +243,7 @@ def test_a_missing_tool_is_reported_with_its_package(mimopilot_process, tmp_path
         result = mimopilot_process(*arguments, env=environment)
         assert_one_clear_line(result, "arm-none-eabi-g++", "apt-get install gcc-arm-none-eabi")
     monkeypatch.setitem(__import__("sys").modules, "unicorn", None)
-    with pytest.raises(CodegenError, match=r"pip install 'mimopilot\[emulator\]'"):
+    with pytest.raises(Error, match=r"pip install 'mimopilot\[emulator\]'"):
         EmulatedController(image, fixed)
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(CodegenError, match="apt-get install qemu-system-arm"):
