@@ -85,8 +85,8 @@ def manoeuvre_chart(
     return Chart(name, caption, panels)
 
 
-def experiment_chart(name: str, flight: Flight) -> Chart:
-    """An experiment: injected and total torque, rates and angles of all axes; a detail on the right."""
+def experiment_charts(name: str, flight: Flight) -> list[Chart]:
+    """An experiment, whole and in detail: injected and total torque, rates and angles of all axes."""
     time = np.asarray(np.arange(len(flight.record)) * flight.scenario.Ts, np.float64)
     record, excitation = flight.record, flight.scenario.excitation
     axes = [axis for axis in range(3) if axis < 2 or excitation[:, axis].any()]
@@ -94,23 +94,26 @@ def experiment_chart(name: str, flight: Flight) -> Chart:
     roll = np.flatnonzero(excitation[:, 0])
     if len(roll) and roll[-1] + 1 < len(time):
         middle = time[roll[-1]]
-    detail = (middle - DETAIL / 2, middle + DETAIL / 2)
+    detail = (float(middle - DETAIL / 2), float(middle + DETAIL / 2))
     near = (time >= detail[0]) & (time <= detail[1])
-    panels = []
+    whole, part = [], []
     for title, unit, values in (
         ("injected torque", "(normalised)", record["excitation"]),
         ("torque", "(normalised)", record["moment"]),
         ("body rate", "[deg/s]", np.degrees(record["rates"])),
         ("angle", "[deg]", np.degrees(record["attitude"])),
     ):
-        whole, part = [], []
-        for axis in axes:
-            look = (ALL_AXES[axis], AXIS_COLOURS[axis])
-            whole.append(Line(*thinned(time, values[:, axis], OVERVIEW_SAMPLES), *look, width=0.8))
-            part.append(Line(time[near], values[near, axis], *look, width=1.3, step=True))
-        panels += [
-            Panel(title, "time [s]", unit, whole, x_range=(0.0, float(time[-1])), height=220),
-            Panel(f"{title}, in detail", "time [s]", unit, part, x_range=detail, height=220),
+        thin = [
+            Line(*thinned(time, values[:, axis], OVERVIEW_SAMPLES), ALL_AXES[axis], AXIS_COLOURS[axis], width=0.8)
+            for axis in axes
         ]
-    caption = "The closed-loop experiment; right: where roll ends and pitch begins."
-    return Chart(name, caption, panels, linked=False)
+        full = [
+            Line(time[near], values[near, axis], ALL_AXES[axis], AXIS_COLOURS[axis], width=1.3, step=True)
+            for axis in axes
+        ]
+        whole.append(Panel(title, "time [s]", unit, thin, x_range=(0.0, float(time[-1])), height=220))
+        part.append(Panel(title, "time [s]", unit, full, x_range=detail, height=220))
+    return [
+        Chart(name, "The closed-loop experiment.", whole),
+        Chart(f"{name}-detail", f"The same in detail, where roll ends: {detail[0]:.1f} to {detail[1]:.1f} s.", part),
+    ]

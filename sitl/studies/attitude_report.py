@@ -10,7 +10,7 @@ import numpy as np
 
 from mimopilot.common.figures import Chart
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.flight.figures import experiment_chart, manoeuvre_chart
+from mimopilot.sitl.flight.figures import experiment_charts, manoeuvre_chart
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.studies.attitude_figures import (
@@ -70,12 +70,12 @@ CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms", "true Ms", "noise", "lo
 
 
 def run_charts(study: AttitudeStudy, found: AttitudeRun) -> list[Chart]:
-    """The time histories of one run, in the order of the report: two of the experiment, then the doublets."""
+    """The time histories of one run, in the order of the report: of the experiment, then of the doublets."""
     name = study.name
     inner, outer = study.models(MIMO, found.experiment.scenario.Ts)
     rotors = len(load_airframe(study.airframe).airframe.rotors)
     charts = [
-        experiment_chart(f"{name}-experiment", found.experiment),
+        *experiment_charts(f"{name}-experiment", found.experiment),
         experiment_motors_chart(found.experiment, rotors, name),
     ]
     others = (DEFAULT, SISO_PRINTED, MIMO_PRINTED) if study.fitted else (DEFAULT, AUTOTUNE, MIMO, BEST)
@@ -91,12 +91,13 @@ def study_sections(found: StudyStatistics, shown: Sequence[Chart]) -> list[Secti
     study, name = found.study, found.study.name
     inner, outer = study.models(MIMO, load_airframe(study.airframe).default_gains().Ts)
     _, axis, costs = study.costs_table
+    flown = [chart for chart in shown if chart.name.startswith(f"{name}-experiment")]
     limited = f", setpoint limited to {study.rate_limit_deg_s:g} degrees/s" if study.rate_limit_deg_s else ""
     return [
         Section(
             f"{name}: experiment",
             _lead(study, inner.label, outer.label),
-            charts=shown[:2],
+            charts=flown,
         ),
         Section(
             f"{name}: gains",
@@ -111,7 +112,7 @@ def study_sections(found: StudyStatistics, shown: Sequence[Chart]) -> list[Secti
             f"{FITTED_METHODS if study.fitted else METHODS} "
             f"{COMPARABILITY if costs else ''}",
             [costs_table(found), certificates_table(found)],
-            charts=[costs_chart(found, study.methods(), costs, axis), *shown[2:]],
+            charts=[costs_chart(found, study.methods(), costs, axis), *shown[len(flown) :]],
         ),
     ]
 

@@ -23,7 +23,7 @@ from mimopilot.sitl.field.report.sections.gain_sets import gains_section
 from mimopilot.sitl.field.report.sections.prediction import prediction_section
 from mimopilot.sitl.field.report.sections.stability import stability_section
 from mimopilot.sitl.flight.excitation_flight import default_yaw_amplitude
-from mimopilot.sitl.flight.figures import experiment_chart, manoeuvre_chart
+from mimopilot.sitl.flight.figures import experiment_charts, manoeuvre_chart
 from mimopilot.sitl.flight.flight_log import save_flight
 from mimopilot.sitl.flight.metrics import Performance, performance
 from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet, excitation_flight
@@ -241,7 +241,7 @@ def _write_report(
             "Experiment",
             f"PRBS torque on roll, then on pitch (amplitude {AMPLITUDE:g}, bandwidth {BANDWIDTH:g} rad/s), then on yaw "
             f"({np.abs(experiment.scenario.excitation[:, 2]).max():g}, half the bandwidth), under the flown gains.",
-            charts=[experiment_chart("experiment", experiment)],
+            charts=experiment_charts("experiment", experiment),
         ),
         replace(gains_section(cases), text=f"MIMO is limited by: {limits}."),
         prediction_section(cases),
