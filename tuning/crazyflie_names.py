@@ -67,7 +67,7 @@ class LogVariable:
     name : str
         Without the group.
     type : str
-        ``float``, ``int8_t``, ``uint8_t`` or ``uint16_t``.
+        ``float``, ``int8_t`` or ``uint8_t``.
     unit, description : str
     """
 

@@ -97,6 +97,19 @@ def test_a_quaternion_setpoint_is_in_the_newer_frame_without_the_inverted_pitch(
     assert logged(host, SETPOINTS) == pytest.approx([degrees * DEGREE for degrees in expected], abs=1e-6)
 
 
+def test_the_supervisors_level_out_after_a_full_state_setpoint_is_level(host):
+    """The supervisor then sets the modes of roll, pitch and yaw, and leaves that of the quaternion as it was."""
+    mode = host.setpoint.mode
+    mode.x = mode.y = mode.z = mode.quat = 1
+    mode.roll = mode.pitch = mode.yaw = 0
+    turn(host.setpoint.attitudeQuaternion, "x", 25.0)
+    host.run()
+    mode.x = mode.y = 0
+    mode.roll, mode.pitch, mode.yaw = 1, 1, 2
+    host.run()
+    assert logged(host, SETPOINTS[:2]) == [0, 0]
+
+
 @pytest.mark.parametrize(("name", "expected"), [("roll", (1, 0, 0)), ("pitch", (0, 1, 0)), ("yaw", (0, 0, -1))])
 def test_rate_setpoints_are_in_the_older_frame_and_flown_without_the_attitude(host, name, expected):
     host.setpoint.mode.roll = host.setpoint.mode.pitch = 2
@@ -192,6 +205,17 @@ def test_a_yaw_rate_turns_the_heading_to_hold_from_the_measured_one_on(host):
     host.setpoint.attitudeRate.yaw = 50.0
     host.run(400)
     assert host.log("yawSp") == pytest.approx(-(170 + 20 - 360) * DEGREE, abs=1e-4)
+
+
+@pytest.mark.parametrize("mode", [1, 2])
+def test_a_single_yaw_setpoint_that_is_no_number_does_not_stay_in_the_heading(host, mode):
+    host.setpoint.mode.yaw = mode
+    host.setpoint.attitude.yaw = host.setpoint.attitudeRate.yaw = math.nan
+    host.run(2)
+    host.setpoint.mode.yaw = 2
+    host.setpoint.attitudeRate.yaw = 0.0
+    host.run(200)
+    assert host.log("yawSp") == 0 and host.log("fault") == 0
 
 
 def test_thrust_0_gives_no_torque_and_empties_the_integrators(host):

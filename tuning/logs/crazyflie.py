@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mimopilot.tuning.crazyflie_names import GROUP, ControllerState
 from mimopilot.tuning.errors import TuningError
@@ -22,7 +23,7 @@ from mimopilot.tuning.logs.crazyflie_file import (
     read_cfclient_csv,
     read_usd_log,
 )
-from mimopilot.tuning.logs.flight_phase import intervals
+from mimopilot.tuning.logs.flight_phase import intersection, intervals
 from mimopilot.tuning.logs.formats import HEAD_BYTES
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Interval, Series
@@ -90,14 +91,17 @@ STOCK_NOTE = (
     "firmware compensates the battery"
 )
 RADIO_NOTE = "each log block over the radio is a sample at 100 Hz or less of a loop at 500 Hz, without a filter before"
+#: What flies, as our controller logs it; and the whole log.
+STATUS, ALWAYS = f"{GROUP}.state", ((-math.inf, math.inf),)
 STOCK_FLEW = (
-    f"{GROUP}.state is {ControllerState.STOCK.value} in the whole log: the stock PID flew, our controller's torque "
-    f"was not applied; set {GROUP}.EN to 1 on the ground"
+    f"according to {STATUS} the stock PID flew, our controller gave no torque; set {GROUP}.EN to 1 on the ground, "
+    f"and see that {STATUS} is {ControllerState.FLIES.value} before the take-off"
 )
-NO_TORQUE = (
-    f"{GROUP}.state is {ControllerState.WRONG_PERIOD.value}: the gains are for another rate, so the controller gave no "
-    "torque"
-)
+ANOTHER_SET = {
+    ControllerState.CHANGED: "a parameter had changed since",
+    ControllerState.REFUSED: "the parameters were refused",
+}
+NO_TORQUE = f"{STATUS} is {ControllerState.WRONG_PERIOD.value}: the gains are for another rate, so there was no torque"
 
 
 def record_usd(path: Path) -> Recording:
@@ -158,13 +162,17 @@ def _record(
     beside: tuple[Path, ...] = (),
 ) -> Recording:
     """The recording of log blocks."""
-    faults, warned, ours = _what_flew(blocks)
+    airborne, evidence = _airborne(blocks)
+    faults, warned, flown = _what_flew(blocks, airborne)
+    ours = flown != ()
+    if flown and flown != ALWAYS:
+        airborne = flown if airborne is None else intersection(airborne, flown)
+        evidence = f"{evidence} and {STATUS}".removeprefix(" and ")
     signals, yaw = _signals(blocks, LAYOUTS, ours), _signals(blocks, YAW_LAYOUTS, ours)
     wanted = {
         signal: " or ".join(" and ".join(name for name, _ in layout) for layout in _allowed(signal, layouts, ours))
         for signal, layouts in LAYOUTS.items()
     }
-    airborne, evidence = _airborne(blocks)
     stock = "u" in signals and not signals["u"].topic.startswith(GROUP)
     return Recording(
         path=path,
@@ -203,16 +211,49 @@ def _signals(blocks: Sequence[LogBlock], layouts: Mapping[str, tuple[Layout, ...
     return signals
 
 
-def _what_flew(blocks: Sequence[LogBlock]) -> tuple[list[str], list[str], bool]:
-    """Faults, warnings, and whether our controller flew; without its state in the log, its signals count as flown."""
-    state = next((block.variables[name] for block in blocks for name in block.variables if name == "mimo.state"), None)
-    if state is None:
-        return [], [], True
+def _what_flew(
+    blocks: Sequence[LogBlock], airborne: tuple[Interval, ...] | None
+) -> tuple[list[str], list[str], tuple[Interval, ...]]:
+    """Faults, warnings, and when our controller flew; without its state in the log, always.
+
+    Parameters
+    ----------
+    blocks : sequence of LogBlock
+    airborne : tuple of (begin, end) or None, s
+        None: not known, then in the whole log.
+    """
+    block = next((one for one in blocks if STATUS in one.variables), None)
+    if block is None:
+        return [], [], ALWAYS
+    state = block.variables[STATUS]
     if (state == ControllerState.WRONG_PERIOD).any():
-        return [NO_TORQUE], [], True
-    if (state == ControllerState.STOCK).all():
-        return [], [STOCK_FLEW], False
-    return [], [], True
+        return [NO_TORQUE], [], ALWAYS
+    # While a switch of EN waits for the ground, what flew before still flies.
+    told = np.maximum.accumulate(np.where(state != ControllerState.WAITING, np.arange(len(state)), 0))
+    state = state[told]
+    used = np.any([(a <= block.time) & (block.time <= b) for a, b in airborne or ALWAYS], axis=0)
+    if not used.any():
+        return [], [], ALWAYS
+    stock = state == ControllerState.STOCK
+    if stock[used].all():
+        return [], [STOCK_FLEW], ()
+    warnings = []
+    if stock[used].any():
+        share = _share(stock[used])
+        warnings.append(f"according to {STATUS} the stock PID flew for {share:.0f} % of the flight: not used")
+    for other, why in ANOTHER_SET.items():
+        share = _share(state[used] == other)
+        if share:
+            warnings.append(
+                f"{STATUS} is {other.value} for {share:.0f} % of the flight: {why}, and the set that was taken before "
+                "flew; give that set's values in the --spec file"
+            )
+    return [], warnings, intervals(block.time, ~stock) if stock.any() else ALWAYS
+
+
+def _share(flag: NDArray[np.bool_]) -> float:
+    """How many percent are true."""
+    return 100.0 * float(np.mean(flag))
 
 
 def _airborne(blocks: Sequence[LogBlock]) -> tuple[tuple[Interval, ...] | None, str]:
@@ -220,6 +261,8 @@ def _airborne(blocks: Sequence[LogBlock]) -> tuple[tuple[Interval, ...] | None, 
     for name, bit in FLYING:
         for block in blocks:
             if name in block.variables:
-                flying = (block.variables[name].astype(np.int64) >> bit) & 1 == 1
+                values = block.variables[name]
+                bits = np.where(np.abs(values) < 1 << 16, values, 0.0).astype(np.int64)  # text may hold anything
+                flying = (bits >> bit) & 1 == 1
                 return intervals(block.time, flying), name
     return None, ""

@@ -20,6 +20,8 @@ from mimopilot.tuning.logs.recording import INCOMPLETE
 
 #: Header line of cfclient (src/cfclient/utils/logdatawriter.py): "Timestamp", then the variables of the block.
 _CSV_HEADER = re.compile(rb"Timestamp(,\w+\.\w+)+\r?\n")
+#: Time stamps over the radio are of 24 bits (crazyflie-firmware, src/modules/src/log.c): they begin again after 4.7 h.
+_WRAP_MS, _MINUTE_MS = 2.0**24, 60e3
 #: First byte of a uSD log (crazyflie-firmware, src/deck/drivers/src/usddeck.c and tools/usdlog/cfusdlog.py).
 _MAGIC = 0xBC
 #: Version of the uSD log -> struct format of an event's number and time stamp, and the unit of that, s.
@@ -110,6 +112,8 @@ def read_cfclient_csv(path: Path) -> tuple[LogBlock, str]:
     if not rows:
         raise TuningError(f"{path}: no samples below the header line; write the log block to a file while you fly")
     table = np.array(rows).T
+    wraps = (table[0, :-1] > _WRAP_MS - _MINUTE_MS) & (table[0, 1:] < _MINUTE_MS)
+    table[0, 1:] += _WRAP_MS * np.cumsum(wraps)
     return LogBlock(path.name, 1e-3 * table[0], dict(zip(names[1:], table[1:], strict=True))), damage
 
 

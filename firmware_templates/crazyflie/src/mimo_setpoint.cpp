@@ -23,6 +23,13 @@ constexpr float kFullThrust = 65535.0F;
 
 bool position_held(const setpoint_t &setpoint) { return setpoint.mode.x != modeDisable && setpoint.mode.y != modeDisable; }
 
+// The supervisor levels a vehicle out by the modes of roll and pitch, and leaves that of the quaternion as it was.
+bool quaternion_flown(const setpoint_t &setpoint)
+{
+	return setpoint.mode.quat == modeAbs && setpoint.mode.roll == modeDisable && setpoint.mode.pitch == modeDisable
+	       && !position_held(setpoint);
+}
+
 void reset_position_controller(const state_t &state)
 {
 	positionControllerResetAllPID(state.position.x, state.position.y, state.position.z);
@@ -33,6 +40,14 @@ void load(const quaternion_t &from, float (&q)[4])
 {
 	const float xyzw[4] = {from.x, from.y, from.z, from.w};
 	attitude_from_flu(xyzw, q);
+}
+
+// The heading to hold from now on. One that is no number is not taken: it would stay after a single invalid sample.
+void hold(float heading, float &held)
+{
+	const float turn = remainderf(heading, kTurn);
+
+	if (fabsf(turn) <= kTurn) { held = turn; }
 }
 
 float along(stab_mode_t mode, float position, float velocity) { return mode == modeAbs ? position : velocity; }
@@ -48,7 +63,7 @@ bool same(const setpoint_mode_t &a, const setpoint_mode_t &b)
 void Setpoint::start(const Input &input)
 {
 	*this = Setpoint{};
-	_heading = heading(input.attitude);
+	hold(heading(input.attitude), _heading);
 }
 
 bool Setpoint::rates_flown(const setpoint_t &setpoint)
@@ -66,16 +81,16 @@ void Setpoint::update_heading(const setpoint_t &setpoint, Input &input)
 	if (setpoint.mode.yaw == modeVelocity) {
 		angles_from_legacy(yaw_left, angles);
 		input.yaw_rate_setpoint = angles[2];
-		_heading = remainderf(_heading + angles[2] * kGains.period, kTurn);
+		hold(_heading + angles[2] * kGains.period, _heading);
 
 	} else if (setpoint.mode.yaw == modeAbs) {
 		angles_from_legacy(heading_left, angles);
-		_heading = angles[2];
+		hold(angles[2], _heading);
 
 	} else if (setpoint.mode.quat == modeAbs) {
 		float q[4];
 		load(setpoint.attitudeQuaternion, q);
-		_heading = heading(q);
+		hold(heading(q), _heading);
 	}
 }
 
@@ -97,7 +112,7 @@ void Setpoint::step(const setpoint_t &setpoint, const state_t &state, uint32_t s
 					setpoint.mode.yaw == modeVelocity ? setpoint.attitudeRate.yaw : 0.0F};
 		angles_from_legacy(rates, input.rates_setpoint);
 		input.rate_mode = 1;
-		_heading = heading(input.attitude);
+		hold(heading(input.attitude), _heading);
 
 	} else {
 		input.rate_mode = 0;
@@ -109,7 +124,7 @@ void Setpoint::step(const setpoint_t &setpoint, const state_t &state, uint32_t s
 	angles_from_legacy(legacy, angles);
 	angles[2] = _heading;
 
-	if (setpoint.mode.quat == modeAbs && !position_held(setpoint)) {
+	if (quaternion_flown(setpoint)) {
 		load(setpoint.attitudeQuaternion, input.attitude_setpoint);
 
 	} else {
@@ -118,7 +133,7 @@ void Setpoint::step(const setpoint_t &setpoint, const state_t &state, uint32_t s
 
 	if (!(_thrust > 0.0F)) {
 		reset_position_controller(state);
-		_heading = heading(input.attitude);
+		hold(heading(input.attitude), _heading);
 	}
 }
 

@@ -124,6 +124,10 @@ class CrazyflieLink:
             if isinstance(message, ReadParameter | SetParameter):
                 self._send_parameter(message)
             elif isinstance(message, StoreParameters):
+                if not self._storing:  # else it is the same command, sent again
+                    self._unstored = dict.fromkeys(name for name in message.names if name not in self._unstored) | (
+                        self._unstored
+                    )
                 self._storing = True
                 self._store_next()
             elif isinstance(message, RequestMessage) and self._complete:

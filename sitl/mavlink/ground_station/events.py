@@ -216,10 +216,14 @@ class SetParameter(NamedTuple):
 
 
 class StoreParameters(NamedTuple):
-    """MAV_CMD_PREFLIGHT_STORAGE: save the parameters to non-volatile memory."""
+    """MAV_CMD_PREFLIGHT_STORAGE: save the parameters to non-volatile memory.
+
+    `names`: for a vehicle that saves one parameter after the other, those to save besides the ones that were written.
+    """
 
     system: int
     component: int
+    names: tuple[str, ...] = ()
 
 
 class SetMessageInterval(NamedTuple):

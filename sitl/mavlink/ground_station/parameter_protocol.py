@@ -218,11 +218,16 @@ class ParameterClient(VehicleLinkState):
             if any(not isinstance(m, CommandAck) and m.name in self.possible for m in answers):
                 until = self.now + quiet
 
-    def store(self) -> Exchange[str]:
+    def store(self, names: Collection[str] = ()) -> Exchange[str]:
         """Command the vehicle to save its parameters, but for ArduPilot, which saves each when it is set.
 
         ArduPilot denies the command (GCS_Common.cpp: only its erasing of all parameters is accepted). A Crazyflie saves
         nothing by itself, and one parameter after the other.
+
+        Parameters
+        ----------
+        names : collection of str
+            For a Crazyflie: what to save besides what was written, and before it.
 
         Returns
         -------
@@ -239,7 +244,7 @@ class ParameterClient(VehicleLinkState):
         while self.now < deadline and not self.closed and result == IN_PROGRESS:
             send: list[Outgoing] = []
             if self.now >= due:
-                send = [StoreParameters(self.vehicle.system, self.vehicle.component)]
+                send = [StoreParameters(self.vehicle.system, self.vehicle.component, tuple(names))]
                 self._changed_at, due = self.now, self.now + TRY_S
             for message in (yield from self.send_and_wait(send, min(due, deadline))):
                 if isinstance(message, CommandAck) and message.command == STORAGE_COMMAND:

@@ -27,10 +27,10 @@ from mimopilot.tuning.gains import Gains, Triple
 from mimopilot.tuning.law_terms import MIMO
 
 STORAGE = {
-    "acknowledged": "stored: the vehicle acknowledged it (PREFLIGHT_STORAGE)",
+    "acknowledged": "stored: the vehicle acknowledged it",
     "autosave": f"storage was not acknowledged: waited {AUTOSAVE_S:g} s, in which PX4 and ArduPilot save by themselves",
     "denied": "not stored: the vehicle refused it (PREFLIGHT_STORAGE: MAV_RESULT_DENIED)",
-    "failed": "not stored: the vehicle could not (PREFLIGHT_STORAGE: MAV_RESULT_FAILED)",
+    "failed": "not stored: the vehicle failed to (over MAVLink: MAV_RESULT_FAILED)",
     "": "the link was lost before storage was acknowledged",
 }
 #: Results of storage after which the vehicle loses the values when it restarts.
@@ -84,10 +84,10 @@ class Upload:
         """
         if self.outcome.state == "verified":
             if self.outcome.storage in UNSTORED:
-                raise SitlError(
-                    f"all values were read back, but {STORAGE[self.outcome.storage]}: it loses them when it restarts",
-                    exit_code=1,
-                )
+                later = "it loses them when it restarts"
+                if self.vehicle.autopilot in SWITCHES:  # the switch was stored as off before the set
+                    later = "when it restarts, the stock PID flies; upload again"
+                raise SitlError(f"all values were read back, but {STORAGE[self.outcome.storage]}: {later}", exit_code=1)
         elif self.outcome.state != "dry run":
             raise SitlError(_failure(self.outcome, self.held, self.snapshot, self.connect), exit_code=1)
 
@@ -143,6 +143,11 @@ def upload_and_verify(
         switch = SWITCHES.get(vehicle.vehicle.autopilot)
         if switch is not None and plan.profile == MIMO:
             held |= vehicle.run(read_values(vehicle.client, [switch.enable]))
+            if held[switch.enable] not in (0.0, 1.0):
+                raise SitlError(
+                    f"{switch.enable}: the vehicle holds {held[switch.enable]:.6g}, expected 0 or 1: it could not be "
+                    "switched back; set it by hand first"
+                )
         _check_vehicle(plan, held, vehicle, options)
         if ask_scale and gains is not None:
             check_moment_scale(gains, [held[name] for name in plan.scale], "the vehicle")

@@ -57,7 +57,7 @@ def read_values(client: ParameterClient, names: Sequence[str]) -> Exchange[dict[
 
     Raises
     ------
-    NoneHeldError
+    NoParametersError
         If the vehicle is present, but answers for none of them.
     SitlError
         If one is not answered, refused, or not a float.
@@ -90,11 +90,10 @@ def write_and_verify(
     store : bool
         False: the values are for this flight only; do not store, verify once.
     switch : SetSwitch, optional
-        Of a vehicle that takes a set as a whole; `old` has its value.
+        Of a vehicle that takes a set as a whole; `old` has its value. It is switched off and back also if no value
+        differs: what it holds need not be what it flies.
     """
     expected = {**old, **new}
-    if all(expected[name] == old[name] for name in old):
-        switch = None
     client.possible = {name: {value} for name, value in old.items()}
     client.check_contradictions(True)
     storage = ""
@@ -106,7 +105,8 @@ def write_and_verify(
     if not reason and switch is not None:
         reason = yield from _switch_back(client, switch, old[switch.enable])
     if not reason and store:
-        storage = yield from client.store()
+        # All of them: the vehicle may hold values that it has not saved, and would start with a mixture.
+        storage = yield from client.store(new)
         reason = (yield from client.wait_for_autosave()) or (yield from _verify(client, expected))
     state = "verified"
     if reason:
@@ -157,7 +157,7 @@ def _roll_back(
     yield from client.wait_until_quiet()
     storage = ""
     if store:
-        storage = yield from client.store()
+        storage = yield from client.store(new)
         yield from client.wait_for_autosave(keep_going=True)
     answers = yield from client.read(list(old), "verifying", keep_going=True)
     restored = all(answers[name].value == old[name] and client.possible[name] == {old[name]} for name in old)

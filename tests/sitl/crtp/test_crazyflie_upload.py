@@ -1,5 +1,6 @@
 """Uploads to a scripted Crazyflie, by the command: the same transaction as over MAVLink, with its faults."""
 
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -8,7 +9,7 @@ import pytest
 
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.tuning.certificate import Certificate, Verdict
-from mimopilot.tuning.crazyflie_names import STATE, crazyflie_name
+from mimopilot.tuning.crazyflie_names import STATE, ControllerState, crazyflie_name
 from mimopilot.tuning.parameters import PARAMETERS
 from tests.conftest import assert_one_clear_line
 from tests.sitl.crtp.scripted_crazyflie import ARMED, AUTO, FLYING, URI, ScriptedCrazyflie, connect
@@ -133,10 +134,26 @@ def test_a_link_that_dies_in_between_leaves_the_stock_controller_and_says_what_i
     assert held(vehicle, new) == {name: old[name] for name in new}
 
 
-def test_a_vehicle_that_does_not_store_is_no_success(mimopilot, monkeypatch, certified, old):
+def test_a_vehicle_that_does_not_store_is_no_success_and_the_next_upload_stores_all(
+    mimopilot, monkeypatch, certified, old, new
+):
     vehicle = connect(monkeypatch, ScriptedCrazyflie(old, "does not store"))
-    assert_one_clear_line(upload(mimopilot, certified), "not stored", "loses them when it restarts", code=1)
+    failed = upload(mimopilot, certified)
+    assert_one_clear_line(failed, "not stored", "when it restarts, the stock PID flies", code=1)
     assert vehicle.stored == {"mimo.EN": 0.0}
+    vehicle.fault = ""
+    again = upload(mimopilot, certified)
+    assert f"{WRITTEN} parameters verified, 0 of them written" in again.stdout
+    assert vehicle.stored == on_vehicle(new) | {"mimo.EN": 1.0}
+
+
+def test_a_vehicle_that_holds_the_set_but_flies_another_one_takes_it(mimopilot, monkeypatch, certified, old, new):
+    vehicle = connect(monkeypatch, ScriptedCrazyflie(old))
+    vehicle.values |= on_vehicle(new)
+    vehicle.update()
+    assert vehicle.values[STATE] == ControllerState.CHANGED
+    assert upload(mimopilot, certified).returncode == 0
+    assert vehicle.values[STATE] == ControllerState.FLIES
 
 
 REFUSALS = {
@@ -148,6 +165,11 @@ REFUSALS = {
     "armed by hand": (lambda v: setattr(v, "state_bits", v.state_bits & ~AUTO | ARMED), "the vehicle is armed", 1),
     "another period": (lambda v: v.values.update({"mimo.TS": 0.004}), "MIMO_TS: the vehicle has 0.004", 2),
     "another unit": (lambda v: v.values.update({"mimo.SCALE_P": 0.5}), "moment_scale: the gains are for", 2),
+    "a switch that is no number": (
+        lambda v: v.values.update({"mimo.EN": math.nan}),
+        "MIMO_EN: the vehicle holds nan",
+        2,
+    ),
     "old firmware": (lambda v: setattr(v, "protocol", 11), "version 11 of CRTP", 2),
     "silent": (
         lambda v: setattr(v, "fault", "silent"),

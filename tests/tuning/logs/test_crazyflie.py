@@ -1,5 +1,6 @@
 """Crazyflie's logs: signs and units, the reasons of refusals, damage."""
 
+import re
 import struct
 import zlib
 
@@ -111,6 +112,45 @@ def test_a_log_of_our_variables_while_the_stock_pid_flew_is_no_experiment_of_our
         read_log(written(tmp_path / "log02", usd_bytes(flight.t, wrong)))
 
 
+@pytest.fixture
+def flown_twice(flight, tmp_path):
+    """Reads a log of a flight from 2 s to 4 s after its begin, and one from 5 s on, with this state in each."""
+
+    def read(first, second, between=0):
+        since = flight.t - flight.t[0]
+        state = np.select([since < 3.9, since < 5.0], [first, between], second)
+        flying = ((since > 2.0) & (since < 4.0)) | (since > 5.0)
+        added = {"mimo.state": ("B", state), "supervisor.info": ("H", np.where(flying, 0x1F, 0x0F))}
+        return open_log(written(tmp_path / "log00", usd_bytes(flight.t, mimo_variables(flight) | added))), flight.t[0]
+
+    return read
+
+
+def test_a_flight_of_the_stock_pid_beside_one_of_ours_is_not_used(flown_twice):
+    found, begin = flown_twice(0, 1)
+    assert found.airborne == ((pytest.approx(begin + 5.0, abs=0.003), np.inf),)
+    assert found.evidence == "supervisor.info and mimo.state"
+    assert any(re.search("the stock PID flew for [34]. % of the flight", warning) for warning in found.warnings)
+
+
+@pytest.mark.parametrize(("first", "second"), [(0, 4), (0, 0)])
+def test_a_switch_that_waits_for_the_ground_does_not_fly_our_controller(flown_twice, first, second):
+    found, _ = flown_twice(first, second)
+    assert "u" not in found.signals
+    assert any("the stock PID flew, our controller gave no torque" in warning for warning in found.warnings)
+
+
+def test_a_switch_off_that_waits_for_the_ground_still_flies_our_controller(flown_twice):
+    found, _ = flown_twice(1, 4, between=1)
+    assert "u" in found.signals and not found.warnings and len(found.airborne) == 2
+
+
+@pytest.mark.parametrize(("state", "why"), [(2, "a parameter had changed since"), (3, "the parameters were refused")])
+def test_a_log_of_another_set_than_the_parameters_says_so(flown_twice, state, why):
+    found, _ = flown_twice(state, state, between=state)
+    assert any(f"mimo.state is {state} for 100 % of the flight: {why}" in warning for warning in found.warnings)
+
+
 @pytest.mark.parametrize(("name", "letter", "value"), [("supervisor.info", "H", 0x1F), ("sys.isFlying", "B", 1)])
 def test_the_time_in_the_air_is_the_supervisors(flight, tmp_path, name, letter, value):
     flying = (flight.t > 11.0) & (flight.t < 15.0)
@@ -171,6 +211,15 @@ def test_a_csv_file_that_ends_within_a_line_is_used_up_to_there_and_other_damage
     path.write_text(whole.splitlines()[0] + "\n")
     with pytest.raises(TuningError, match=r"no samples below the header line"):
         read_log(path)
+
+
+def test_time_stamps_that_begin_again_after_24_bits_go_on_and_a_status_that_is_no_number_is_no_flight(tmp_path):
+    status = ("f", np.array([0x1F, 0x1F, np.nan, 0x0F]))
+    path = write_csv_block(tmp_path / "a.csv", 16777.210 + 0.01 * np.arange(4), {"supervisor.info": status})
+    path.write_text(path.read_text().replace("16777220", "4").replace("16777230", "14").replace("16777240", "24"))
+    found = open_log(path)
+    assert found.span == pytest.approx((16777.21, 16777.24))
+    assert found.airborne == ((-np.inf, pytest.approx(16777.23)),)
 
 
 LITTLE = usd_bytes(np.arange(4) * 0.002, {"gyro.x": ("f", np.arange(4.0)), "sys.isFlying": ("B", np.ones(4, int))})

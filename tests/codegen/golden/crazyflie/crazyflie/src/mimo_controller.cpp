@@ -30,8 +30,9 @@ constexpr float kMomentScale[kAxes] = {0.0078F, 0.0075F, 0.0017F};
 
 constexpr Motors kMotors = {ARM_LENGTH, THRUST2TORQUE, THRUST_MAX};
 
-// The gains have a fixed period, and this is the firmware's, to 5 %.
-constexpr bool kPeriodKept = kGains.period * ATTITUDE_RATE > 0.95F && kGains.period * ATTITUDE_RATE < 1.05F;
+// The gains have a fixed period, and the firmware's is the same to 5 % of it.
+constexpr float kPeriods = 1.0F / (kGains.period * ATTITUDE_RATE);
+constexpr bool kPeriodKept = kPeriods > 0.95F && kPeriods < 1.05F;
 
 struct Controller {
 	State state;
@@ -47,7 +48,7 @@ struct Controller {
 
 Controller flight;
 
-// Rounded; -1 if it is no whole number of 0 to a million.
+// Rounded; -1 if it is not between 0 and a million, or no number.
 int32_t integer(float value)
 {
 	return value >= 0.0F && value <= 1.0e6F ? static_cast<int32_t>(value + 0.5F) : -1;
