@@ -48,6 +48,8 @@ MISSING = {
         "report x.ulg --out x.html",
         "tune x.ulg --out x --report x.html",
         "autotune --connect udpin:127.0.0.1:14550 --out tuned",
+        "demo --out x",
+        "reproduce numerical-example --out x",
     ),
     "pyarrow": ("campaign adam0 --out x",),
     "unicorn": ("pil my.gains.toml",),

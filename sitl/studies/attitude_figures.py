@@ -1,4 +1,4 @@
-"""Plots of the attitude studies: tracking, motor commands, gains and costs with their spread."""
+"""Figures of the attitude studies: tracking, motor commands, gains and costs with their spread."""
 
 from __future__ import annotations
 
@@ -6,34 +6,46 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from numpy.typing import NDArray
 
-from mimopilot.common.charts import AXIS_COLOURS, FIFTH, FLOWN, STYLES
+from mimopilot.common import charts
+from mimopilot.common.figures import Chart, LimitLine, Line, Panel, thinned
+from mimopilot.sitl.flight.figures import BEFORE, FROM_START, OVERVIEW_SAMPLES
 from mimopilot.sitl.flight.metrics import FIGURE_LABELS, reference_responses
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.flight.simulator import Flight
 from mimopilot.sitl.studies.attitude_run import AttitudeRun
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
 from mimopilot.sitl.studies.attitude_study import (
+    AUTOTUNE,
+    BEST,
+    DEFAULT,
     MIMO,
+    MIMO_PRINTED,
     MIMO_THESIS,
     PRINTED_KEYS,
     SISO,
+    SISO_OWN,
+    SISO_PRINTED,
     SISO_THESIS,
     AttitudeStudy,
 )
 
-#: Methods in the plots; method -> (colour, line style) and marker.
-TUNED = (SISO_THESIS, MIMO_THESIS, SISO, MIMO)
-LOOK = {
-    SISO_THESIS: ((FIFTH, ":"), "s"),
-    MIMO_THESIS: (STYLES[3], "o"),
-    SISO: (STYLES[1], "^"),
-    MIMO: (STYLES[2], "v"),
+#: Method -> colour and line style; flown, SISO and MIMO as in every report.
+LOOKS = {
+    DEFAULT: (charts.FLOWN, ":"),
+    AUTOTUNE: (charts.FIFTH, "--"),
+    SISO_THESIS: (charts.FIFTH, ":"),
+    SISO_OWN: (charts.FIFTH, "-."),
+    SISO_PRINTED: (charts.FIFTH, "-"),
+    MIMO_THESIS: (charts.FURTHER, "-."),
+    MIMO_PRINTED: (charts.FURTHER, "-"),
+    SISO: (charts.SISO, "--"),
+    MIMO: (charts.NEW, "-"),
+    BEST: (charts.FURTHER, "--"),
 }
-PRINTED = {"color": "black", "marker": "x", "markersize": 7, "markeredgewidth": 1.6, "linestyle": "none"}
+#: Methods in the time histories.
+TUNED = (SISO_THESIS, MIMO_THESIS, SISO, MIMO)
 MATRICES = {"Kp_o": "1/s", "Kp_i": "s", "Ki_i": "-", "Kd_i": "s^2"}
 ELEMENTS = ("roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
 #: Figure -> label.
@@ -42,35 +54,40 @@ COSTS = {name: FIGURE_LABELS[name] for name in ("J_M_o", "J_M_i", "J_r_o", "J_r_
 SAME_MODEL, SAME_MODEL_LABEL = "J_M_o_design", "J_M,o, MIMO's model"
 #: Percentiles at the ends of the bars.
 LOW, HIGH = 5, 95
+#: Height of a panel with one row per method: of its frame, and of a row, px.
+FRAME, ROW = 130, 22
+#: Figures over all runs; the others are of one run.
+OF_ALL_RUNS = ("gains", "costs")
+#: Height of a motor's panel, px.
+MOTOR = 170
+#: Length of the detail of the motors in an experiment, s.
+MOTOR_DETAIL = 2.0
+#: Least ratio of the largest to the least cost that is drawn on a logarithmic axis, and the room at its ends.
+DECADE, ROOM = 10.0, 1.2
+
+#: Rows of a panel: place, values of every seed, colour, marker, label.
+Row = tuple[float, NDArray[np.float64], str, str, str]
 
 
-def tracking_figure(found: AttitudeRun, study: AttitudeStudy) -> Figure:
+def tracking_chart(found: AttitudeRun, study: AttitudeStudy) -> Chart:
     """Error of angle and rate to the reference models of their setpoints, in both doublets."""
-    figure = Figure(figsize=(9, 5.5), layout="constrained")
-    panels: Any = figure.subplots(2, 2, sharex=True, sharey="row")
-    for method, (colour, style) in _lines(found):
-        for column, (axis, flight) in enumerate(zip(AXES, found.flights[method], strict=True)):
-            scenario, record = flight.scenario, flight.record
-            models = reference_responses(flight, *study.models(method, scenario.Ts))
-            shown = _shown(flight)
-            for panel, name, model in zip(panels[:, column], ("attitude", "rates"), models, strict=True):
-                line = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": method}
-                panel.plot(_time(flight)[shown], np.degrees(record[name][shown, column] - model[shown]), **line)
-            panels[0, column].set_title(f"{axis} doublet", loc="left", fontsize=10)
-            panels[1, column].set_xlabel("time from the start of the doublet [s]")
-    for panel, text in zip(panels[:, 0], ("angle - model [deg]", "rate - model [deg/s]"), strict=True):
-        panel.set_ylabel(text)
-    for panel in panels.flat:
-        panel.grid(alpha=0.3)
-        panel.axhline(0, color="black", linewidth=0.6)
-    _legend(figure, panels[0, 0])
-    figure.suptitle(f"{study.title}: measured minus reference model", x=0.02, ha="left")
-    return figure
+    panels = []
+    for place, (name, title, unit) in enumerate((("attitude", "angle", "[deg]"), ("rates", "rate", "[deg/s]"))):
+        for column, axis in enumerate(AXES):
+            lines = []
+            for method in _drawn(found):
+                flight = found.flights[method][column]
+                model = reference_responses(flight, *study.models(method, flight.scenario.Ts))[place]
+                shown = _shown(flight)
+                error = np.degrees(flight.record[name][shown, column] - model[shown])
+                lines.append(Line(_time(flight)[shown], error, method, *LOOKS[method]))
+            panels.append(Panel(f"{axis} doublet: {title} minus model", FROM_START, unit, lines))
+    return Chart(f"{study.name}-tracking", "Measured minus reference model; each method's own model.", panels)
 
 
-def _lines(found: AttitudeRun) -> list[tuple[str, Any]]:
-    """The plotted methods of a run, with their colour and line style."""
-    return [(method, line) for method, (line, _) in LOOK.items() if method in found.flights]
+def _drawn(found: AttitudeRun) -> list[str]:
+    """The methods of a run whose time histories are drawn."""
+    return [method for method in TUNED if method in found.flights]
 
 
 def _time(flight: Flight) -> NDArray[np.float64]:
@@ -79,131 +96,133 @@ def _time(flight: Flight) -> NDArray[np.float64]:
 
 
 def _shown(flight: Flight) -> NDArray[np.bool_]:
-    """Samples from 0.1 s before the doublet until one doublet length after it, (N,)."""
+    """Samples from shortly before the doublet until one doublet length after it, (N,)."""
     start, stop = flight.scenario.window
-    return np.asarray((_time(flight) >= -0.1) & (_time(flight) <= 2 * (stop - start) * flight.scenario.Ts))
+    return np.asarray((_time(flight) >= -BEFORE) & (_time(flight) <= 2 * (stop - start) * flight.scenario.Ts))
 
 
-def motors_figure(found: AttitudeRun, rotors: int, title: str) -> Figure:
+def motors_chart(found: AttitudeRun, rotors: int, name: str) -> Chart:
     """Commands of all motors in both doublets, one row of panels per motor."""
-    figure = Figure(figsize=(9, 1.5 + 1.5 * rotors), layout="constrained")
-    panels: Any = figure.subplots(rotors, 2, sharex=True, sharey=True)
-    for method, (colour, style) in _lines(found):
-        for column, flight in enumerate(found.flights[method]):
-            shown = _shown(flight)
-            for motor in range(rotors):
-                line = {"color": colour, "linestyle": style, "linewidth": 1.5, "label": method}
-                command = flight.record["commands"][shown, motor]
-                panels[motor, column].step(_time(flight)[shown], command, where="post", **line)
-    for panel in panels.flat:
-        panel.grid(alpha=0.3)
-        panel.set_ylim(-0.05, 1.05)
+    panels = []
     for motor in range(rotors):
-        panels[motor, 0].set_ylabel(f"motor {motor + 1} [-]")
-    for column, axis in enumerate(AXES):
-        panels[0, column].set_title(f"{axis} doublet", loc="left", fontsize=10)
-        panels[-1, column].set_xlabel("time from the start of the doublet [s]")
-    _legend(figure, panels[0, 0])
-    figure.suptitle(f"{title}: motor commands (thrust, 0 to 1)", x=0.02, ha="left")
-    return figure
+        for column, axis in enumerate(AXES):
+            lines = []
+            for method in _drawn(found):
+                flight = found.flights[method][column]
+                shown = _shown(flight)
+                command = flight.record["commands"][shown, motor]
+                lines.append(Line(_time(flight)[shown], command, method, *LOOKS[method], step=True))
+            title = f"{axis} doublet: motor {motor + 1}"
+            panels.append(Panel(title, FROM_START, "[-]", lines, y_range=(-0.05, 1.05), height=MOTOR + 40))
+    return Chart(f"{name}-motors", "Motor commands in the doublets (thrust, 0 to 1).", panels)
 
 
-def experiment_motors_figure(flight: Flight, rotors: int, title: str) -> Figure:
+def experiment_motors_chart(flight: Flight, rotors: int, name: str) -> Chart:
     """Commands of all motors in the experiment, with the mean of each; a detail where roll ends and pitch begins."""
-    figure = Figure(figsize=(9, 1.5 + 1.3 * rotors), layout="constrained")
-    panels: Any = figure.subplots(rotors, 2, sharex="col", sharey=True, width_ratios=[3, 2])
-    time = np.arange(len(flight.record)) * flight.scenario.Ts
+    time = np.asarray(np.arange(len(flight.record)) * flight.scenario.Ts, np.float64)
+    middle = time[-1] / 2
+    detail = (middle - MOTOR_DETAIL / 2, middle + MOTOR_DETAIL / 2)
+    near = (time >= detail[0]) & (time <= detail[1])
+    panels = []
     for motor in range(rotors):
         command = flight.record["commands"][:, motor]
-        # As in `experiment_figure`: the overview is drawn as pixels.
-        for panel, width, pixels in zip(panels[motor], (0.4, 1.2), (True, False), strict=True):
-            panel.step(time, command, where="post", color=FLOWN, linewidth=width, rasterized=pixels)
-            panel.axhline(command.mean(), color="black", linewidth=0.8)
-            panel.grid(alpha=0.3)
-        panels[motor, 0].set_ylabel(f"motor {motor + 1} [-]")
-        panels[motor, 0].set_title(f"mean {command.mean():.3f}", loc="left", fontsize=9)
-    middle = time[-1] / 2
-    for column, limits in enumerate(((time[0], time[-1]), (middle - 1.0, middle + 1.0))):
-        panels[-1, column].set_xlabel("time [s]")
-        panels[-1, column].set_xlim(*limits)
-    figure.suptitle(f"{title}: motor commands in the experiment (thrust, 0 to 1)", x=0.02, ha="left")
-    return figure
+        mean = [LimitLine(float(command.mean()), colour=charts.SETPOINT_COLOUR, dash="-")]
+        whole = [Line(*thinned(time, command, OVERVIEW_SAMPLES), colour=charts.FLOWN, width=0.8)]
+        part = [Line(time[near], command[near], colour=charts.FLOWN, width=1.3, step=True)]
+        title = f"motor {motor + 1}, mean {command.mean():.3f}"
+        span = (0.0, float(time[-1]))
+        panels += [
+            Panel(title, "time [s]", "[-]", whole, mean, x_range=span, height=MOTOR),
+            Panel(f"motor {motor + 1}, in detail", "time [s]", "[-]", part, mean, x_range=detail, height=MOTOR),
+        ]
+    caption = "Motor commands in the experiment (thrust, 0 to 1), with the mean of each."
+    return Chart(f"{name}-experiment-motors", caption, panels, linked=False)
 
 
-def gains_figure(found: StudyStatistics, printed: Mapping[str, Any], table: str) -> Figure:
+def gains_chart(found: StudyStatistics, printed: Mapping[str, Any], table: str) -> Chart:
     """Median and 5 to 95 % of every gain over the seeds; a cross marks a value printed in the thesis."""
-    figure = Figure(figsize=(9, 8.5), layout="constrained")
-    panels: Any = figure.subplots(4, 4)
-    shown = {method: look for method, look in LOOK.items() if method in found.study.methods()}
-    for row, (name, unit) in zip(panels, MATRICES.items(), strict=True):
-        for element, panel in enumerate(row):
-            for place, (method, look) in enumerate(shown.items()):
-                values = found.gains(method, name).reshape(-1, 4)[:, element]
-                _spread(panel, place, values, look, method)
-                if (key := PRINTED_KEYS.get(method, "")) in printed:
-                    value = np.ravel(printed[key][name])[element]
-                    panel.plot(place + 0.25, value, label=f"{table} as printed", **PRINTED)
-            panel.axhline(0, color="black", linewidth=0.6)
-            panel.set_xlim(-0.6, len(shown) - 0.4)
-            panel.set_xticks([])
-            panel.grid(alpha=0.3, axis="y")
-            panel.tick_params(labelsize=8)
-        row[0].set_ylabel(f"{name} [{unit}]")
-    for panel, text in zip(panels[0], ELEMENTS, strict=True):
-        panel.set_title(text, fontsize=10)
-    _legend(figure, panels[0, 0])
-    title = f"{found.study.title}: gains, median and {LOW} to {HIGH} % of {len(found.runs)} experiments"
-    figure.suptitle(title, x=0.02, ha="left")
-    return figure
+    methods = found.study.methods()[::-1]
+    panels = []
+    for name, unit in MATRICES.items():
+        for element, label in enumerate(ELEMENTS):
+            rows: list[Row] = [
+                (place, found.gains(method, name).reshape(-1, 4)[:, element], LOOKS[method][0], "o", "")
+                for place, method in enumerate(methods)
+            ]
+            crosses = {
+                float(place): float(np.ravel(printed[key][name])[element])
+                for place, method in enumerate(methods)
+                if (key := PRINTED_KEYS.get(method, "")) in printed
+            }
+            lines = [*_bars(rows, methods), *_crosses(crosses, f"{table} as printed")]
+            zero = [LimitLine(0.0, colour=charts.MODEL_COLOUR, upright=True, dash="-")]
+            panels.append(_by_method(f"{name}, {label}", f"{name} [{unit}]", lines, methods, zero))
+    caption = f"Median and {LOW} to {HIGH} % of the gains of {len(found.runs)} experiments."
+    return Chart(f"{found.study.name}-gains", caption, panels, linked=False)
 
 
-def costs_figure(
-    found: StudyStatistics, methods: Sequence[str], printed: Mapping[str, Any], axis_printed: str
-) -> Figure:
+def costs_chart(found: StudyStatistics, methods: Sequence[str], printed: Mapping[str, Any], axis_printed: str) -> Chart:
     """Median and 5 to 95 % of every cost over the seeds, by method, for roll and pitch."""
-    figure = Figure(figsize=(9, 8.5), layout="constrained")
-    panels: Any = figure.subplots(3, 2, sharey=True)
-    places = np.arange(len(methods))[::-1]
-    for panel, (name, text) in zip(panels.flat, COSTS.items(), strict=True):
-        for axis, shift, colour, marker in zip(AXES, (0.16, -0.16), AXIS_COLOURS[:2], "os", strict=True):
-            for place, method in zip(places, methods, strict=True):
-                values = found.values(method, axis, name)
-                low, middle, high = np.percentile(values, [LOW, 50, HIGH])
-                panel.plot([low, high], [place + shift] * 2, color=colour, linewidth=2.2)
-                filled = colour if axis == "roll" else "white"
-                panel.plot(
-                    middle,
-                    place + shift,
-                    marker,
-                    color=colour,
-                    markerfacecolor=filled,
-                    markersize=6,
-                    label=f"{axis} doublet",
-                )
-                flown = printed.get(PRINTED_KEYS.get(method, ""), {})
-                if axis == axis_printed and name in flown:
-                    panel.plot(flown[name], place + shift, label="printed, real flight", **PRINTED)
-        low, high = panel.dataLim.x0, panel.dataLim.x1
-        panel.set_xscale("log" if high > 10 * low else "linear")
-        panel.xaxis.set_minor_formatter(NullFormatter())
-        panel.set_xlabel(text)
-        panel.set_yticks(places, methods)
-        panel.grid(alpha=0.3, axis="x")
-        panel.tick_params(labelsize=8)
-    _legend(figure, panels[0, 0])
-    title = f"{found.study.title}: median and {LOW} to {HIGH} % of {len(found.runs)} seeds"
-    figure.suptitle(title, x=0.02, ha="left")
-    return figure
+    names, panels = list(methods)[::-1], []
+    for name, text in COSTS.items():
+        rows: list[Row] = [
+            (place + shift, found.values(method, axis, name), colour, marker, f"{axis} doublet")
+            for axis, shift, colour, marker in zip(AXES, (0.16, -0.16), charts.AXIS_COLOURS[:2], "os", strict=True)
+            for place, method in enumerate(names)
+        ]
+        side = 0.16 if axis_printed == AXES[0] else -0.16
+        crosses = {
+            place + side: float(flown[name])
+            for place, method in enumerate(names)
+            if name in (flown := printed.get(PRINTED_KEYS.get(method, ""), {}))
+        }
+        lines = [*_bars(rows, names), *_crosses(crosses, "printed, real flight")]
+        panels.append(_by_method(text.partition(" [")[0], text, lines, names, stretched=True))
+    caption = f"Median and {LOW} to {HIGH} % of the figures of {len(found.runs)} seeds."
+    return Chart(f"{found.study.name}-costs", caption, panels, linked=False)
 
 
-def _spread(panel: Any, place: float, values: NDArray[np.float64], look: Any, label: str) -> None:
-    (colour, _), marker = look
-    low, middle, high = np.percentile(values, [LOW, 50, HIGH])
-    panel.plot([place, place], [low, high], color=colour, linewidth=2.5)
-    panel.plot(place, middle, marker, color=colour, markersize=6, label=label)
+def _bars(rows: Sequence[Row], methods: Sequence[str]) -> list[Line]:
+    """A bar from `LOW` to `HIGH` and a marker at the median for each row; rows of one look are one line."""
+    lines: list[Line] = []
+    for colour, marker, label in dict.fromkeys(row[2:] for row in rows):
+        alike = [(place, values) for place, values, *look in rows if tuple(look) == (colour, marker, label)]
+        y = np.array([place for place, _ in alike])
+        # A lost flight has infinite costs, for which a plot has no place.
+        found = np.array([np.percentile(values, [LOW, 50, HIGH]) for _, values in alike])
+        found[~np.isfinite(found)] = np.nan
+        ends = np.column_stack([found[:, 0], found[:, 2], np.full(len(y), np.nan)]).ravel()
+        text = [
+            f"{methods[round(place)]}: {middle:.4g}, {LOW} to {HIGH} %: {low:.4g} to {high:.4g}"
+            for place, (low, middle, high) in zip(y, found, strict=True)
+        ]
+        lines.append(Line(ends, np.repeat(y, 3), colour=colour, width=3.0))
+        lines.append(Line(found[:, 1], y, label, colour, width=0, marker=marker, text=text))
+    return lines
 
 
-def _legend(figure: Figure, panel: Any) -> None:
-    """A legend below the figure with each label of a panel once."""
-    handles = dict(zip(*reversed(panel.get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=4, fontsize=9)
+def _crosses(values: Mapping[float, float], label: str) -> list[Line]:
+    """Printed values at the places of their methods."""
+    if not values:
+        return []
+    x, y = np.array([*values.values()]), np.array([*values])
+    return [
+        Line(x, y, label, charts.SETPOINT_COLOUR, width=0, marker="x", text=[f"{label}: {value:.4g}" for value in x])
+    ]
+
+
+def _by_method(
+    title: str,
+    label: str,
+    lines: Sequence[Line],
+    methods: Sequence[str],
+    marks: Sequence[LimitLine] = (),
+    stretched: bool = False,
+) -> Panel:
+    """A panel with a row for each method; `stretched`: logarithmic where the values need it."""
+    values = np.concatenate([line.x for line in lines])
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    log = stretched and low > 0 and high > DECADE * low
+    span = (low / ROOM, high * ROOM) if log else None
+    height = FRAME + ROW * len(methods)
+    return Panel(title, label, "", lines, marks, log_x=log, x_range=span, y_names=methods, height=height)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from mimopilot.common.chart_json import chart_from_json, chart_to_json
 from mimopilot.common.long_work import Piece
-from mimopilot.sitl.studies.attitude_report import run_pictures, study_figures, study_sections
+from mimopilot.sitl.studies.attitude_report import run_charts, study_figures, study_sections
 from mimopilot.sitl.studies.attitude_run import numbers, run
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
 from mimopilot.sitl.studies.attitude_study import AttitudeStudy
@@ -45,11 +46,12 @@ def run_once(task: tuple[AttitudeStudy, int]) -> dict[str, Any]:
     Returns
     -------
     dict
-        ``numbers``: see `sitl.studies.attitude_run.numbers`. ``pictures``: of the shown run, else empty.
+        ``numbers``: see `sitl.studies.attitude_run.numbers`. ``charts``: of the shown run, else empty.
     """
     study, seed = task
     found = run(study, seed)
-    return {"numbers": numbers(found), "pictures": run_pictures(study, found) if seed == SHOWN_SEED else {}}
+    charts = run_charts(study, found) if seed == SHOWN_SEED else []
+    return {"numbers": numbers(found), "charts": [chart_to_json(chart) for chart in charts]}
 
 
 def statistics(study: AttitudeStudy, runs: list[Any]) -> StudyStatistics:
@@ -60,4 +62,5 @@ def statistics(study: AttitudeStudy, runs: list[Any]) -> StudyStatistics:
 def study_part(study: AttitudeStudy, *runs: Any) -> dict[str, Any]:
     """A study's part of the report from all its runs, as JSON."""
     found = statistics(study, list(runs))
-    return ReportPart("", study_sections(found, runs[SHOWN_SEED]["pictures"]), study_figures(found)).as_json()
+    charts = [chart_from_json(chart) for chart in runs[SHOWN_SEED]["charts"]]
+    return ReportPart("", study_sections(found, charts), study_figures(found)).as_json()

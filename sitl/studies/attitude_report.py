@@ -2,30 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from mimopilot.common.figures import Chart
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
+from mimopilot.sitl.flight.figures import experiment_charts, manoeuvre_chart
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.sitl.studies.attitude_figures import (
     COSTS,
     ELEMENTS,
     HIGH,
+    LOOKS,
     LOW,
     MATRICES,
     SAME_MODEL,
     SAME_MODEL_LABEL,
     TUNED,
-    costs_figure,
-    experiment_motors_figure,
-    gains_figure,
-    motors_figure,
-    tracking_figure,
+    costs_chart,
+    experiment_motors_chart,
+    gains_chart,
+    motors_chart,
+    tracking_chart,
 )
 from mimopilot.sitl.studies.attitude_run import AttitudeRun
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
@@ -67,39 +69,42 @@ COST_COLUMNS = ("doublet, method", *(text.partition(" [")[0].removesuffix(", RMS
 CERTIFICATE_COLUMNS = ("method", "seeds: verdict", "Ms", "true Ms", "noise", "lost flights")
 
 
-def run_pictures(study: AttitudeStudy, found: AttitudeRun) -> dict[str, str]:
-    """Name -> SVG of every plot of one run, in the order of the report."""
+def run_charts(study: AttitudeStudy, found: AttitudeRun) -> list[Chart]:
+    """The time histories of one run, in the order of the report: of the experiment, then of the doublets."""
+    name = study.name
     inner, outer = study.models(MIMO, found.experiment.scenario.Ts)
     rotors = len(load_airframe(study.airframe).airframe.rotors)
-    plots = {"experiment": experiment_figure(found.experiment)}
-    plots |= {"experiment motors": experiment_motors_figure(found.experiment, rotors, study.title)}
+    charts = [
+        *experiment_charts(f"{name}-experiment", found.experiment),
+        experiment_motors_chart(found.experiment, rotors, name),
+    ]
     others = (DEFAULT, SISO_PRINTED, MIMO_PRINTED) if study.fitted else (DEFAULT, AUTOTUNE, MIMO, BEST)
     for key, methods in (("ours", TUNED), ("others", others)):
-        for axis, name in enumerate(AXES):
+        for axis, moved in enumerate(AXES):
             flights = {m: found.flights[m][axis] for m in methods if m in found.flights}
-            plots[f"{key} {name}"] = manoeuvre_figure(flights, inner, outer)
-    plots |= {"tracking": tracking_figure(found, study), "motors": motors_figure(found, rotors, study.title)}
-    return {name: svg(plot, f"{study.name} {name}") for name, plot in plots.items()}
+            charts.append(manoeuvre_chart(f"{name}-{key}-{moved}", flights, LOOKS, inner, outer))
+    return [*charts, tracking_chart(found, study), motors_chart(found, rotors, name)]
 
 
-def study_sections(found: StudyStatistics, pictures: Mapping[str, str]) -> list[Section]:
-    """The report sections of a study; `pictures` are those of `run_pictures`."""
+def study_sections(found: StudyStatistics, shown: Sequence[Chart]) -> list[Section]:
+    """The report sections of a study; `shown` are those of `run_charts`."""
     study, name = found.study, found.study.name
     inner, outer = study.models(MIMO, load_airframe(study.airframe).default_gains().Ts)
     _, axis, costs = study.costs_table
+    flown = [chart for chart in shown if chart.name.startswith(f"{name}-experiment")]
     limited = f", setpoint limited to {study.rate_limit_deg_s:g} degrees/s" if study.rate_limit_deg_s else ""
     return [
         Section(
             f"{name}: experiment",
             _lead(study, inner.label, outer.label),
-            figures=[picture for key, picture in pictures.items() if key.startswith("experiment")],
+            charts=flown,
         ),
         Section(
             f"{name}: gains",
             f"Medians, in brackets {LOW} to {HIGH} % of {len(found.runs)} experiments with different noise and PRBS. "
             "Kp_o in 1/s, Kp_i in s, Ki_i without unit, Kd_i in s^2.",
             [gains_table(found), *([printed_table(found)] if study.fitted else [])],
-            [svg(gains_figure(found, study.gains_table[1], study.gains_table[0]), f"{name} gains")],
+            charts=[gains_chart(found, study.gains_table[1], study.gains_table[0])],
         ),
         Section(
             f"{name}: doublets",
@@ -107,10 +112,7 @@ def study_sections(found: StudyStatistics, pictures: Mapping[str, str]) -> list[
             f"{FITTED_METHODS if study.fitted else METHODS} "
             f"{COMPARABILITY if costs else ''}",
             [costs_table(found), certificates_table(found)],
-            [
-                svg(costs_figure(found, study.methods(), costs, axis), f"{name} costs"),
-                *(picture for key, picture in pictures.items() if not key.startswith("experiment")),
-            ],
+            charts=[costs_chart(found, study.methods(), costs, axis), *shown[len(flown) :]],
         ),
     ]
 

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from mimopilot.common.charts import IS_NEW, IS_SISO, looks, svg
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.flight.figures import svg
-from mimopilot.sitl.studies.benchmark_figures import sensitivity_figure, spread_figure, step_figure
+from mimopilot.sitl.studies.benchmark_figures import sensitivity_chart, spread_figure, step_chart
 from mimopilot.sitl.studies.benchmarks import Benchmark, Signal, excitation, lv100, numerical_example
 from mimopilot.sitl.studies.report_part import ReportPart
 from mimopilot.tuning.design.refine_on_model import refine_on_model
@@ -26,6 +26,7 @@ SAMPLES = 5000  # per experiment
 IFT_SAMPLES = 1000  # per experiment of Iterative Feedback Tuning
 RUNS, LENGTHS = 500, (1000, 10_000)  # experiments of Table 5.2, and their lengths in samples
 CHUNK, WORKERS = 25, 2  # experiments simulated at once; threads
+STEP = 60  # samples of a step response
 SEEDS = 20  # experiments per design in the one-experiment comparison
 CONTROLLER_COLUMNS = ("controller", "column 1", "column 2", "J_MR", "runs")
 ONE_EXPERIMENT = "Noise variance 0.0025, amplitude 1. No method knows the plant; J_MR is computed on it."
@@ -129,11 +130,12 @@ def study_numerical_example() -> ReportPart:
     found = {"MIMO": mimo, "SISO": LoopController(diagonal, Filters(task.plant.Ts))}
     shown = _beside(found, _printed(task, "table_5_3"), "Table 5.3")
     table = ReportTable("Table 5.3: (B0 z + B1)/(z - 1), noise-free", CONTROLLER_COLUMNS, _rows(task, shown, {}))
-    figure = svg(step_figure(task, found, 60, "Steps of the numerical example: MIMO and SISO VRFT"), "steps")
+    caption = "Figure 5.3: steps of the setpoints, MIMO and SISO VRFT."
+    chart = step_chart("numerical-example-steps", caption, task, found, looks([IS_NEW, IS_SISO]), STEP)
     lead = (
         "The 2x2 numerical example of the thesis, tuned without noise: white inputs, one after the other, in open loop."
     )
-    section = Section("Table 5.3 and Figure 5.3", "J_MR: (3.1), here on the true plant.", [table], [figure])
+    section = Section("Table 5.3 and Figure 5.3", "J_MR: (3.1), here on the true plant.", [table], charts=[chart])
     return ReportPart(lead, [section], {"table_5_3": _numbers(task, shown, {})})
 
 
@@ -190,14 +192,15 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> ReportPart:
     main = {
         name: ours[name] for name in ("VRFT, instrument u_bar, W = I", "VRFT, refined on a PBSID model", "CbT", "IFT")
     }
+    colours = looks([IS_NEW] * len(main))
     sections = [
         Section(
             "Table 5.1 and Figure 5.1",
             "CbT: 8 experiments in open loop. IFT: 6 iterations. The thesis does not print the amplitude; 1 is used.",
             tables[:1],
-            [
-                svg(sensitivity_figure(task, main, "LV100: complementary sensitivity"), "sensitivity"),
-                svg(step_figure(task, main, 60, "LV100: steps of the setpoints"), "steps"),
+            charts=[
+                sensitivity_chart("lv100-sensitivity", "Figure 5.1: complementary sensitivity.", task, main, colours),
+                step_chart("lv100-steps", "Steps of the setpoints.", task, main, colours, STEP),
             ],
         ),
         Section("One experiment", ONE_EXPERIMENT, tables[1:2]),
@@ -207,7 +210,7 @@ def study_lv100(runs: int = RUNS, seeds: int = SEEDS) -> ReportPart:
             tables[2:],
             [
                 svg(
-                    spread_figure(task, found, 60, f"LV100: steps with the gains of {runs} experiments, N = {N}"),
+                    spread_figure(task, found, STEP, f"LV100: steps with the gains of {runs} experiments, N = {N}"),
                     f"spread {N}",
                 )
                 for N, found in gains.items()

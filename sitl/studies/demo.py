@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mimopilot.codegen.native import NativeController, load_native
+from mimopilot.common.charts import IS_FLOWN, IS_NEW, IS_SISO, looks
 from mimopilot.common.console import print_table, print_text
+from mimopilot.common.extras import REPORT
 from mimopilot.common.files import inside
-from mimopilot.common.html_report import ReportTable, Section, write_report
+from mimopilot.common.html_report import Headline, ReportTable, Section, write_report
 from mimopilot.common.progress import step
-from mimopilot.common.text_table import with_deviation
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.errors import SitlError
+from mimopilot.sitl.field.report.analysis.flight_data import ReportedFlight, gain_cases, read_flights
+from mimopilot.sitl.field.report.sections.gain_sets import gains_section
+from mimopilot.sitl.field.report.sections.prediction import prediction_section
+from mimopilot.sitl.field.report.sections.stability import stability_section
 from mimopilot.sitl.flight.excitation_flight import default_yaw_amplitude
-from mimopilot.sitl.flight.figures import experiment_figure, manoeuvre_figure, svg
+from mimopilot.sitl.flight.figures import experiment_charts, manoeuvre_chart
 from mimopilot.sitl.flight.flight_log import save_flight
 from mimopilot.sitl.flight.metrics import Performance, performance
 from mimopilot.sitl.flight.scenario import AXES, Scenario, doublet, excitation_flight
@@ -28,16 +33,14 @@ from mimopilot.sitl.mavlink.simulator_api.plant_process import plant_process
 from mimopilot.sitl.physics.airframe import Airframe, load_airframe
 from mimopilot.tuning.design.cascade import tune
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.logs.reader import read_log
-from mimopilot.tuning.parameters import with_unit
-from mimopilot.tuning.spec import load_spec
+from mimopilot.tuning.spec import TuningSpec, load_spec
 
 AIRFRAME = "adam0"
 #: Gain set -> its name in tables and plots.
 LABELS = {"default": "flown", "siso": "SISO", "mimo": "MIMO"}
 METHODS = tuple(LABELS)
-#: The same in the predicted figures of the set with full matrices.
-PREDICTED = {"flown": "flown", "siso": "SISO", "tuned": "MIMO"}
+#: Gain set -> its colour and line style.
+LOOKS = dict(zip(LABELS.values(), looks((IS_FLOWN, IS_SISO, IS_NEW)), strict=True))
 #: PRBS of the experiment: s per axis, amplitude (normalised torque), bandwidth (rad/s).
 SECONDS_PER_AXIS, AMPLITUDE, BANDWIDTH = 20.0, 0.15, 50.0
 DOUBLET_DEG, DOUBLET_S = 22.5, 0.42  # deg, s: the thesis' simulated doublet
@@ -45,10 +48,10 @@ DOUBLET_DEG, DOUBLET_S = 22.5, 0.42  # deg, s: the thesis' simulated doublet
 
 @dataclass(frozen=True, eq=False)
 class DemoSummary:
-    """Result of the demo: paths, gain sets, figures by axis and method, and the run time (s)."""
+    """Result of the demo: paths, figures by axis and method, the report's tables, and the run time (s)."""
 
     paths: dict[str, Path]
-    gains: dict[str, Gains]
+    tables: list[ReportTable]
     figures: dict[str, dict[str, Performance]]
     report: Path
     log: Path
@@ -85,7 +88,10 @@ def run_demo(out: Path, seed: int) -> DemoSummary:
     ------
     SitlError
         When a flight is lost, or the flight over MAVLink differs from the one in process.
+    Error
+        When plotly is not installed.
     """
+    REPORT.need()
     begin = time.monotonic()
     log, report = inside(out, "flight.ulg"), inside(out, "report.html")
     paths = {method: inside(out, f"{method}.gains.toml") for method in METHODS}
@@ -105,9 +111,11 @@ def run_demo(out: Path, seed: int) -> DemoSummary:
         save_flight(log, flight, airframe, gains["default"])
 
     with step("tuning: gains designed on the log's response, axis by axis (SISO) and with full matrices (MIMO)"):
-        experiment = read_log(log)
+        (logged,) = read_flights([log], None)
+        measured = logged.measured
+        assert measured is not None  # its own excitation can be tuned from
         for method in ("siso", "mimo"):
-            gains[method] = tune(experiment, load_spec(method=method))
+            gains[method] = tune(measured.experiment, load_spec(method=method), measured=measured)
         for method, path in paths.items():
             gains[method].save(path)
 
@@ -130,11 +138,11 @@ def run_demo(out: Path, seed: int) -> DemoSummary:
         for axis, methods in flights.items()
     }
     with step("report"):
-        _write_report(report, gains, figures, flights, flight)
+        tables = _write_report(report, gains, figures, flights, flight, logged)
     samples = len(flights["roll"]["mimo"].record)
     return DemoSummary(
         paths=paths,
-        gains=gains,
+        tables=tables,
         figures=figures,
         report=report,
         log=log,
@@ -182,37 +190,7 @@ def _check_over_mavlink(
     return len(record) * gains.Ts / elapsed
 
 
-def _gain_rows(gains: dict[str, Gains]) -> list[list[str]]:
-    rows = []
-    for name in gains["mimo"].matrices:
-        if name == "Kff_i":
-            continue  # zero in every gain set
-        for method, label in LABELS.items():
-            found = gains[method].provenance.standard_deviation
-            values = np.ravel(getattr(gains[method], name))
-            deviations = np.ravel(found[name]) if name in found else [None] * 4
-            rows.append([f"{with_unit(name)}  {label}", *map(with_deviation, values, deviations)])
-    return rows
-
-
-def _predicted_rows(gains: dict[str, Gains]) -> list[list[str]]:
-    """Predicted figures of the three sets, roll / pitch, for MIMO's attitude model."""
-    predicted = gains["mimo"].provenance.details["predicted"]
-    return [
-        [
-            label,
-            *(" / ".join(f"{value:.2f}" for value in one[name]) for name in ("follow_deg", "offaxis_deg")),
-            " / ".join(f"{value:.2f}" for value in one["disturbance_deg"]),
-            " / ".join(f"{value:.4f}" for value in one["noise"]),
-            f"{one['Ms']:.2f}",
-        ]
-        for key, label in PREDICTED.items()
-        for one in predicted[key]
-    ]
-
-
-GAIN_COLUMNS = ("gain", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch")
-PREDICTED_COLUMNS = ("set", "following [deg]", "off-axis [deg]", "after a torque [deg]", "noise of u", "Ms")
+FLOWN_CAPTION = f"Flown: doublet of {DOUBLET_DEG:g} deg, {DOUBLET_S:g} s; J in rad^2 and rad^2/s^2, (6.1)-(6.4)"
 FIGURE_COLUMNS = (
     *("doublet", "J_M,o [rad^2]", "J_r,o [rad^2]", "J_r,i [rad^2/s^2]"),
     *("off-axis peak [deg]", "off-axis RMS [deg]", "effort RMS"),
@@ -241,59 +219,65 @@ def _write_report(
     figures: dict[str, dict[str, Performance]],
     flights: dict[str, dict[str, Flight]],
     experiment: Flight,
-) -> None:
+    logged: ReportedFlight,
+) -> list[ReportTable]:
+    """Write the page; returns its tables."""
     inner, outer = gains["mimo"].reference_models(0)
     doublets = [
-        svg(manoeuvre_figure({LABELS[m]: f for m, f in methods.items()}, inner, outer), axis)
+        manoeuvre_chart(f"doublet-{axis}", {LABELS[m]: f for m, f in methods.items()}, LOOKS, inner, outer)
         for axis, methods in flights.items()
     ]
     lead = (
         "ADAM-0 with 10 % inertia coupling (class values: the thesis prints no inertia), tuned from one "
         f"{3 * SECONDS_PER_AXIS:g} s closed-loop flight without a model of the vehicle. The design finds the attitude "
         f"model that can be followed within its limits: {outer.label} (rad/s, damping, delay in samples). SISO: the "
-        "same design, axis by axis."
+        "same design, axis by axis. MIMO: with full matrices."
     )
     limits = "; ".join(gains["mimo"].provenance.details["limited_by"]) or "nothing"
+    task = TuningSpec()
+    cases = gain_cases([logged], [(LABELS[method], gains[method]) for method in ("siso", "mimo")], task)
     sections = [
         Section(
             "Experiment",
             f"PRBS torque on roll, then on pitch (amplitude {AMPLITUDE:g}, bandwidth {BANDWIDTH:g} rad/s), then on yaw "
             f"({np.abs(experiment.scenario.excitation[:, 2]).max():g}, half the bandwidth), under the flown gains.",
-            figures=[svg(experiment_figure(experiment), "experiment")],
+            charts=experiment_charts("experiment", experiment),
         ),
+        replace(gains_section(cases), text=f"MIMO is limited by: {limits}."),
+        prediction_section(cases),
+        stability_section(cases, task.certificate),
         Section(
-            "Gains",
-            "In brackets: the spread to expect if the flight were repeated (standard deviation). Kp_o in 1/s, Kp_i in "
-            f"s, Ki_i dimensionless, Kd_i in s^2. MIMO is limited by: {limits}.",
-            tables=[ReportTable("Gains: output <- error", GAIN_COLUMNS, _gain_rows(gains))],
-        ),
-        Section(
-            "Predicted from the log",
-            "Roll / pitch. RMS over doublets of 10 degrees and 0.4 to 2 s, and 1 s after: error to the attitude model "
-            "above, for all sets; angle of the other axis. RMS of the angles after a step of torque. RMS of the torque "
-            "(normalised) that noise causes at hover. Largest peak of the sensitivity, Ms.",
-            tables=[ReportTable("Predicted figures", PREDICTED_COLUMNS, _predicted_rows(gains))],
-        ),
-        Section(
-            "Doublets",
+            "Doublets flown",
             f"{DOUBLET_DEG:g} degrees, {DOUBLET_S:g} s. J in rad^2 and rad^2/s^2, over the doublet; J_M,o against the "
             "attitude model above, for all sets. The flight over MAVLink (roll, MIMO) gave the same torques bit for "
             "bit.",
-            tables=[ReportTable("Performance figures, (6.1)-(6.4)", FIGURE_COLUMNS, _figure_rows(figures))],
-            figures=doublets,
+            tables=[ReportTable(FLOWN_CAPTION, FIGURE_COLUMNS, _figure_rows(figures))],
+            charts=doublets,
         ),
     ]
-    write_report(path, "mimopilot demo", lead, sections)
+    write_report(path, "mimopilot demo", lead, sections, _headline(figures))
+    return [table for section in sections for table in section.tables]
+
+
+def _headline(figures: dict[str, dict[str, Performance]]) -> Headline:
+    """What the page shows, and what to do next."""
+    moved = {method: found.offaxis_peak_deg for method, found in figures["roll"].items()}
+    sentence = (
+        f"A doublet on roll moves pitch by {moved['mimo']:.2f} degrees with full gain matrices (MIMO), by "
+        f"{moved['siso']:.2f} degrees with the same design axis by axis (SISO), and by {moved['default']:.2f} degrees "
+        "with the gains that flew."
+    )
+    steps = (
+        "More of this flight: mimopilot report flight.ulg --gains mimo.gains.toml --out flight.html",
+        "Your own log: mimopilot inspect LOG, then mimopilot tune LOG --out my.gains.toml --report tuned.html",
+    )
+    return Headline(sentence, steps, "good" if moved["mimo"] == min(moved.values()) else "doubt")
 
 
 def print_summary(summary: DemoSummary) -> None:
     """Print the tables and the paths of all files."""
-    print_table(
-        "Gains by the design on the log's response, beside those that flew", GAIN_COLUMNS, _gain_rows(summary.gains)
-    )
-    print_table("Predicted from the log, roll / pitch", PREDICTED_COLUMNS, _predicted_rows(summary.gains))
-    title = f"Flown: doublet of {DOUBLET_DEG:g} deg, {DOUBLET_S:g} s; J in rad^2 and rad^2/s^2"
-    print_table(title, FIGURE_COLUMNS, _figure_rows(summary.figures))
+    for table in summary.tables:
+        print_table(table.caption, table.columns, table.rows)
     print_text(
         f"over MAVLink (roll, MIMO): {summary.mavlink_samples} torques, 0 differ from the flight in process; "
         f"{summary.mavlink_speed:.0f} times real time"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from mimopilot.common.chart_json import chart_from_json, chart_to_json
 from mimopilot.common.html_report import ReportTable, Section
 
 
@@ -33,13 +34,23 @@ class ReportPart:
 
     def as_json(self) -> dict[str, Any]:
         """The part as a JSON value, see `from_json`."""
-        return asdict(self)
+        sections = [
+            asdict(replace(section, charts=())) | {"charts": [chart_to_json(chart) for chart in section.charts]}
+            for section in self.sections
+        ]
+        return {"lead": self.lead, "sections": sections, "figures": self.figures}
 
     @classmethod
     def from_json(cls, value: dict[str, Any]) -> ReportPart:
         """The part from `as_json`."""
         sections = [
-            Section(**(section | {"tables": [ReportTable(**table) for table in section["tables"]]}))
+            Section(
+                **section
+                | {
+                    "tables": [ReportTable(**table) for table in section["tables"]],
+                    "charts": [chart_from_json(chart) for chart in section["charts"]],
+                }
+            )
             for section in value["sections"]
         ]
         return cls(value["lead"], sections, value["figures"])

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from mimopilot.common.extras import REPORT
 from mimopilot.common.files import inside
 from mimopilot.common.html_report import Section, write_report
 from mimopilot.common.long_work import Piece, run_pieces
 from mimopilot.common.parallel import cores
+from mimopilot.sitl.studies.attitude_figures import OF_ALL_RUNS
 from mimopilot.sitl.studies.attitude_pieces import run_name, statistics, study_pieces
 from mimopilot.sitl.studies.attitude_report import COMPARABILITY
 from mimopilot.sitl.studies.attitude_statistics import StudyStatistics
@@ -31,6 +33,11 @@ SAME_MODEL = (
     "J_M,o is against the attitude model of MIMO's design for all methods: the flown gains are compared with a model "
     "that they were not made for. The doublets of adam0-sim and adam0 saturate the motors; adam0-small is the vehicle "
     "of adam0-sim with one that does not."
+)
+
+ELSEWHERE = (
+    "The flights of a study are shown on its own page, in the file beside this one that has its name: one page of 6 MB "
+    "does not hold all of them."
 )
 
 PRINTED = (
@@ -61,8 +68,9 @@ def reproduce(name: str, out: Path, seeds: int = SEEDS, workers: int | None = No
     Raises
     ------
     Error
-        When the folder is in use, or a vehicle was lost; exit code 130 after Ctrl-C.
+        When the folder is in use, a vehicle was lost, or plotly is not installed; exit code 130 after Ctrl-C.
     """
+    REPORT.need()
     chosen = STUDIES if name == ALL else (name,)
     for study in {name, *chosen}:
         inside(out, f"{study}.html")
@@ -89,12 +97,14 @@ def _parts(chosen: Sequence[str], results: Mapping[str, Any], seeds: int) -> dic
     """The parts of a report: benchmarks, the expectations of the attitude studies, and these studies."""
     known = studies()
     own = {study: ReportPart.from_json(results[study]) for study in chosen}
+    if len(chosen) > 1:
+        own = {study: _without_flights(study, part) if study in known else part for study, part in own.items()}
     found = [
         statistics(known[study], [results[run_name(known[study], seed)] for seed in range(seeds)])
         for study in chosen
         if study in known
     ]
-    before = {"expectations": _overview(found, seeds)} if found else {}
+    before = {"expectations": _overview(found, seeds, ELSEWHERE if len(chosen) > 1 else "")} if found else {}
     return {
         **{study: part for study, part in own.items() if study not in known},
         **before,
@@ -102,8 +112,15 @@ def _parts(chosen: Sequence[str], results: Mapping[str, Any], seeds: int) -> dic
     }
 
 
-def _overview(found: Sequence[StudyStatistics], seeds: int) -> ReportPart:
-    """The expectations, and how the printed figures come out."""
+def _without_flights(study: str, part: ReportPart) -> ReportPart:
+    """A study's part for a page of several studies: with the figures of all runs, without those of one."""
+    kept = {f"{study}-{name}" for name in OF_ALL_RUNS}
+    sections = [replace(one, charts=[chart for chart in one.charts if chart.name in kept]) for one in part.sections]
+    return replace(part, sections=sections)
+
+
+def _overview(found: Sequence[StudyStatistics], seeds: int, note: str) -> ReportPart:
+    """The expectations, how the printed figures come out, and a note on the page."""
     rows = expectations([one for one in found if not one.study.fitted])
     fitted = [one for one in found if one.study.fitted]
     sections = []
@@ -114,8 +131,8 @@ def _overview(found: Sequence[StudyStatistics], seeds: int) -> ReportPart:
         sections.append(Section("Printed figures", PRINTED, [summary_table(fitted)]))
     lead = (
         "Each vehicle flies an experiment in simulation, is tuned from it by every method, and flies doublets. Its "
-        f"constants are class values, or fitted to the printed gains. {COMPARABILITY}"
-    )
+        f"constants are class values, or fitted to the printed gains. {COMPARABILITY} {note}"
+    ).rstrip()
     table = [{**asdict(row), "met": row.met} for row in rows]
     return ReportPart(lead, sections, {"seeds": seeds, "rows": table})
 

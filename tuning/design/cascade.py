@@ -160,6 +160,12 @@ def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | No
         When the log has no external signal, is too short or not excited, or when its unit of torque differs from that
         of the gains.
     """
+    return certify_around(PlantEstimates(experiment), gains, spec)
+
+
+def certify_around(measured: PlantEstimates, gains: Gains, spec: TuningSpec | None = None) -> Gains:
+    """`certify_from_log` of a log whose plant estimates are there already: several sets take them once."""
+    experiment = measured.experiment
     flown = experiment.flown.moment_scale if experiment.flown else None
     if flown and gains.moment_scale and not np.allclose(flown[:2], gains.moment_scale[:2], rtol=UNIT_TOLERANCE, atol=0):
         theirs, ours = (", ".join(f"{v:.4g}" for v in scale[:2]) for scale in (flown, gains.moment_scale))
@@ -167,4 +173,4 @@ def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | No
             f"{experiment.source}: u = 1 stands for {theirs} N m (roll, pitch), in the gains for {ours}; convert the "
             "gains (mimopilot convert), or certify them with a log of their own allocator"
         )
-    return gains.with_certificate(_certificate(gains, PlantEstimates(experiment), spec or TuningSpec()))
+    return gains.with_certificate(_certificate(gains, measured, spec or TuningSpec()))

@@ -12,10 +12,14 @@ import numpy as np
 import pytest
 
 from mimopilot.cli.studies import Study as Choice
+from mimopilot.common.charts import FLOWN, NEW
+from mimopilot.common.charts import SISO as SISO_COLOUR
 from mimopilot.common.long_work import run_pieces
 from mimopilot.common.parallel import processes
+from mimopilot.common.plotly_page import plotly_script
 from mimopilot.sitl.flight.scenario import AXES
 from mimopilot.sitl.physics.airframe import load_airframe
+from mimopilot.sitl.studies.attitude_figures import LOOKS
 from mimopilot.sitl.studies.attitude_pieces import run_name, run_once, statistics, study_part, study_pieces
 from mimopilot.sitl.studies.attitude_run import experiment
 from mimopilot.sitl.studies.attitude_study import (
@@ -34,7 +38,8 @@ from mimopilot.sitl.studies.autotune import autotune, identify_arx, minimum_vari
 from mimopilot.sitl.studies.benchmarks import TABLES
 from mimopilot.sitl.studies.expectations import expectations
 from mimopilot.sitl.studies.printed_figures import printed_figures
-from mimopilot.sitl.studies.reproduce import ALL, STUDIES, reproduce
+from mimopilot.sitl.studies.report_part import ReportPart
+from mimopilot.sitl.studies.reproduce import ALL, STUDIES, _parts, _write, reproduce
 from tests.conftest import run_here
 
 PRINTED = json.loads(TABLES.read_text())
@@ -167,10 +172,37 @@ def test_the_report_has_the_printed_figures_and_is_reproducible(results):
         assert f"{value:.4f}" in cells
     assert f"{PRINTED['adam0_flight_perturbed']['table_6_5_pitch']['SISO']['J_M_o']:.3g}" in cells
     assert "Only trends can be compared" in " ".join(section["text"] for section in part["sections"])
-    assert sum(len(section["figures"]) for section in part["sections"]) == 10
+    assert [len(section["charts"]) for section in part["sections"]] == [3, 1, 7]
+    assert not any(section["figures"] for section in part["sections"])
     study = studies()["adam0-perturbed"]
     again = study_part(study, *(results[run_name(study, seed)] for seed in range(SEEDS[study.name])))
     assert json.dumps(again) == json.dumps(part)
+
+
+def test_a_method_has_one_look_in_all_figures(results):
+    colours = {}
+    for section in ReportPart.from_json(results["coupled"]).sections:
+        for line in (line for chart in section.charts for panel in chart.panels for line in panel.lines):
+            if line.label in LOOKS:
+                colours.setdefault(line.label, set()).add((line.colour, line.dash))
+    assert colours == {method: {LOOKS[method]} for method in colours}
+    assert {DEFAULT, AUTOTUNE, SISO, MIMO, BEST} < set(colours)
+    assert [LOOKS[method][0] for method in (DEFAULT, SISO, MIMO)] == [FLOWN, SISO_COLOUR, NEW]
+
+
+def test_a_page_of_several_studies_names_the_pages_with_the_flights_and_keeps_below_6_mb(results, tmp_path):
+    parts = _parts(OURS, results, 2)
+    names = [chart.name for part in parts.values() for section in part.sections for chart in section.charts]
+    assert names == [f"{study}-{figure}" for study in OURS for figure in ("gains", "costs")]
+    assert "file beside this one" in parts["expectations"].lead
+    alone = _write(tmp_path, "coupled", _parts(["coupled"], results, 2)).report
+    assert "coupled-ours-roll-0" in alone.read_text()
+    assert "file beside this one" not in alone.read_text()
+    together = _write(tmp_path, ALL, parts).report
+    assert together.stat().st_size < alone.stat().st_size < 6_000_000
+    # All ten studies: plotly.js once, and ten times what one adds.
+    bare = len(plotly_script())
+    assert bare + len(STUDIES) * (together.stat().st_size - bare) / len(OURS) < 6_000_000
 
 
 def gains_of(statistics):

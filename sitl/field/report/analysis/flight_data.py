@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mimopilot.common.charts import INJECTED, IS_FLOWN, IS_NEW, IS_SISO, LIMIT, looks
 from mimopilot.common.figures import MOST_SAMPLES
 from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals, further_signals
-from mimopilot.tuning.design.cascade import certify_from_log
+from mimopilot.tuning.design.cascade import certify_around
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
@@ -324,6 +324,6 @@ def _examined(case: GainCase, spec: TuningSpec) -> GainCase:
     if case.flight.measured is None:
         return replace(case, problem=case.flight.why_not)
     try:
-        return replace(case, gains=certify_from_log(case.flight.measured.experiment, case.gains, spec))
+        return replace(case, gains=certify_around(case.flight.measured, case.gains, spec))
     except TuningError as error:
         return replace(case, problem=str(error))

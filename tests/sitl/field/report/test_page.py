@@ -16,6 +16,7 @@ from mimopilot.sitl.field.report.analysis.flight_data import PHASES, ReportedFli
 from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals
 from mimopilot.sitl.field.report.flight_report import MOST_LOGS, make_report
 from mimopilot.sitl.field.report.sections.timeline import contents_section, timeline_section
+from mimopilot.sitl.studies.reproduce import reproduce
 from mimopilot.tuning.logs.inspection import Inspection
 from mimopilot.tuning.logs.recording import Recording
 from mimopilot.tuning.logs.resample import Series
@@ -48,6 +49,7 @@ def folder(bench, tmp_path_factory):
     columns = table(make_flight(seconds=30.0, Ts=0.02))
     write_csv(path / "slow.csv", {name: columns[name] for name in ("t", "roll", "pitch", "roll_sp", "pitch_sp")})
     mp.report(path / "slow.csv", path / "slow.html", figures=path / "pictures")
+    reproduce("numerical-example", path)
     return path
 
 
@@ -57,9 +59,13 @@ def browser(tmp_path_factory):
         yield found
 
 
-@pytest.mark.parametrize("page", ["flight", "slow"])
+@pytest.mark.parametrize(
+    ("page", "wanted"),
+    [("flight", HEADINGS), ("slow", HEADINGS), ("numerical-example", ("Table 5.3 and Figure 5.3",))],
+    ids=["flight", "slow", "study"],
+)
 @pytest.mark.parametrize("width", [1280, 390])
-def test_a_page_draws_all_its_figures_without_error_request_or_sideways_scroll(folder, browser, page, width):
+def test_a_page_draws_all_its_figures_without_error_request_or_sideways_scroll(folder, browser, page, wanted, width):
     browser.errors.clear()
     browser.requests.clear()
     path = folder / f"{page}.html"
@@ -67,7 +73,7 @@ def test_a_page_draws_all_its_figures_without_error_request_or_sideways_scroll(f
     panels = int(browser.value("document.querySelectorAll('.panel').length"))
     assert panels == int(browser.value("document.documentElement.dataset.drawn"))
     drawn = browser.value("[...document.querySelectorAll('.panel .js-plotly-plot')].filter(p => p.data.length).length")
-    assert drawn == panels > 5
+    assert drawn == panels > 3
     assert browser.value("document.querySelectorAll('.panel path.js-line, .panel .heatmaplayer image').length") > panels
     assert browser.value("document.documentElement.scrollWidth") <= width
     widest = "Math.max(...[...document.querySelectorAll('.panel')].map(p => p.getBoundingClientRect().right))"
@@ -75,7 +81,7 @@ def test_a_page_draws_all_its_figures_without_error_request_or_sideways_scroll(f
     assert browser.errors == []
     assert {address for address in browser.requests if not address.startswith("data:")} == {path.resolve().as_uri()}
     headings = json.loads(browser.value("JSON.stringify([...document.querySelectorAll('h2')].map(h => h.textContent))"))
-    assert [heading for heading in headings if heading in HEADINGS] == list(HEADINGS)
+    assert [heading for heading in headings if heading in wanted] == list(wanted)
 
 
 def test_zooming_a_panel_zooms_those_beside_it(folder, browser):
