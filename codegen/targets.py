@@ -42,6 +42,8 @@ class Target:
         Control rates that the vehicle can run, Hz; empty: any.
     rate_source : str
         What sets the rate on the vehicle.
+    shaped_setpoints : bool
+        Whether the autopilot shapes the attitude setpoints and gives their rate (ArduPilot's input shaping).
     """
 
     name: str
@@ -53,6 +55,7 @@ class Target:
     options: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     rates: tuple[float, ...] = ()
     rate_source: str = ""
+    shaped_setpoints: bool = False
 
     def rate(self, gains: Gains) -> float:
         """The vehicle's control rate that is nearest to that of the gains, Hz."""
@@ -67,6 +70,16 @@ class Target:
             f"Ts: the gains are for {rate:.4g} Hz, but {self.name} runs the controller at {self.rate_source}, "
             f"{', '.join(f'{hertz:g}' for hertz in self.rates)} Hz, and the emitted code refuses to start; carry the "
             f"gains to that rate: mimopilot certify LOG --gains FILE --rate {nearest:g}"
+        )
+
+    def shaping_warning(self, gains: Gains) -> str:
+        """What to do about gains designed for shaped setpoints that the vehicle does not shape; empty if it does."""
+        if not gains.filters.shaping_s or self.shaped_setpoints or not self.rates:
+            return ""
+        return (
+            f"shaping_s: the gains are designed for setpoints as ArduPilot shapes them, with their rate fed forward; "
+            f"{self.name} does neither, so the vehicle follows less well than predicted; stability is the same; for "
+            f"gains of its own tune from a log of {self.name}"
         )
 
     def chosen(self, options: Mapping[str, str]) -> dict[str, str]:

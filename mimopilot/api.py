@@ -409,7 +409,7 @@ def generate(
     from mimopilot.tuning.acceptance import check_verdict
 
     loaded, chosen = _gains(gains), find_target(target)
-    warnings = [check_verdict(loaded, allow=uncertified), chosen.rate_warning(loaded)]
+    warnings = [check_verdict(loaded, allow=uncertified), chosen.rate_warning(loaded), chosen.shaping_warning(loaded)]
     files = render(loaded, target, **options)
     written = write_tree(files, Path(out), force)
     return GeneratedTree(

@@ -269,6 +269,13 @@ def test_a_name_that_is_invalid_on_a_vehicle_is_refused(gains, monkeypatch, name
         render(gains)
 
 
+def test_gains_for_shaped_setpoints_are_emitted_for_others_with_a_warning(gains):
+    shaped = dataclasses.replace(gains, filters=dataclasses.replace(gains.filters, shaping_s=0.15))
+    warned = {name for name, target in targets().items() if target.shaping_warning(shaped)}
+    assert warned == {"px4", "crazyflie"}
+    assert not any(target.shaping_warning(gains) for target in targets().values())
+
+
 def test_an_unknown_target_is_refused(gains):
     with pytest.raises(CodegenError, match=f"expected one of {', '.join(sorted(targets()))}$"):
         render(gains, "unknown")
