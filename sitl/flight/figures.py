@@ -77,8 +77,8 @@ def experiment_figure(flight: Flight, zoom_s: float = 3.0) -> Figure:
     figure = Figure(figsize=(9, 7), layout="constrained")
     panels: Any = figure.subplots(4, 2, sharex="col", sharey="row", width_ratios=[3, 2])
     signals = (
-        ("injected torque (norm.)", record["excitation"]),
-        ("total torque u (norm.)", record["moment"]),
+        ("injected torque", record["excitation"]),
+        ("total torque u", record["moment"]),
         ("body rate [deg/s]", np.degrees(record["rates"])),
         ("angle [deg]", np.degrees(record["attitude"])),
     )
