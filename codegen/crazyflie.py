@@ -54,8 +54,8 @@ def context(gains: Gains) -> dict[str, Any]:
     """
     if gains.moment_scale is None:
         raise CodegenError(
-            "moment_scale: the gains have none, and the Crazyflie's firmware takes torques in N m; write the N m of "
-            "u = 1 on roll, pitch and yaw into the gains file (moment_scale = [...]), as it was when they were tuned"
+            "moment_scale: the gains have none, and the Crazyflie's firmware takes torques in N m; tune again with "
+            "--spec FILE, where FILE says moment_scale = [...]: the N m of u = 1 on roll, pitch and yaw"
         )
     values = gains.elements() | {p.code: gains.identity()[p.name] for p in IDENTITY}
     return {

@@ -68,8 +68,8 @@ class Target:
             return ""
         return (
             f"Ts: the gains are for {rate:.4g} Hz, but {self.name} runs the controller at {self.rate_source}, "
-            f"{', '.join(f'{hertz:g}' for hertz in self.rates)} Hz, and the emitted code refuses to start; carry the "
-            f"gains to that rate: mimopilot certify LOG --gains FILE --rate {nearest:g}"
+            f"{', '.join(f'{hertz:g}' for hertz in self.rates)} Hz, where the emitted code refuses to "
+            f"start; carry the gains to that rate: mimopilot certify LOG --gains FILE --rate {nearest:g} --out NEW"
         )
 
     def shaping_warning(self, gains: Gains) -> str:

@@ -26,7 +26,7 @@ def register(app: typer.Typer) -> None:
     app.command(
         epilog="Example: mimopilot sitl adam0 --gains my.gains.toml, then mavproxy.py --master=udp:127.0.0.1:14550"
     )(sitl)
-    app.command(epilog="Example: mimopilot plant adam0 --port 4560")(plant)
+    app.command(epilog="Example: mimopilot plant adam0; mimopilot plant adam0 --protocol ardupilot-json")(plant)
 
 
 def sitl(

@@ -42,7 +42,8 @@ def headline(flights: Sequence[ReportedFlight], cases: Sequence[GainCase]) -> He
     assert certificate is not None
     name = "The gains that flew" if case.flown and len(flights) == 1 else f"The gains '{case.label}'"
     if certificate.verdict in ACCEPTED:
-        margins = f"Ms {certificate.figures['Ms']:.2f}, phase margin {least_phase(certificate):.0f} degrees or more"
+        phase = least_phase(certificate) // 1  # "or more": rounded down
+        margins = f"Ms {certificate.figures['Ms']:.2f}, phase margin {phase:.0f} degrees or more"
         sentence = f"{before}{name} are {certificate.verdict} on this vehicle: {margins}."
     else:
         sentence = f"{before}{name} are {certificate.verdict}: {certificate.reason}."
