@@ -236,6 +236,11 @@ def _check_ours(files: dict[str, str], folder: Path) -> None:
         ours = set()
     if not ours:
         raise CodegenError(f"{folder}: holds files that mimopilot did not generate; {hint}")
+    others = [name for name in sorted(ours - files.keys()) if (folder / name).is_file()]
+    if others and manifest.get("target") != json.loads(files[MANIFEST])["target"]:
+        raise CodegenError(
+            f"{folder}: holds target {manifest.get('target')}, whose {others[0]} would stay with other gains; {hint}"
+        )
     for name in sorted(files.keys() - ours):
         if (folder / name).exists():
             raise CodegenError(f"{folder / name}: mimopilot did not generate it; {hint}")

@@ -2,10 +2,37 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from mimopilot.tuning.certificate import ACCEPTED, DEFAULT_THRESHOLDS, Verdict
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains import Gains, Triple
 from mimopilot.tuning.parameters import PARAMETERS
+
+#: Largest relative difference between two statements of one unit of torque: rounding in files.
+UNIT_TOLERANCE = 0.01
+
+
+def check_unit(source: str, stated: Triple | None, other: Triple | None, advice: str) -> None:
+    """Refuse two different units of torque (roll, pitch) of one vehicle.
+
+    Parameters
+    ----------
+    source : str
+        What states the first, for the message.
+    stated, other : tuple of 3 float or None, N m
+        Torque of u = 1; None: unknown.
+    advice : str
+        What to do.
+
+    Raises
+    ------
+    TuningError
+        With both.
+    """
+    if stated and other and not np.allclose(stated[:2], other[:2], rtol=UNIT_TOLERANCE, atol=0):
+        first, second = (", ".join(f"{v:.4g}" for v in scale[:2]) for scale in (stated, other))
+        raise TuningError(f"{source}: u = 1 stands for {first} N m (roll, pitch), not for {second}; {advice}")
 
 
 def check_ranges(gains: Gains) -> None:

@@ -169,7 +169,7 @@ def tune(
 
 def print_comparison(gains: Gains, logs: list[str]) -> None:
     """Predicted figures of a designed set beside those of the flown gains, and the conclusion."""
-    from mimopilot.tuning.design.prediction_rows import PREDICTED, predicted_rows
+    from mimopilot.tuning.design.prediction_rows import PREDICTED, predicted_rows, softer
 
     details = gains.provenance.details
     if "predicted" not in details or gains.provenance.outer_model is None:
@@ -180,6 +180,8 @@ def print_comparison(gains: Gains, logs: list[str]) -> None:
         print_text(
             "better than the gains that flew: in following and on the other axis, within the limits of Ms and noise"
         )
+        if trade_off := softer(gains):
+            print_text(trade_off)
     worth = details.get("worth_of_off_diagonals", {})
     for before, after in zip(worth.get("tuned", ()), worth.get("module", ()), strict=True):
         print_text(

@@ -98,6 +98,21 @@ def test_another_target_is_added_to_a_generated_tree_and_foreign_files_stay(gain
     assert read_tree(tmp_path) == render(gains, "px4") | {"notes.txt": "keep"}
 
 
+def test_one_folder_holds_one_target_so_that_no_file_stays_with_other_gains(gains, tmp_path):
+    write_tree(render(gains, "px4"), tmp_path)
+    before = read_tree(tmp_path)
+    with pytest.raises(CodegenError, match=r"holds target px4, whose .*px4/.* would stay with other gains; .*--out"):
+        write_tree(render(gains, "ardupilot"), tmp_path)
+    assert read_tree(tmp_path) == before
+    # What an older version emitted for the same target may stay.
+    manifest = json.loads(before["manifest.json"])
+    manifest["files"]["px4/old.cpp"] = ""
+    (tmp_path / "px4/old.cpp").write_text("old")
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    write_tree(render(gains, "px4"), tmp_path)
+    assert read_tree(tmp_path) == before | {"px4/old.cpp": "old"}
+
+
 @pytest.mark.parametrize("taken", ["core", "manifest.json", "native/Makefile"])
 def test_nothing_is_written_when_a_path_is_taken(gains, tmp_path, taken):
     blocked = tmp_path / "x" / taken

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mimopilot.tuning.acceptance import check_unit
 from mimopilot.tuning.analysis.certify_axes import certify_axes
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.quality_checks import check_saturation
@@ -24,8 +25,6 @@ from mimopilot.tuning.spec import TuningSpec
 
 #: Details of a gain set's origin that hold for the control rate of its log only.
 OF_ONE_RATE = ("predicted", "better_than_flown", "keep_flown", "limited_by")
-#: Largest relative difference between the units of torque of a log and of a gain set: rounding in files.
-UNIT_TOLERANCE = 0.01
 
 
 def tune(
@@ -111,8 +110,7 @@ def _check_one_vehicle(flights: Sequence[Experiment]) -> None:
         if abs(other.Ts / first.Ts - 1) > SAME_PERIOD:
             raise TuningError(f"{other.source}: sampled every {other.Ts:g} s, {first.source} every {first.Ts:g} s")
         ours, theirs = (one.flown.moment_scale if one.flown else None for one in (first, other))
-        if ours and theirs and not np.allclose(ours[:2], theirs[:2], rtol=UNIT_TOLERANCE, atol=0):
-            raise TuningError(f"{other.source}: u = 1 is another torque than in {first.source}; not the same allocator")
+        check_unit(other.source, theirs, ours, f"that is {first.source}'s unit: not the same allocator")
 
 
 def _certificate(gains: Gains, measured: PlantEstimates, spec: TuningSpec) -> Certificate:
@@ -166,11 +164,10 @@ def certify_from_log(experiment: Experiment, gains: Gains, spec: TuningSpec | No
 def certify_around(measured: PlantEstimates, gains: Gains, spec: TuningSpec | None = None) -> Gains:
     """`certify_from_log` of a log whose plant estimates are there already: several sets take them once."""
     experiment = measured.experiment
-    flown = experiment.flown.moment_scale if experiment.flown else None
-    if flown and gains.moment_scale and not np.allclose(flown[:2], gains.moment_scale[:2], rtol=UNIT_TOLERANCE, atol=0):
-        theirs, ours = (", ".join(f"{v:.4g}" for v in scale[:2]) for scale in (flown, gains.moment_scale))
-        raise TuningError(
-            f"{experiment.source}: u = 1 stands for {theirs} N m (roll, pitch), in the gains for {ours}; convert the "
-            "gains (mimopilot convert), or certify them with a log of their own allocator"
-        )
+    check_unit(
+        experiment.source,
+        experiment.flown.moment_scale if experiment.flown else None,
+        gains.moment_scale,
+        "convert the gains (mimopilot convert), or certify them with a log of their own allocator",
+    )
     return gains.with_certificate(_certificate(gains, measured, spec or TuningSpec()))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mimopilot.tuning.acceptance import check_unit
 from mimopilot.tuning.design.positive_integral import with_positive_integral
 from mimopilot.tuning.errors import NotMinimumPhaseError, TuningError
 from mimopilot.tuning.estimation.instrumental_variables import (
@@ -221,9 +222,14 @@ def starting_set(experiment: Experiment, spec: TuningSpec) -> Gains:
     Raises
     ------
     TuningError
-        When neither the log nor the specification says what the yaw gains or the derivative's filter are.
+        When neither the log nor the specification says what the yaw gains or the derivative's filter are, or they
+        say different units of torque.
     """
     flown = experiment.flown
+    if flown is not None:
+        check_unit(
+            experiment.source, flown.moment_scale, spec.moment_scale, "leave moment_scale out of the --spec file"
+        )
     if flown is not None and spec.profile == MIMO:
         flown = flown.for_our_law()
     required = {

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from mimopilot.tuning.design.disturbance_limit import ROOM
 from mimopilot.tuning.gains import Gains
 
 #: Columns of `predicted_rows`; without the first one, those of `prediction_cells`.
@@ -22,6 +25,17 @@ def predicted_rows(gains: Gains, logs: Sequence[str]) -> list[list[str]]:
         for name, shown in SETS.items()
         if name in predicted
     ]
+
+
+def softer(gains: Gains) -> str:
+    """How much farther a step of torque moves the vehicle than with the flown gains; empty: no farther, to `ROOM`."""
+    predicted = gains.provenance.details.get("predicted", {})
+    for new, flown in zip(predicted.get("tuned", ()), predicted.get("flown", ()), strict=True):
+        after, before = (float(np.linalg.norm(one["disturbance_deg"])) for one in (new, flown))
+        if after > ROOM * before:
+            flown_text = f"flown {before:.2f}, at Ms {flown['Ms']:.2f}"
+            return f"but a step of torque moves it farther ({after:.2f} degrees; {flown_text})"
+    return ""
 
 
 def prediction_cells(figures: Mapping[str, Any]) -> list[str]:

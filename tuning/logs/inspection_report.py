@@ -75,7 +75,7 @@ def print_inspection(found: Inspection) -> None:
     if found.airborne is not None:
         print_text(f"airborne: {sum(b - a for a, b in found.airborne):.1f} s by {recording.evidence}")
     if found.parts:
-        print_text("used: " + ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.parts))
+        print_text("used for roll and pitch: " + ", ".join(f"{begin:.1f} to {end:.1f} s" for begin, end in found.parts))
     if experiment is not None:
         count = len(experiment.segments)
         print_text(

@@ -263,7 +263,7 @@ def test_any_edit_voids_the_certificate(flights, tmp_path, edit):
 def test_a_log_with_another_unit_of_torque_is_refused(flights):
     log = flights["adam0"][0]
     other_unit = dataclasses.replace(log.flown, moment_scale=(25.0, 25.0, 2.7))
-    with pytest.raises(TuningError, match=r"u = 1 stands for 2\.546, 2\.546 N m .* in the gains for 25, 25"):
+    with pytest.raises(TuningError, match=r"u = 1 stands for 2\.546, 2\.546 N m .* not for 25, 25; convert"):
         certify_from_log(log, other_unit)
     assert dataclasses.replace(log.flown, certificate=None).verdict()[0] == "none"
 

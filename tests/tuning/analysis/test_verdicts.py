@@ -17,7 +17,7 @@ from mimopilot.tuning.gains import gains_to_toml
 from mimopilot.tuning.gains_file import gains_from_toml
 from mimopilot.tuning.plant.frequency_response import DRAWS
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
-from mimopilot.tuning.spec import TuningSpec
+from mimopilot.tuning.spec import TuningSpec, load_spec
 from mimopilot.tuning.statespace import StateSpace
 from tests.tuning.analysis.loops import (
     MODELS,
@@ -230,8 +230,10 @@ def test_a_gains_file_keeps_the_verdict_and_its_thresholds():
     assert dataclasses.replace(tuned, certificate=None).verdict()[0] == "none"
     other_unit = dataclasses.replace(tuned, moment_scale=(25.0, 25.0, 2.7))
     assert other_unit.verdict()[0] == "void"
-    with pytest.raises(TuningError, match=r"u = 1 stands for 2\.546, 2\.546 N m .* in the gains for 25, 25"):
+    with pytest.raises(TuningError, match=r"u = 1 stands for 2\.546, 2\.546 N m .* not for 25, 25; convert"):
         certify_from_log(log, other_unit)
+    with pytest.raises(TuningError, match=r"u = 1 stands for 2\.546, 2\.546 N m .* leave moment_scale out"):
+        tune(log, load_spec(moment_scale=(0.01, 0.01, 0.002)))
 
 
 def test_gains_that_the_log_makes_unstable_are_not_written():
