@@ -19,7 +19,7 @@ from mimopilot.codegen.targets import TEMPLATES
 from mimopilot.codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
 from mimopilot.common.cache import cache_folder
 from mimopilot.common.files import inside, seal, sha256, unseal, write_atomically
-from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.gains import Gains, gains_to_toml
 
 HEADER = TEMPLATES / "native" / "mimo_pid_native.h"
 SOURCES = ("core/mimo_pid.cpp", "native/mimo_pid_native.cpp")
@@ -36,6 +36,10 @@ LAYOUT = (
     OUTPUT.fields["fault"][1],  # type: ignore[index]
     STATE.fields["integral"][1],  # type: ignore[index]
 )
+
+
+#: Gains, compiler, flags and cache folder -> library that this process built or found: a flight needs no rendering.
+_BUILT: dict[tuple[str, str, tuple[str, ...], Path], Path] = {}
 
 
 def build_native(gains: Gains, folder: Path | None = None) -> Path:
@@ -59,8 +63,11 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
     CodegenError
         If there is no compiler or it fails, or the folder holds files that were not generated.
     """
-    files = render(gains, "native")
     compiler = find_compiler()
+    known = (gains_to_toml(gains), compiler, CXX_FLAGS, cache_folder())
+    if folder is None and known in _BUILT and _whole(_BUILT[known]):
+        return _BUILT[known]
+    files = render(gains, "native")
     sources = "".join(
         f"{name}\0{content}\0" for name, content in files.items() if name.startswith(("core/", "native/"))
     )
@@ -77,6 +84,8 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
             write_tree(files, tree)
             compile_shared(compiler, [tree / source for source in SOURCES], tree / name)
             write_atomically(library, seal((tree / name).read_bytes(), name))  # the loader ignores appended bytes
+    if folder is None:
+        _BUILT[known] = library
     return library
 
 

@@ -7,6 +7,7 @@ import json
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
+from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -82,12 +83,7 @@ def render(gains: Gains, target: str = "native", **options: str) -> dict[str, st
     chosen = kind.chosen(options)
     check_names()
     check_ranges(gains)
-    environment = jinja2.Environment(
-        undefined=jinja2.StrictUndefined,
-        keep_trailing_newline=True,
-        autoescape=False,
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-    )
+    environment = _environment(TEMPLATES)
     context = _context(gains, kind) | chosen
     for name in CONTEXTS.keys() & set(kind.folders):
         context |= CONTEXTS[name](gains)
@@ -104,6 +100,17 @@ def render(gains: Gains, target: str = "native", **options: str) -> dict[str, st
                 files[name] = path.read_text()
     files[MANIFEST] = _manifest(files, gains, target)
     return dict(sorted(files.items()))
+
+
+@lru_cache(maxsize=1)
+def _environment(templates: Path) -> jinja2.Environment:
+    """Keeps the compiled templates; a changed file is read again."""
+    return jinja2.Environment(
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+        autoescape=False,
+        loader=jinja2.FileSystemLoader(templates),
+    )
 
 
 def _context(gains: Gains, target: Target) -> dict[str, Any]:
