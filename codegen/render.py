@@ -218,9 +218,9 @@ def write_tree(files: dict[str, str], folder: Path, force: bool = False) -> list
         If a file's place is taken or not writable, or, without `force`, holds something that mimopilot did not
         generate. In all cases nothing has been written.
     """
-    paths = [inside(folder, name) for name in files]
+    paths = [inside(folder, name) for name in files]  # before anything in the folder is read
     if not force:
-        _check_ours(files, folder)
+        files = _checked(files, folder)
     for path in paths:
         if path.exists() and not path.is_file():
             kind = "a folder" if path.is_dir() else "a device or a pipe"
@@ -231,10 +231,13 @@ def write_tree(files: dict[str, str], folder: Path, force: bool = False) -> list
     return [name for path, (name, content) in zip(paths, files.items(), strict=True) if write_atomically(path, content)]
 
 
-def _check_ours(files: dict[str, str], folder: Path) -> None:
-    """Refuse a folder without a mimopilot manifest, and a file that the manifest does not list."""
+def _checked(files: dict[str, str], folder: Path) -> dict[str, str]:
+    """The files, their manifest with those of other targets of the same gains in the folder.
+
+    Refuses a folder without a mimopilot manifest, a file that the manifest does not list, and other gains.
+    """
     if not folder.is_dir() or not any(folder.iterdir()):
-        return
+        return files
     hint = "give --out another folder, or --force to write anyway"
     try:
         manifest = json.loads(read_text(folder / MANIFEST, "manifest"))
@@ -243,11 +246,14 @@ def _check_ours(files: dict[str, str], folder: Path) -> None:
         ours = set()
     if not ours:
         raise CodegenError(f"{folder}: holds files that mimopilot did not generate; {hint}")
-    others = [name for name in sorted(ours - files.keys()) if (folder / name).is_file()]
-    if others and manifest.get("target") != json.loads(files[MANIFEST])["target"]:
-        raise CodegenError(
-            f"{folder}: holds target {manifest.get('target')}, whose {others[0]} would stay with other gains; {hint}"
-        )
+    new = json.loads(files[MANIFEST])
+    places = find_target(new["target"]).folders
+    others = sorted(name for name in ours - files.keys() if "/" in name and name.split("/")[0] not in places)
+    if others and manifest.get("gains_sha256") != new["gains_sha256"]:
+        raise CodegenError(f"{folder}: holds {others[0]} of another target, which would stay with other gains; {hint}")
+    new["files"] = dict(sorted((new["files"] | {name: manifest["files"][name] for name in others}).items()))
+    manifest_text = json.dumps(new, indent=2) + "\n"
     for name in sorted(files.keys() - ours):
         if (folder / name).exists():
             raise CodegenError(f"{folder / name}: mimopilot did not generate it; {hint}")
+    return files | {MANIFEST: manifest_text}

@@ -98,19 +98,32 @@ def test_another_target_is_added_to_a_generated_tree_and_foreign_files_stay(gain
     assert read_tree(tmp_path) == render(gains, "px4") | {"notes.txt": "keep"}
 
 
-def test_one_folder_holds_one_target_so_that_no_file_stays_with_other_gains(gains, tmp_path):
+def test_targets_share_a_folder_only_with_the_same_gains(gains, tmp_path):
     write_tree(render(gains, "px4"), tmp_path)
     before = read_tree(tmp_path)
-    with pytest.raises(CodegenError, match=r"holds target px4, whose .*px4/.* would stay with other gains; .*--out"):
-        write_tree(render(gains, "ardupilot"), tmp_path)
+    other = gains.with_elements({"RP_RR": 0.2})
+    for target in ("ardupilot", "native"):
+        with pytest.raises(CodegenError, match=r"holds px4/.* of another target, which would stay with other gains"):
+            write_tree(render(other, target), tmp_path)
     assert read_tree(tmp_path) == before
-    # What an older version emitted for the same target may stay.
+    write_tree(render(gains, "ardupilot"), tmp_path)
+    both = read_tree(tmp_path)
+    assert set(json.loads(both["manifest.json"])["files"]) == both.keys() - {"manifest.json"}
+    with pytest.raises(CodegenError, match="of another target"):
+        write_tree(render(other, "px4"), tmp_path)
+    assert read_tree(tmp_path) == both
+
+
+def test_what_an_older_version_emitted_for_the_target_may_stay(gains, tmp_path):
+    write_tree(render(gains, "px4"), tmp_path)
+    before = read_tree(tmp_path)
     manifest = json.loads(before["manifest.json"])
     manifest["files"]["px4/old.cpp"] = ""
     (tmp_path / "px4/old.cpp").write_text("old")
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    write_tree(render(gains, "px4"), tmp_path)
-    assert read_tree(tmp_path) == before | {"px4/old.cpp": "old"}
+    other = render(gains.with_elements({"RP_RR": 0.2}), "px4")
+    write_tree(other, tmp_path)
+    assert read_tree(tmp_path) == before | other | {"px4/old.cpp": "old"}
 
 
 @pytest.mark.parametrize("taken", ["core", "manifest.json", "native/Makefile"])
