@@ -9,7 +9,7 @@ demo: $(VENV)/.installed
 	$(BIN)/mimopilot demo --out demo
 
 test: $(VENV)/.installed-test cross
-	$(BIN)/pytest -n $(JOBS) --dist loadfile
+	$(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
 
 # What emulates and builds for the vehicle's processor, and the browser that opens reports; installed when missing.
 CROSS = gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm chromium

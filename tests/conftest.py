@@ -32,6 +32,29 @@ settings.load_profile("any machine")
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
+#: Files that take longest, by far: they begin first, so that at the end no worker is left alone with one.
+LONGEST = (
+    "test_sitl.py",
+    "test_attitude_studies.py",
+    "test_certify.py",
+    "test_campaign.py",
+    "test_confidence_intervals.py",
+    "test_package.py",
+    "test_verdicts.py",
+    "test_autotune_command.py",
+    "test_response_design.py",
+    "test_stability_figures.py",
+    "test_sitl_links.py",
+    "test_damage.py",
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Sort the longest files to the front; all others keep their order."""
+    place = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(LONGEST)))
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Golden directories are rewritten on purpose only."""
     parser.addoption("--update-golden", action="store_true", help="rewrite the golden directories of tests/codegen")
