@@ -38,8 +38,8 @@ LAYOUT = (
 )
 
 
-#: Gains, compiler, flags and cache folder -> library that this process built or found: a flight needs no rendering.
-_BUILT: dict[tuple[str, str, tuple[str, ...], Path], Path] = {}
+#: Hash of the gains, compiler and cache folder -> library that this process built or found: a flight renders nothing.
+_BUILT: dict[tuple[str, str, Path] | None, Path] = {}
 
 
 def build_native(gains: Gains, folder: Path | None = None) -> Path:
@@ -64,8 +64,8 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
         If there is no compiler or it fails, or the folder holds files that were not generated.
     """
     compiler = find_compiler()
-    known = (gains_to_toml(gains), compiler, CXX_FLAGS, cache_folder())
-    if folder is None and known in _BUILT and _whole(_BUILT[known]):
+    known = None if folder else (sha256(gains_to_toml(gains)), compiler, cache_folder())
+    if known in _BUILT and _whole(_BUILT[known]):
         return _BUILT[known]
     files = render(gains, "native")
     sources = "".join(
@@ -84,7 +84,7 @@ def build_native(gains: Gains, folder: Path | None = None) -> Path:
             write_tree(files, tree)
             compile_shared(compiler, [tree / source for source in SOURCES], tree / name)
             write_atomically(library, seal((tree / name).read_bytes(), name))  # the loader ignores appended bytes
-    if folder is None:
+    if known is not None:
         _BUILT[known] = library
     return library
 

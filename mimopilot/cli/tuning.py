@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: Details of a designed set that `tune --json` has, too.
 SHARED = ("predicted", "better_than_flown", "keep_flown", "worth_of_off_diagonals")
-#: Columns of the tables of predicted figures.
+#: Title of the tables of predicted figures.
 PREDICTED_TITLE = (
     "Predicted, roll / pitch. RMS in doublets of 10 degrees, 0.4 to 2 s: to the model\n"
     "({model}) and of the other axis; after a step of torque; of the torque at hover"

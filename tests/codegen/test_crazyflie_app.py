@@ -1,6 +1,5 @@
 """The emitted Crazyflie app: its conversions one by one, its modes, and which set of parameters flies."""
 
-import difflib
 import math
 from dataclasses import asdict, replace
 from operator import attrgetter
@@ -28,6 +27,7 @@ from mimopilot.tuning.parameter_row import Parameter
 from mimopilot.tuning.parameters import PARAMETERS
 from mimopilot.tuning.spec import load_spec
 from tests.codegen.crazyflie_host import Host, compile_all, crazyflie_gains, emit
+from tests.codegen.golden_files import check_golden
 from tests.conftest import coupled_gains
 
 GAINS = crazyflie_gains()
@@ -459,17 +459,4 @@ def test_the_emitted_specification_holds_what_a_log_of_the_built_in_gains_lacks(
 def test_the_rendered_files_match_the_golden_files(request):
     files = {name: text for name, text in render(GAINS, "crazyflie").items() if (TEMPLATES / f"{name}.jinja").is_file()}
     files = {name: text for name, text in files.items() if name.startswith("crazyflie/")}
-    folder = Path(__file__).parent / "golden" / "crazyflie"
-    if request.config.getoption("--update-golden"):
-        for name, text in files.items():
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (folder / name).write_text(text)
-    kept = {p.relative_to(folder).as_posix(): p.read_text() for p in folder.rglob("*") if p.is_file()}
-    difference = [
-        line
-        for name in sorted(kept.keys() | files.keys())
-        for line in difflib.unified_diff(
-            kept.get(name, "").splitlines(), files.get(name, "").splitlines(), f"golden/{name}", name, lineterm=""
-        )
-    ]
-    assert not difference, "\n".join(["run pytest --update-golden if intended:", *difference])
+    check_golden("crazyflie", files, request.config.getoption("--update-golden"))

@@ -135,9 +135,13 @@ def test_an_unknown_px4_interface_is_refused(gains):
 
 
 def templated(api, gains):
-    """The files of px4/ rendered from a template."""
+    """The files of px4/ and vehicle/ rendered from a template."""
     files = render(gains, "px4", px4_api=api)
-    return {name: text for name, text in files.items() if (TEMPLATES / f"{name}.jinja").is_file() and "px4/" in name}
+    return {
+        name: text
+        for name, text in files.items()
+        if (TEMPLATES / f"{name}.jinja").is_file() and name.startswith(("px4/", "vehicle/"))
+    }
 
 
 @pytest.mark.parametrize("api", targets()["px4"].options["px4_api"])

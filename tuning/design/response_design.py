@@ -347,7 +347,7 @@ class ResponseDesign:
     def _least_attitude(self, base: Law, place: int) -> Definite:
         """The least attitude gain of a design, or the flown one."""
         axes, flown = self.plants[place].axes, flown_law(self.experiments[place])
-        least = base.filters.least_attitude[2 if axes == 1 else 0]
+        least = base.filters.least_attitude[axes_slice(axes).start]
         if flown is not None:
             least = min(least, float(np.diag(getattr(flown, ATTITUDE.matrix)).min()))
         name = f"the autopilot's range of {ATTITUDE.matrix}" if least else ""

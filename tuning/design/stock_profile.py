@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from mimopilot.tuning.axes import Law
+from mimopilot.tuning.axes import Law, axes_slice
 from mimopilot.tuning.design.prediction import Prediction
 from mimopilot.tuning.design.response_design import Design, ResponseDesign
 from mimopilot.tuning.errors import TuningError
@@ -88,7 +88,7 @@ def in_digits(law: AnyLaw) -> AnyLaw:
 
     def rounded(name: str) -> Matrix:
         values = np.diag(getattr(law, name))
-        tops = largest[name][-1:] if len(values) == 1 else largest[name][: len(values)]
+        tops = np.array(largest[name])[axes_slice(len(values))].tolist()
         step = law.filters.law.step.get(name)
         digits = [step * round(value / step) if step else float(f"{value:.{DIGITS}g}") for value in values]
         digits = [min(digits)] * len(digits) if name in law.filters.law.shared else digits

@@ -3,42 +3,13 @@
 
 #include <string.h>
 
-#include "gains.hpp"
+#include "gain_limits.hpp"
 
 namespace mimopilot
 {
 
 namespace
 {
-
-struct Limits {
-	float minimum;
-	float maximum;
-};
-
-constexpr Limits kLimits[] = {
-	{0.01F, 50.0F},
-	{-50.0F, 50.0F},
-	{1e-04F, 5.0F},
-	{-5.0F, 5.0F},
-	{0.0F, 10.0F},
-	{-10.0F, 10.0F},
-	{-0.5F, 0.5F},
-	{0.01F, 1.0F},
-	{0.001F, 1.0F},
-	{0.0F, 50.0F},
-	{0.0F, 0.9999F},
-	{0.3F, 2.0F},
-};
-
-constexpr uint8_t kFixed = 255;
-
-// In the order of the gains.
-constexpr uint8_t kLimitsOf[] = {
-	0, 1, 1, 0, 2, 3, 3, 2, 4, 5, 5, 4, 6, 6, 6, 6, 3, 3, 3, 3,
-	3, 3, 3, 3, 6, 6, 6, 6, 0, 2, 4, 6, 3, 0, 0, 0, 7, 7, 7, 8,
-	8, 8, 7, 9, 10, kFixed, 11, 9,
-};
 
 // The set as gains; what is fixed in the firmware stays so. Returns the place of the first value out of its range, from
 // 1; 0: none.
@@ -51,12 +22,9 @@ int read(const MimoParameters &parameters, Gains &gains)
 	const float *const values = reinterpret_cast<const float *>(&gains);
 
 	for (int i = 0; i < kGainCount; i++) {
-		if (kLimitsOf[i] == kFixed) { continue; }
+		if (fixed(i)) { continue; }
 
-		const Limits &limits = kLimits[kLimitsOf[i]];
-		const bool inside = values[i] >= limits.minimum && values[i] <= limits.maximum;  // NaN is not
-
-		if (!inside) { return i + 1; }
+		if (!accepted(i, values[i])) { return i + 1; }
 	}
 
 	return 0;
