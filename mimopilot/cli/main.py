@@ -48,6 +48,7 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback(help="From one flight to tuned, tested C++ for a multirotor's roll and pitch.")
 def options(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and end.")
     ] = False,
@@ -62,6 +63,7 @@ def options(
     if quiet and verbose:
         raise Error("--quiet and --verbose exclude each other; leave one out")
     set_verbosity(Verbosity.QUIET if quiet else Verbosity.VERBOSE if verbose else Verbosity.NORMAL)
+    context.call_on_close(lambda: set_verbosity(Verbosity.NORMAL))  # a program that runs commands begins each anew
 
 
 def main() -> None:

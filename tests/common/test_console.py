@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 import mimopilot
 from mimopilot.common.console import print_json, print_table, print_text
 from mimopilot.common.text_table import folded, plain_zero, text_table, with_deviation
+from mimopilot.common.verbosity import Verbosity, verbosity
 from mimopilot.tuning.design.advise import Advice, Candidate
 from mimopilot.tuning.design.prediction import Prediction
 from mimopilot.tuning.gains_file import load_gains
@@ -167,6 +168,7 @@ def test_quiet_shows_only_results_and_errors(folder):
     assert quiet.stdout == usual.stdout
     assert "--quiet and --verbose exclude each other" in run_here(folder, "--quiet", "--verbose", "fly", "adam0").stderr
     assert run_here(folder, "inspect", "missing.ulg", "--quiet").stderr.startswith("mimopilot: ")
+    assert verbosity() is Verbosity.NORMAL  # a quiet command leaves none behind it
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("faults", "--kinds"), ("fly", "--help")])
