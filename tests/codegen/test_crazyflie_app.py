@@ -280,7 +280,7 @@ def test_the_firmwares_pid_flies_while_the_controller_is_off(host):
 
 def test_a_set_written_while_it_flies_is_taken_as_a_whole_only_by_switching_it_off_and_on_on_the_ground(host):
     before = torque_against_a_roll_rate(host)
-    host.write(RP_RR=0.3)
+    host.write(RP_RR=0.3, SET_ID=host.defaults["FW_ID"])
     assert (host.run(), state(host))[1] is ControllerState.CHANGED
     host.write(EN=0.0)
     assert (host.run(), state(host))[1] is ControllerState.WAITING and host.firmware.pid_calls == 0
@@ -309,6 +309,34 @@ def test_a_stored_set_flies_from_the_start(host):
     assert (
         torque_against_a_roll_rate(host) == pytest.approx(2 * before, rel=0.2) and state(host) is ControllerState.FLIES
     )
+
+
+def test_parameters_stored_for_another_firmware_do_not_fly_and_the_console_says_why(host):
+    number = host.defaults["FW_ID"]
+    for stored in (0.0, number + 1):
+        host.take_off(RP_RR=0.3, SET_ID=stored)
+        assert state(host) is ControllerState.OTHER_FIRMWARE and host.firmware.pid_calls == 4
+        assert host.console == f"mimo.SET_ID is not {number:.0f}: stored for another firmware, stock PID flies\n"
+    host.write(SET_ID=number)  # does not count in the air
+    assert (host.run(), state(host))[1] is ControllerState.OTHER_FIRMWARE
+    host.firmware.flying = False
+    host.write(EN=0.0)
+    assert (host.run(), state(host))[1] is ControllerState.STOCK
+    host.write(EN=1.0)
+    assert (host.run(), state(host))[1] is ControllerState.FLIES and not host.console
+
+
+def test_the_gains_of_the_firmware_fly_whatever_was_stored_with_others(host):
+    host.take_off(SET_ID=1.0)
+    assert state(host) is ControllerState.FLIES
+
+
+def test_a_set_that_flew_is_followed_by_the_stock_pid_if_the_next_is_for_another_firmware(host):
+    host.firmware.flying = False
+    host.write(EN=0.0)
+    host.run()
+    host.write(EN=1.0, RP_RR=0.3)
+    assert (host.run(), state(host))[1] is ControllerState.OTHER_FIRMWARE and host.control.controlMode == 0
 
 
 def test_gains_for_another_period_are_refused_without_any_torque(built, tmp_path):

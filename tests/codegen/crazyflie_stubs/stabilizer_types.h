@@ -43,5 +43,6 @@ struct firmware {
 	int position_resets;
 	float thrust;
 	attitude_t desired;
+	char console[400];
 };
 extern struct firmware firmware;

@@ -12,6 +12,7 @@ enum Place {
 	SCALE_R = kGainCount,
 	SCALE_P,
 	SCALE_Y,
+	FW_ID,
 	EX_AX,
 	EX_AMP,
 	EX_AMPY,
@@ -21,6 +22,7 @@ enum Place {
 	EX_SEED,
 	EX_MODE,
 	EX_TILT,
+	SET_ID,
 	kValueCount
 };
 
@@ -82,6 +84,7 @@ constexpr Limits kLimits[] = {
 	{2.54592F, 2.54592F},  // SCALE_R
 	{2.54592F, 2.54592F},  // SCALE_P
 	{0.2736F, 0.2736F},  // SCALE_Y
+	{68312.0F, 68312.0F},  // FW_ID
 };
 
 constexpr int kLimited = sizeof(kLimits) / sizeof(kLimits[0]);

@@ -60,6 +60,17 @@ Obstacle wrong_parameter()
 					      "MIMO: a gain is out of its range");
 }
 
+Obstacle other_firmware()
+{
+	/* EVENT
+	 * @description
+	 * The stored parameters were written for another firmware. Upload gains, or reset the parameters of the group, or, if
+	 * they are right for this firmware, set <param>MIMO_SET_ID</param> to 972901.
+	 */
+	return reporter.armingCheckFailureExt(events::ID("mimo_firmware"), events::Log::Error,
+					      "MIMO: MIMO_SET_ID is not 972901");
+}
+
 void ArmingCheck::ask(uint64_t now)
 {
 	register_ext_component_request_s request{};

@@ -51,8 +51,12 @@ void McMimoPid::update_parameters()
 {
 	Gains gains;
 	_wrong_gain = _parameters.read(gains);
+	_foreign_set = _wrong_gain == nullptr && !_parameters.for_this_firmware(gains);
 
-	if (_wrong_gain != nullptr) {
+	if (_foreign_set) {
+		PX4_ERR("MIMO_SET_ID is not 972901: no gain changed");
+
+	} else if (_wrong_gain != nullptr) {
 		PX4_ERR("%s is out of its range: no gain changed", _wrong_gain);
 
 	} else if (memcmp(&gains, &_state.gains, sizeof(gains)) != 0 && !set_gains(_state, gains)) {
@@ -134,6 +138,8 @@ Obstacle McMimoPid::obstacle() const
 	if (_settings.autotune > 0.5F) { return autotune_enabled(); }
 
 	if (_clock.rate() == SampleClock::Rate::Wrong) { return wrong_gyro_rate(); }
+
+	if (_foreign_set) { return other_firmware(); }
 
 	return _wrong_gain != nullptr ? wrong_parameter() : Obstacle{};
 }

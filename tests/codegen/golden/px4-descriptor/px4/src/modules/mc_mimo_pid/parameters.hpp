@@ -18,6 +18,9 @@ public:
 	// then of no use. What is fixed in the firmware stays so.
 	const char *read(Gains &gains);
 
+	// Whether the gains that were read are for this firmware: PX4 stores values longer than a firmware.
+	bool for_this_firmware(const Gains &gains) const;
+
 	// The gains in the firmware.
 	static const Gains &programmed();
 
@@ -36,6 +39,7 @@ private:
 		MIMO_EX_SEED,
 		MIMO_EX_MODE,
 		MIMO_EX_TILT,
+		MIMO_SET_ID,
 		MIMO_EN,
 		kSettingCount
 	};
