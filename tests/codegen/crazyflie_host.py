@@ -110,7 +110,7 @@ class Host:
         number = {"SET_ID": self.defaults["FW_ID"]} if parameters.keys() - {"EN", "EX_AX"} else {}
         for name, value in (self.defaults | number | parameters).items():
             self.parameters[name][1][0] = int(value) if name == "STATE" else value
-        for name in ("flying", "pid_inits", "pid_calls", "position_calls", "position_resets", "thrust"):
+        for name in ("flying", "pid_inits", "pid_calls", "position_calls", "position_resets", "thrust", "idle_thrust"):
             setattr(self.firmware, name, 0)
         self.firmware.pid_passes = True
         self.control, self.setpoint = self.ffi.new("control_t *"), self.ffi.new("setpoint_t *")

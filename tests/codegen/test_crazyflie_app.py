@@ -256,6 +256,25 @@ def test_torque_that_the_motors_cannot_give_is_noticed_and_does_not_wind_up(host
     assert abs(host.log(name)) > abs(held) + 0.001
 
 
+@pytest.mark.parametrize("turned", [1, -1])
+def test_torque_that_idling_motors_cannot_give_is_noticed_in_both_directions(host, turned):
+    # Each motor gives 12.5 mN. Of a roll torque t it gives t / 4 / (0.05 m sin 45 degrees) less or more.
+    lever = 4 * 0.05 * math.sqrt(0.5)
+    idle, hover = 0.05 * 0.125, 0.0125
+    for least in (0, 3277):  # 0.05 of 65535
+        host.take_off()
+        host.firmware.idle_thrust = least
+        host.setpoint.thrust = 6553.5
+        host.sensors.gyro.x = turned * 45.0
+        host.run(60)
+        first = host.torque[0]
+        host.run(100)
+        assert first * turned < 0 and lever * (hover - idle) < abs(first) < lever * hover
+        assert int(host.log("saturated")) & 1 == (least > 0)
+        # The integrator goes on unless the torque is not given.
+        assert (host.torque[0] == pytest.approx(first, rel=1e-3)) == (least > 0)
+
+
 # Which set of parameters flies.
 
 

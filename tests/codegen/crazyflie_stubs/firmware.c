@@ -53,6 +53,8 @@ void positionController(float *thrust, attitude_t *attitude, const setpoint_t *s
 
 float powerDistributionGetMaxThrust(void) { return 4.0f * THRUST_MAX; }
 
+uint32_t powerDistributionGetIdleThrust() { return firmware.idle_thrust; }
+
 bool supervisorIsFlying(void) { return firmware.flying; }
 
 /* The app's main function has no end: its task is stopped in a delay. */
