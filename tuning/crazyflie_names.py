@@ -98,7 +98,10 @@ LOG_VARIABLES: tuple[LogVariable, ...] = (
     *(LogVariable(name, "float", "rad/s", "body rate") for name in "pqr"),
     *(LogVariable(f"{name}Sp", "float", "rad/s", "body rate setpoint that is flown") for name in "pqr"),
     *(LogVariable(name, "float", "rad", "attitude") for name in ("roll", "pitch", "yaw")),
-    *(LogVariable(f"{name}Sp", "float", "rad", "attitude setpoint that is flown") for name in ("roll", "pitch", "yaw")),
+    *(
+        LogVariable(f"{name}Sp", "float", "rad", "attitude setpoint; NaN: rates are flown")
+        for name in ("roll", "pitch", "yaw")
+    ),
     LogVariable("phase", "int8_t", "", "excitation: -2 waits, -1 off, 0 roll, 1 pitch, 2 pause, 3 yaw"),
     LogVariable("end", "uint8_t", "", "how the last excitation ended"),
     LogVariable("state", "uint8_t", "", "what flies, see STATE"),

@@ -119,6 +119,15 @@ def test_rate_setpoints_are_in_the_older_frame_and_flown_without_the_attitude(ho
     assert logged(host, RATE_SETPOINTS) == pytest.approx([math.pi / 2 * sign for sign in expected])
 
 
+def test_while_rates_are_flown_the_log_has_no_attitude_setpoint(host):
+    host.setpoint.attitude.roll = 20.0
+    host.run()
+    assert host.log("rollSp") == pytest.approx(20 * DEGREE, rel=1e-5)
+    host.setpoint.mode.roll = host.setpoint.mode.pitch = 2
+    host.run()
+    assert all(math.isnan(one) for one in logged(host, SETPOINTS)) and host.log("rSp") == 0
+
+
 def test_thrust_of_a_quarter_is_a_quarter_of_what_the_motors_can_in_newton(host):
     host.setpoint.thrust = 65535 / 4
     assert host.run().thrustSi == pytest.approx(0.125)  # 4 motors of 0.125 N

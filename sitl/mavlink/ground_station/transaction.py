@@ -261,8 +261,7 @@ def _save_snapshot(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbe
     """Write the old values to a new file: an older snapshot may be the only copy of its values."""
     path = snapshot_path(options)
     old = {name: held[name] for name in plan.values}
-    if plan.binding is not None:
-        old[plan.binding.firmware] = held[plan.binding.firmware]
+    old |= {name: value for name, value in held.items() if name.endswith(FIRMWARE_NUMBER.code)}
     write_atomically(path, parameter_text("qgc", old, vehicle.system, vehicle.component))
     if read_parameters(path) != old:
         raise SitlError(

@@ -13,7 +13,7 @@ from mimopilot.tuning.crazyflie_names import LOG_VARIABLES
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.crazyflie import LAYOUTS, YAW_LAYOUTS, record_usd
 from mimopilot.tuning.logs.inspection import inspect_log
-from mimopilot.tuning.logs.reader import open_log, read_log
+from mimopilot.tuning.logs.reader import open_log, read_log, unchecked_experiment
 from tests.conftest import assert_one_clear_line
 from tests.tuning.logs.crazyflie_logs import mimo_variables, stock_variables, usd_bytes, write_csv_block
 from tests.tuning.logs.flights import make_flight, pulses
@@ -143,6 +143,32 @@ def test_a_switch_that_waits_for_the_ground_does_not_fly_our_controller(flown_tw
 def test_a_switch_off_that_waits_for_the_ground_still_flies_our_controller(flown_twice):
     found, _ = flown_twice(1, 4, between=1)
     assert "u" in found.signals and not found.warnings and len(found.airborne) == 2
+
+
+def test_what_flew_while_a_switch_waits_from_the_begin_of_the_log_on_is_not_known(flown_twice):
+    found, _ = flown_twice(4, 4, between=4)
+    assert "u" not in found.signals and any("state is 4 from the begin of the log on" in one for one in found.warnings)
+    found, begin = flown_twice(4, 1)  # off on the ground
+    assert found.airborne == ((pytest.approx(begin + 5.0, abs=0.003), np.inf),)
+    assert any("does not tell whether our controller flew" in one and "not used" in one for one in found.warnings)
+
+
+def test_a_set_stored_for_another_firmware_leaves_the_stock_pid_flying(flown_twice):
+    found, _ = flown_twice(6, 6, between=6)
+    assert "u" not in found.signals and any("the stock PID flew" in one for one in found.warnings)
+
+
+def test_a_part_that_flies_rates_has_no_attitude_setpoint_and_is_not_used(flight, tmp_path):
+    variables, rates = mimo_variables(flight), (flight.t > flight.t[0] + 5.0) & (flight.t < flight.t[0] + 7.0)
+    for name in ("mimo.rollSp", "mimo.pitchSp"):
+        variables[name] = "f", np.where(rates, np.nan, variables[name][1])
+    found = unchecked_experiment(open_log(written(tmp_path / "log01", usd_bytes(flight.t, variables))))
+    (_, before), (after, _) = found.segments
+    assert after - before == np.count_nonzero(rates)
+    assert any("rollSp is NaN for 25 % of the log: rates were flown" in one for one in found.warnings)
+    variables |= {name: ("f", np.full(len(flight.t), np.nan)) for name in ("mimo.rollSp", "mimo.pitchSp")}
+    with pytest.raises(TuningError, match="NaN for 100 % of the log: rates were flown"):
+        read_log(written(tmp_path / "log02", usd_bytes(flight.t, variables)))
 
 
 @pytest.mark.parametrize(("state", "why"), [(2, "a parameter had changed since"), (3, "the parameters were refused")])

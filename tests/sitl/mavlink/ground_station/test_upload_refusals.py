@@ -186,7 +186,7 @@ def test_an_incomplete_or_out_of_range_snapshot_is_refused_before_contacting_the
         lines = text.splitlines(keepends=True)
         unsealed = "".join(lines[1:])
         for content, parts in [
-            ("".join(lines[:-5]), (f"holds {WRITTEN - 5} parameters, but its first line says {WRITTEN}",)),
+            ("".join(lines[:-5]), (f"holds {WRITTEN - 4} parameters, but its first line says {WRITTEN + 1}",)),
             (text[:-4], ("it was cut short",)),
             (text.replace("0.13125", "0.13126"), ("damaged or edited",)),
             ("".join(lines[1:-5]), (f"holds {REQUIRED - 1} of our {REQUIRED} gains", "lacks MIMO_D_POLE")),

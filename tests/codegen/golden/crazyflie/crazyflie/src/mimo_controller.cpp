@@ -158,9 +158,10 @@ void log()
 	log.pitch = angles[1];
 	log.yaw = angles[2];
 	angles_of(flight.state.attitude_setpoint, angles);
-	log.rollSp = angles[0];
-	log.pitchSp = angles[1];
-	log.yawSp = angles[2];
+	const bool rates_flown = input.rate_mode != 0;  // then the last attitude setpoint is not flown
+	log.rollSp = rates_flown ? NAN : angles[0];
+	log.pitchSp = rates_flown ? NAN : angles[1];
+	log.yawSp = rates_flown ? NAN : angles[2];
 	log.phase = static_cast<int8_t>(flight.excitation.phase());
 	log.end = static_cast<uint8_t>(flight.excitation.end());
 	log.state = static_cast<uint8_t>(flight.take.state());

@@ -101,9 +101,9 @@ struct MimoLog {
 	float roll;  // attitude, rad
 	float pitch;  // attitude, rad
 	float yaw;  // attitude, rad
-	float rollSp;  // attitude setpoint that is flown, rad
-	float pitchSp;  // attitude setpoint that is flown, rad
-	float yawSp;  // attitude setpoint that is flown, rad
+	float rollSp;  // attitude setpoint; NaN: rates are flown, rad
+	float pitchSp;  // attitude setpoint; NaN: rates are flown, rad
+	float yawSp;  // attitude setpoint; NaN: rates are flown, rad
 	int8_t phase;  // excitation: -2 waits, -1 off, 0 roll, 1 pitch, 2 pause, 3 yaw
 	uint8_t end;  // how the last excitation ended
 	uint8_t state;  // what flies, see STATE
