@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from mimopilot.common.files import sha256, write_atomically
 from mimopilot.common.toml import toml_entries, toml_value
 from mimopilot.tuning.certificate import Certificate, Verdict
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law_terms import LATER_FILTERS, MIMO, Filters, StockFilters
+from mimopilot.tuning.law_filters import LATER_FILTERS, MIMO, Filters, StockFilters
 from mimopilot.tuning.parameter_row import ANY, AXES, NOT_NEGATIVE, POSITIVE, Row, Shape, Valid
 from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, YAW_GAINS, rows
 from mimopilot.tuning.provenance import Provenance
@@ -163,7 +164,7 @@ class Gains:
 
     def _check_law(self) -> None:
         """Refuse what the law of a stock controller does not have."""
-        law = self.filters.law
+        law = control_law(self.filters)
         for row in ROWS:
             if row.key in law.lacks and any(value != (row.default or 0.0) for value in self._values(row)):
                 raise TuningError(f"{row.key}: got {self.of(row)}, but the {self.controller} controller has none")
@@ -454,7 +455,7 @@ def gains_to_toml(gains: Gains) -> str:
     def lines_of(shape: Shape) -> list[str]:
         return [line(row) for row in rows(shape) if not left_out(row)]
 
-    following, law, stock = bool(gains.filters.model_omega), gains.filters.law, gains.filters.stock
+    following, law, stock = bool(gains.filters.model_omega), control_law(gains.filters), gains.filters.stock
     shaping = gains.filters.shaping_s
     scale = toml_value(list(gains.moment_scale)) if gains.moment_scale else '"unknown"'
     lines = [

@@ -18,6 +18,7 @@ from mimopilot.tuning.analysis.beyond_band import MAX_SENSITIVITY_BELOW_BAND, ex
 from mimopilot.tuning.analysis.closed_loop import model_spectral_radius
 from mimopilot.tuning.analysis.manoeuvres import doublet_torque, family_of, manoeuvres
 from mimopilot.tuning.axes import Law, axes_slice, flown_law
+from mimopilot.tuning.control_laws import control_law, least_attitude
 from mimopilot.tuning.design.constraints import (
     SHARE,
     Constraint,
@@ -335,7 +336,7 @@ class ResponseDesign:
             found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
         if TERMS["D"].matrix in free.units:
             found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(plant.axes))]
-        largest = free.base.filters.law.largest or {}
+        largest = control_law(free.base.filters).largest or {}
         axes = axes_slice(plant.axes)
         found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
         found += self._actuators(place, free.base.filters)
@@ -347,7 +348,7 @@ class ResponseDesign:
     def _least_attitude(self, base: Law, place: int) -> Definite:
         """The least attitude gain of a design, or the flown one."""
         axes, flown = self.plants[place].axes, flown_law(self.experiments[place])
-        least = base.filters.least_attitude[axes_slice(axes).start]
+        least = least_attitude(base.filters)[axes_slice(axes).start]
         if flown is not None:
             least = min(least, float(np.diag(getattr(flown, ATTITUDE.matrix)).min()))
         name = f"the autopilot's range of {ATTITUDE.matrix}" if least else ""
