@@ -13,7 +13,8 @@ from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.control_laws import LAWS
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, SHAPING, Gains
+from mimopilot.tuning.gains import SCHEMA_1, Gains
+from mimopilot.tuning.gains_text import SCHEMA, SHAPING
 from mimopilot.tuning.law_filters import MIMO, StockFilters
 from mimopilot.tuning.parameter_row import Row, Shape
 from mimopilot.tuning.parameters import ROWS, rows
