@@ -184,13 +184,13 @@ def experiment(
             ),
         )
         return
-    from mimopilot.api import vehicle
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, default_amplitude
 
     check_not_given("belong to --connect", mode=mode, tilt_deg=tilt_deg, profile=profile, snapshot=snapshot)
     if out is None:
         raise SitlError("--out: name the log to write, FILE.ulg")
-    body, controller = vehicle(airframe or "", gains)
+    body, controller = given_vehicle(airframe or "", gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
     plan = ExperimentPlan(
         body,
@@ -269,14 +269,14 @@ def fly(
     from dataclasses import asdict, replace
 
     import mimopilot as mp
-    from mimopilot.api import vehicle
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.flight.fault_recovery import recovery
     from mimopilot.sitl.flight.flight_log import save_flight
     from mimopilot.sitl.flight.metrics import FIGURE_LABELS
     from mimopilot.sitl.flight.scenario import AXES, scenario_of
 
-    body, controller = vehicle(airframe, gains)
+    body, controller = given_vehicle(airframe, gains)
     task = scenario_of(scenario, axis, amplitude_deg, period_s, tail_s, fault or (), controller.Ts)
     if on not in ("native", "cortex-m4"):
         raise SitlError(f"--on: got {on!r}, expected native or cortex-m4")

@@ -71,7 +71,7 @@ def sitl(
     period_s: PeriodOption = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
-    from mimopilot.api import vehicle
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.faults.kinds import parse_fault
     from mimopilot.sitl.flight.scenario import scenario_of
@@ -79,7 +79,7 @@ def sitl(
 
     if autopilot not in ("mimo", "px4-stock"):
         raise SitlError(f"--autopilot: got {autopilot!r}, expected mimo or px4-stock")
-    body, controller = vehicle(airframe, gains)
+    body, controller = given_vehicle(airframe, gains)
     task, faults = None, tuple(map(parse_fault, fault or ()))
     if scenario is not None:
         task = scenario_of(scenario, axis, amplitude_deg, period_s, None, fault or (), controller.Ts)
