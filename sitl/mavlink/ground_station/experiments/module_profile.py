@@ -17,7 +17,6 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
     SaveValues,
     VehicleSession,
 )
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.experiments.module_injector import (
     INTEGERS,
     NAMES,
@@ -33,6 +32,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     values_of,
     write_back,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.upload import read_values
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES

@@ -39,13 +39,10 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
     SaveValues,
     VehicleSession,
 )
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     FLIGHT_STREAMS,
-    POLL_S,
-    FlightMonitor,
     not_hovering,
     request_status,
-    request_streams,
     stop_reason,
     supplies_problem,
     watch_hover,
@@ -59,6 +56,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     values_of,
     write_back,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor, request_streams
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Answer, ParameterClient
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES, nav_state

@@ -23,14 +23,11 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
     SaveValues,
     VehicleSession,
 )
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     ALTITUDE_STREAM,
     FLIGHT_STREAMS,
-    POLL_S,
-    FlightMonitor,
     not_hovering,
     request_status,
-    request_streams,
     stop_reason,
     supplies_problem,
     watch_hover,
@@ -39,11 +36,11 @@ from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     identify,
     on_the_ground,
     read_known,
-    send_command,
     set_values,
     values_of,
     write_back,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor, request_streams
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 
@@ -192,7 +189,7 @@ class SystemIdentification(ExperimentProfile):
         """Change the mode; returns why that failed, empty: the vehicle reports the mode."""
         assert client.vehicle is not None
         flag = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        ack = yield from send_command(client, mavlink.MAV_CMD_DO_SET_MODE, flag, mode)
+        ack = yield from client.command(mavlink.MAV_CMD_DO_SET_MODE, (flag, mode))
         if ack is not None and ack.result not in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS):
             return f"the vehicle refuses mode {mode} (MAV_RESULT {ack.result}): {monitor.text}"
         end = client.now + MODE_TIMEOUT_S
