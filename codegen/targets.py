@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.common.errors import check_choice
 
 if TYPE_CHECKING:  # the command line reads the table for its help and must start fast
     from mimopilot.tuning.gains import Gains
@@ -95,8 +96,7 @@ class Target:
             if name not in known:
                 raise CodegenError(f"option {name!r}: no target has it; known: {', '.join(sorted(known))}")
             values = self.options.get(name, (value,))
-            if value not in values:
-                raise CodegenError(f"{name.replace('_', '-')}: got {value!r}, expected one of {', '.join(values)}")
+            check_choice(name.replace("_", "-"), value, values, CodegenError)
         return {name: options.get(name, values[0]) for name, values in self.options.items()}
 
 
@@ -128,6 +128,5 @@ def find_target(name: str) -> Target:
     CodegenError
         If there is none; lists the known ones.
     """
-    if name not in targets():
-        raise CodegenError(f"target: got {name!r}, expected one of {', '.join(sorted(targets()))}")
+    check_choice("target", name, sorted(targets()), CodegenError)
     return targets()[name]

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from mimopilot.common.errors import InputFileError
-from mimopilot.common.toml import checked, read_toml
+from mimopilot.common.toml import checked, complaint, read_toml
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.law_terms import LAWS, MIMO
@@ -115,7 +115,7 @@ class TuningSpec(_SpecTable):
     method: Literal["mimo", "siso"] = "mimo"
     inner: Models | None = None
     outer: Models | None = None
-    structure: Annotated[str, Field(pattern="^PI?D?F?$")] = "PID"
+    structure: Literal["P", "PI", "PD", "PID", "PF", "PIF", "PDF", "PIDF"] = "PID"
     instrument: Literal["external", "u", "model", "repeated"] = "external"
     trim: bool = True
     window: Annotated[int, Field(ge=1, le=500)] | None = None
@@ -195,7 +195,12 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
     table = read_toml(path, "specification") if path is not None else {}
     if "schema" in table and "roll_pitch" in table:
         raise InputFileError(f"{path}: is a gains file, expected a specification; leave out --spec")
-    table |= {name: value for name, value in overrides.items() if value is not None}
+    given = {name: value for name, value in overrides.items() if value is not None}
+    try:
+        TuningSpec.model_validate(given)
+    except ValidationError as error:
+        raise InputFileError(f"--{complaint(error, TuningSpec)}") from error
+    table |= given
     return checked(TuningSpec, table, str(path or "specification"))
 
 

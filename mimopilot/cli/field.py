@@ -18,7 +18,9 @@ def register(app: typer.Typer) -> None:
 
 def autotune(
     connect: ConnectOption,
-    out: Annotated[Path, typer.Option(help="Folder of logs, gains, decisions and report; the same one goes on.")],
+    out: Annotated[
+        Path, typer.Option(file_okay=False, help="Folder of logs, gains, decisions and report; the same one goes on.")
+    ],
     profile: ProfileOption = None,
     take_off: Annotated[
         float | None,

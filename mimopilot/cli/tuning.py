@@ -222,7 +222,9 @@ def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Column
 def certify(
     log: LogArgument,
     gains: Annotated[Path, typer.Option(help="Gains file to examine.")],
-    out: Annotated[Path | None, typer.Option(help="Write the gains with their certificate to this file.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Write the gains with their certificate to this file.")
+    ] = None,
     rate: Annotated[
         float | None,
         typer.Option(help="Carry the gains to this control rate, Hz, and examine them there; by default their own."),
@@ -258,7 +260,7 @@ def certify(
 def advise(
     log: LogArgument,
     spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
+    out: Annotated[Path | None, typer.Option(dir_okay=False, help="Write the recommended gains to this file.")] = None,
     columns: ColumnsOption = None,
     report: ReportOption = None,
     as_json: JsonOption = False,

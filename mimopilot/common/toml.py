@@ -134,7 +134,13 @@ def complaint(error: ValidationError, model: type[BaseModel]) -> str:
         return f"{shown_text(field)}: unknown entry; {_meant(first['loc'], model)}"
     if first["type"] == "missing":  # its input is then the table, not a value
         return f"{shown_text(field)}: {message}"
-    return f"{shown_text(field)}: {message}, got {shown(first.get('input'))}" if field else message
+    if not field:
+        return message
+    value = shown(first.get("input"))
+    if (wanted := message.removeprefix("Input should be ")) != message:
+        wanted = wanted.replace("'", "") if first["type"] == "literal_error" else wanted
+        return f"{shown_text(field)}: got {value}, expected {wanted}"
+    return f"{shown_text(field)}: {message}" + ("" if "got " in message else f", got {value}")
 
 
 def _meant(place: Sequence[str | int], model: type[BaseModel]) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mimopilot.common.errors import check_choice
 from mimopilot.common.files import read_bytes, sha256
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.errors import TuningError
@@ -192,8 +193,8 @@ def import_gains(
     TuningError
         When the source holds no gains of a multirotor, lacks a parameter, or a value is not possible.
     """
-    if defaults is not None and defaults not in DEFAULTS:
-        raise TuningError(f"--defaults: got {defaults!r}, expected {' or '.join(DEFAULTS)}")
+    if defaults is not None:
+        check_choice("--defaults", defaults, DEFAULTS, TuningError)
     # The module's own gains may be on the vehicle, too: it is the stock ones that are wanted.
     values = {name: float(str(np.float32(v))) for name, v in source.values.items() if not name.startswith(PREFIX)}
     stock = _stock_controller(values, source)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import ClassVar
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.excitation_flight import AMPLITUDE, VEHICLE_YAW_AMPLITUDE
@@ -57,9 +58,8 @@ def injector_settings(excitation: ExcitationOptions, Ts: float) -> dict[str, flo
         If the bandwidth is wrong.
     """
     axis = excitation.axis or "all"
-    for option, value, known in (("--axis", axis, AXES), ("--mode", excitation.mode, EXCITED_MODES)):
-        if value not in known:
-            raise SitlError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
+    check_choice("--axis", axis, AXES, SitlError)
+    check_choice("--mode", excitation.mode, EXCITED_MODES, SitlError)
     hold_min, hold_max = hold_from_bandwidth(excitation.bandwidth, Ts)
     values = {
         AXIS: AXES[axis],
