@@ -89,13 +89,14 @@ class Target:
         Raises
         ------
         CodegenError
-            If a value is unknown. Options of other targets are ignored.
+            If an option or its value is unknown. Options of other targets are ignored.
         """
-        known = {name for target in targets().values() for name in target.options}
         for name, value in options.items():
-            if name not in known:
-                raise CodegenError(f"option {name!r}: no target has it; known: {', '.join(sorted(known))}")
-            values = self.options.get(name, (value,))
+            owners = [target for target in targets().values() if name in target.options]
+            if not owners:
+                known = sorted({name for target in targets().values() for name in target.options})
+                raise CodegenError(f"option {name!r}: no target has it; known: {', '.join(known)}")
+            values = (self if self in owners else owners[0]).options[name]
             check_choice(name.replace("_", "-"), value, values, CodegenError)
         return {name: options.get(name, values[0]) for name, values in self.options.items()}
 

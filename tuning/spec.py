@@ -192,9 +192,7 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
     Error
         When the file cannot be read, is not TOML, or has an unknown or invalid entry.
     """
-    table = read_toml(path, "specification") if path is not None else {}
-    if "schema" in table and "roll_pitch" in table:
-        raise InputFileError(f"{path}: is a gains file, expected a specification; leave out --spec")
+    table = read_toml(path, "specification", "leave out --spec") if path is not None else {}
     given = {name: value for name, value in overrides.items() if value is not None}
     try:
         TuningSpec.model_validate(given)
@@ -204,7 +202,7 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
     return checked(TuningSpec, table, str(path or "specification"))
 
 
-def parse_model(text: str) -> tuple[float, float, int]:
+def parse_model(text: str, option: str = "") -> tuple[float, float, int]:
     """Parse a second-order reference model of the command line: ``OMEGA,ZETA,DELAY`` (rad/s, damping, samples).
 
     Raises
@@ -223,4 +221,6 @@ def parse_model(text: str) -> tuple[float, float, int]:
             raise ValueError
         return float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
     except ValueError:
-        raise TuningError(f"reference model: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0") from None
+        raise TuningError(
+            f"{option or 'reference model'}: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0"
+        ) from None

@@ -53,7 +53,9 @@ def _files(values: Iterable[Any]) -> Iterator[Path]:
 
 
 def _check_place(option: str, path: Path) -> None:
-    """Refuse a path below something that is no folder."""
+    """Refuse a path below something that is no folder, and standard output."""
+    if str(path) == "-":
+        raise Error(f"{option}: nothing is written to standard output; give a path")
     nearest = next(parent for parent in path.absolute().parents if parent.exists())
     if not nearest.is_dir():
         shown = next((parent for parent in path.parents if parent.absolute() == nearest), nearest)

@@ -47,10 +47,6 @@ def autotune(
     Exit code 0: the new gains are kept; 1: the old ones are back, or a step failed.
     """
     from mimopilot.common.console import print_json
-    from mimopilot.common.extras import REPORT, VEHICLE
-
-    VEHICLE.need()
-    REPORT.need()
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.field.autotune_console import AutotuneTerminal
     from mimopilot.sitl.field.autotune_run import AutotuneOptions

@@ -119,4 +119,4 @@ def _usage_message(error: typer.BadParameter) -> str:
     )
     path = error.ctx.command_path if error.ctx else "mimopilot"
     where = path.removeprefix("mimopilot").strip()
-    return f"{where + ': ' if where else ''}{text[:1].lower()}{text[1:]}; see {path} --help"
+    return f"{where}{': ' if where else ''}{text[:1].lower()}{text[1:]}; see {path} --help"

@@ -190,6 +190,8 @@ def experiment(
     check_not_given("belong to --connect", mode=mode, tilt_deg=tilt_deg, profile=profile, snapshot=snapshot)
     if out is None:
         raise SitlError("--out: name the log to write, FILE.ulg")
+    if out.is_dir() and runs is None:
+        raise SitlError(f"--out: {out} is a folder; give the log to write, FILE.ulg, or --runs")
     body, controller = vehicle(airframe or "", gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
     plan = ExperimentPlan(

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 from mimopilot.common.errors import Error
+from mimopilot.common.extras import REPORT
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import GAINS, SNAPSHOT, AutotuneDialogue, AutotuneOptions, AutotuneRun, Decided
 from mimopilot.sitl.field.decisions import Decisions, load_decisions
@@ -81,6 +82,7 @@ def autotune(options: AutotuneOptions, dialogue: AutotuneDialogue) -> Decisions:
     SitlError
         If not: with the reason, and the set that the vehicle holds.
     """
+    REPORT.need()
     check_experiment(options.profile)
     pilot = EXPERIMENTS[options.profile].pilot
     if pilot and options.take_off is not None:

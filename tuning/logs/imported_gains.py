@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mimopilot.common.errors import check_choice
-from mimopilot.common.files import read_bytes, sha256
+from mimopilot.common.files import check_file, read_bytes, sha256
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains, Triple
@@ -126,8 +126,7 @@ def read_source(path: Path) -> ParameterSource:
     Error
         When the file cannot be read, is neither, or is a log of another vehicle than a multirotor.
     """
-    if not path.is_file():
-        raise TuningError(f"{path}: no such file; give a parameter file or a flight log")
+    check_file(path, "a parameter file or a flight log", TuningError)
     found, _ = log_format(path)
     if found is None or (found.takes_columns and ".csv" in found.suffixes):  # parameter files have commas, too
         values = {name: entry.value for name, entry in read_parameter_file(path).items()}

@@ -10,7 +10,6 @@ import select
 import time
 from typing import Any
 
-import serial
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.errors import SitlError
@@ -47,15 +46,11 @@ class SerialPlant:
         if not self.device or not (baud.isascii() and baud.isdigit()):
             raise SitlError(f"--serial {url}: expected DEVICE,BAUD such as /dev/ttyACM0,921600")
         self.baud = int(baud)
-        try:
-            self.port = self._open()
-        except (OSError, ValueError) as error:
-            raise SitlError(
-                f"--serial {url}: cannot be opened: {error}; is the board connected?", exit_code=1
-            ) from error
+        self.url = url
+        self.port = self._open()
 
     def _open(self) -> Any:
-        return serial.Serial(self.device, self.baud, timeout=0, write_timeout=WRITE_S, exclusive=True)
+        return open_serial("--serial", self.url, self.device, self.baud, WRITE_S, exclusive=True)
 
     def serve(self) -> None:
         """Serve for ever; a board that disconnects (they do when they reboot) may reconnect."""
@@ -73,7 +68,7 @@ class SerialPlant:
             try:
                 self.port = self._open()
                 return
-            except OSError:
+            except SitlError:
                 time.sleep(REOPEN_S)
 
     def _fly(self) -> None:
