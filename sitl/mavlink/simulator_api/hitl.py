@@ -16,6 +16,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import MAX_CATCH_UP_S, SimulatedVehicle
 from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, READ_BYTES
+from mimopilot.sitl.mavlink.wire.serial_ports import open_serial
 from mimopilot.sitl.physics.rigid_body import MAX_ROTORS
 
 STALE_S = 0.5  # s without commands after which the motors stop, as speed controllers do; chosen
