@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from mimopilot.common.errors import Error
-from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text
+from mimopilot.common.toml import GAINS_FILE, parse_toml, read_toml, shown, shown_text
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.control_laws import LAWS
 from mimopilot.tuning.errors import TuningError
@@ -40,7 +40,7 @@ def load_gains(path: str | Path) -> Gains:
     Error
         When the file is missing, is not TOML, lacks a matrix, or has a number that is not finite.
     """
-    return _gains(read_toml(Path(path), "gains file"), str(path))
+    return _gains(read_toml(Path(path), GAINS_FILE), str(path))
 
 
 def gains_from_toml(text: str, where: str) -> Gains:

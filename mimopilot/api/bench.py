@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 from mimopilot.api.arguments import given_gains, given_vehicle
 from mimopilot.common.blas import reproducible
+from mimopilot.common.errors import check_choice
 
 if TYPE_CHECKING:
     from mimopilot.api.arguments import GainSet, PathLike
@@ -93,8 +94,7 @@ def fly(
     from mimopilot.sitl.flight.scenario import Scenario, scenario_of
     from mimopilot.sitl.flight.simulator import fly as fly_scenario
 
-    if on not in ("native", "cortex-m4"):
-        raise SitlError(f"on: got {on!r}, expected native or cortex-m4")
+    check_choice("on", on, ("native", "cortex-m4"), SitlError)
     body, controller = given_vehicle(airframe, gains)
     task = (
         scenario

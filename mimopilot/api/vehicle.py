@@ -192,10 +192,6 @@ def autotune(
     Error
         When they were not: the message says why, and which gains the vehicle holds.
     """
-    from mimopilot.common.extras import REPORT, VEHICLE
-
-    VEHICLE.need()
-    REPORT.need()
     from mimopilot.sitl.field.autotune_console import SilentAnswers
     from mimopilot.sitl.field.autotune_run import AutotuneOptions
     from mimopilot.sitl.field.workflow import autotune as run

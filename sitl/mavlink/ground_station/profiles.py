@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
@@ -207,8 +208,7 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
             f"the gains are for {gains.controller}: Betaflight takes no parameters over MAVLink; write lines for its "
             f"command line: mimopilot params FILE --format {BETAFLIGHT}, of gains from tune LOG --profile {BETAFLIGHT}"
         )
-    if profile not in PROFILES:
-        raise SitlError(f"--profile: got {profile!r}, expected one of {', '.join(PROFILES)}")
+    check_choice("--profile", profile, PROFILES, SitlError)
     if law_of(profile) != gains.controller:
         raise SitlError(
             f"--profile {profile}: the gains are for {gains.controller}; upload them with --profile "
