@@ -4,8 +4,15 @@ from __future__ import annotations
 
 import math
 
+from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Exchange, Outgoing, RequestMessage
-from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, REPEAT_REQUEST_S, FlightMonitor, Streams
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import (
+    POLL_S,
+    REPEAT_REQUEST_S,
+    FlightMonitor,
+    Streams,
+    request_streams,
+)
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 
 #: Message -> (number, interval in us) that the vehicle is requested to stream.
@@ -85,6 +92,34 @@ def not_hovering(client: ParameterClient, monitor: FlightMonitor) -> str:
     if not client.vehicle.armed:
         return "the vehicle is not armed: take off and hover first"
     return "" if monitor.in_air else "the vehicle is on the ground: take off and hover first"
+
+
+def check_hover(
+    client: ParameterClient, streams: Streams, wrong_mode: str, largest_tilt: float
+) -> Exchange[FlightMonitor]:
+    """Request the vehicle's streams; check that it hovers in calm air, with battery and card for an experiment.
+
+    Parameters
+    ----------
+    client : ParameterClient
+    streams : mapping
+    wrong_mode : str
+        Why its mode does not allow the experiment; empty: it does.
+    largest_tilt : float, rad
+        At which the experiment would be stopped.
+
+    Raises
+    ------
+    SitlError
+        If it does not.
+    """
+    monitor = yield from request_streams(client, streams)
+    yield from request_status(client, monitor)
+    problem = not_hovering(client, monitor) or wrong_mode or supplies_problem(monitor)
+    problem = problem or (yield from watch_hover(client, monitor, largest_tilt))
+    if problem:
+        raise SitlError(f"{problem}; nothing was written", exit_code=1)
+    return monitor
 
 
 def stop_reason(client: ParameterClient, monitor: FlightMonitor, mode: int, largest_tilt: float) -> str:

@@ -42,11 +42,8 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
 )
 from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     FLIGHT_STREAMS,
-    not_hovering,
-    request_status,
+    check_hover,
     stop_reason,
-    supplies_problem,
-    watch_hover,
 )
 from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     identify,
@@ -57,7 +54,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     values_of,
     write_back,
 )
-from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor, request_streams
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Answer, ParameterClient
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES, nav_state
@@ -232,18 +229,12 @@ class Px4Autotune(ExperimentProfile):
 
     def check(self, session: VehicleSession) -> FlightMonitor:
         """Check that the vehicle hovers in its mode in calm air, and that the autotune runs and the log is fast."""
-        client = session.client
-        vehicle = identify(session, self.name)
-        monitor = session.run(request_streams(client, FLIGHT_STREAMS))
-        session.run(request_status(client, monitor))
-        problem = not_hovering(client, monitor)
-        wanted = EXCITED_MODES[self.options.mode][0]
-        if not problem and nav_state(vehicle.mode) != wanted:
-            problem = f"the vehicle is not in the mode {self.options.mode}: change to it, or name its mode with --mode"
-        problem = problem or supplies_problem(monitor)
-        problem = problem or session.run(watch_hover(client, monitor, self.tilt))
-        if problem:
-            raise SitlError(f"{problem}; nothing was written", exit_code=1)
+        wrong_mode = ""
+        if nav_state(identify(session, self.name).mode) != EXCITED_MODES[self.options.mode][0]:
+            wrong_mode = (
+                f"the vehicle is not in the mode {self.options.mode}: change to it, or name its mode with --mode"
+            )
+        monitor = session.run(check_hover(session.client, FLIGHT_STREAMS, wrong_mode, self.tilt))
         self._check_prepared(self._read(session))
         return monitor
 

@@ -27,11 +27,8 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
 from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     ALTITUDE_STREAM,
     FLIGHT_STREAMS,
-    not_hovering,
-    request_status,
+    check_hover,
     stop_reason,
-    supplies_problem,
-    watch_hover,
 )
 from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     identify,
@@ -41,7 +38,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     values_of,
     write_back,
 )
-from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor, request_streams
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 
@@ -124,21 +121,13 @@ class SystemIdentification(ExperimentProfile):
 
     def check(self, session: VehicleSession) -> FlightMonitor:
         """Check that the vehicle hovers in Stabilize in calm air."""
-        client = session.client
-        vehicle = identify(session, self.name)
-        monitor = session.run(request_streams(client, {**FLIGHT_STREAMS, **ALTITUDE_STREAM}))
-        session.run(request_status(client, monitor))
-        problem = not_hovering(client, monitor)
-        if not problem and vehicle.mode != STABILIZE:
-            problem = (
-                f"the vehicle is in mode {vehicle.mode}: change to Stabilize; ArduCopter enters SystemID on the mixer "
-                "only from a mode with manual throttle, so the altitude is the pilot's"
+        wrong_mode, mode = "", identify(session, self.name).mode
+        if mode != STABILIZE:
+            wrong_mode = (
+                f"the vehicle is in mode {mode}: change to Stabilize; ArduCopter enters SystemID on the mixer only "
+                "from a mode with manual throttle, so the altitude is the pilot's"
             )
-        problem = problem or supplies_problem(monitor)
-        problem = problem or session.run(watch_hover(client, monitor, self.tilt))
-        if problem:
-            raise SitlError(f"{problem}; nothing was written", exit_code=1)
-        return monitor
+        return session.run(check_hover(session.client, {**FLIGHT_STREAMS, **ALTITUDE_STREAM}, wrong_mode, self.tilt))
 
     @property
     def settings(self) -> dict[str, float]:
