@@ -25,7 +25,9 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.spec import TuningSpec
 
-#: Most logs of one page, which stays below 6 MB: plotly.js has 4.8, a first log 0.5.
+#: Bytes of a page, at most: what mail and a slow link carry. plotly.js has 4.8 MB of it.
+LARGEST_PAGE = 6_000_000
+#: Most logs of one page: more lines in a figure cannot be told apart.
 MOST_LOGS = 4
 
 
@@ -52,7 +54,7 @@ class FlightReport:
 
     def write(self, out: Path, figures: Path | None = None) -> list[Path]:
         """Write the page, and its figures as PNG and SVG into a folder; returns the files."""
-        write_report(out, self.title, self.lead, self.sections, self.headline)
+        write_report(out, self.title, self.lead, self.sections, self.headline, LARGEST_PAGE)
         if figures is None:
             return [out]
         from mimopilot.common.figure_images import write_images
