@@ -54,11 +54,15 @@ class Section:
 
 @dataclass(frozen=True)
 class Headline:
-    """The conclusion at the top: a sentence, what to do next, and a colour: ``good``, ``doubt`` or ``bad``."""
+    """The conclusion at the top: a sentence, what to do next, a colour, and what the conclusion rests on.
+
+    The colour is ``good``, ``doubt`` or ``bad``.
+    """
 
     sentence: str
     steps: Sequence[str] = ()
     tone: str = "doubt"
+    notes: Sequence[str] = ()
 
 
 def write_report(

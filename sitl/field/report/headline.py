@@ -65,7 +65,8 @@ def headline(flights: Sequence[ReportedFlight], cases: Sequence[GainCase]) -> He
         sentence, tone = f"{before}{name} cannot be judged from this flight: {case.unknown}.", "doubt"
     else:
         sentence = f"{before}{name} are {certificate.verdict}: {certificate.reason}."
-    return Headline(sentence, [_next_step(case, certificate), *coherence_notes(case)], "bad" if crashed else tone)
+    steps = [_next_step(case, certificate)]
+    return Headline(sentence, steps, "bad" if crashed else tone, coherence_notes(case))
 
 
 def _next_step(case: GainCase, certificate: Certificate) -> str:

@@ -48,7 +48,8 @@ def coherence_note(plant: PlantResponse, loops: NDArray[np.complex128], omega: N
     ranges = weak_ranges(plant)
     if not ranges:
         return ""
-    weak = np.any([(plant.omega >= low) & (plant.omega <= high) for low, high in ranges], axis=0)
+    run = plant.known_run()
+    weak = run[np.any([(plant.omega[run] >= low) & (plant.omega[run] <= high) for low, high in ranges], axis=0)]
     told = (
         f"Coherence of {' or '.join(axis_names(plant.axes))} with the excitation is below {COHERENT:g} at "
         f"{_in_words(ranges)}, inside the known band: other things also move the vehicle there. The margins include "
