@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from mimopilot.common.blas import reproducible
+from mimopilot.common.errors import check_choice
 
 if TYPE_CHECKING:
     from mimopilot.sitl.field.autotune_run import AutotuneDialogue
@@ -491,8 +492,7 @@ def fly(
     from mimopilot.sitl.flight.scenario import Scenario, scenario_of
     from mimopilot.sitl.flight.simulator import fly as fly_scenario
 
-    if on not in ("native", "cortex-m4"):
-        raise SitlError(f"on: got {on!r}, expected native or cortex-m4")
+    check_choice("on", on, ("native", "cortex-m4"), SitlError)
     body, controller = vehicle(airframe, gains)
     task = (
         scenario
@@ -704,10 +704,6 @@ def autotune(
     Error
         When they were not: the message says why, and which gains the vehicle holds.
     """
-    from mimopilot.common.extras import REPORT, VEHICLE
-
-    VEHICLE.need()
-    REPORT.need()
     from mimopilot.sitl.field.autotune_console import SilentAnswers
     from mimopilot.sitl.field.autotune_run import AutotuneOptions
     from mimopilot.sitl.field.workflow import autotune as run

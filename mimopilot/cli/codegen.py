@@ -31,7 +31,11 @@ def register(app: typer.Typer) -> None:
 def generate(
     gains: GainsArgument,
     out: Annotated[
-        Path, typer.Option(help="Folder to write to; changed files are replaced, nothing is deleted, no link followed.")
+        Path,
+        typer.Option(
+            file_okay=False,
+            help="Folder to write to; changed files are replaced, nothing is deleted, no link followed.",
+        ),
     ],
     target: Annotated[
         str,

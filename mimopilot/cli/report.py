@@ -29,12 +29,13 @@ def report(
     logs: Annotated[
         list[Path], typer.Argument(help="Any flight log; two or three to compare flights, the one before first.")
     ],
-    out: Annotated[Path, typer.Option(help="The page to write (HTML).")],
+    out: Annotated[Path, typer.Option(dir_okay=False, help="The page to write (HTML).")],
     gains: Annotated[
         list[Path] | None, typer.Option(help="Gains file to show beside the flown gains; may be repeated.")
     ] = None,
     figures: Annotated[
-        Path | None, typer.Option(help="Folder for the same figures as PNG and SVG; made if it is missing.")
+        Path | None,
+        typer.Option(file_okay=False, help="Folder for the same figures as PNG and SVG; made if it is missing."),
     ] = None,
     spec: Annotated[
         Path | None, typer.Option(help="Specification (TOML) whose [certificate] says what margins are needed.")

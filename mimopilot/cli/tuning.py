@@ -13,7 +13,7 @@ from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, Profil
 from mimopilot.cli.report import check_count, write_report_of
 from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
 from mimopilot.common.console import print_json, print_table, print_text, progress_console
-from mimopilot.common.errors import check_not_given
+from mimopilot.common.errors import Error, check_not_given
 from mimopilot.common.progress import step
 from mimopilot.common.text_table import with_deviation
 from mimopilot.common.verbosity import warn
@@ -106,13 +106,15 @@ def tune(
         spec,
         profile=profile,
         method=method,
-        inner=parse_model(inner) if inner else None,
-        outer=parse_model(outer) if outer else None,
+        inner=parse_model(inner, "--inner") if inner else None,
+        outer=parse_model(outer, "--outer") if outer else None,
         structure=structure,
         follow_model=follow_model or None,
         instrument=instrument or ("repeated" if repeat else None),
         window=window,
     )
+    if out.is_dir() and not campaign:
+        raise Error(f"--out: {out} is a folder; give the file to write, FILE.gains.toml, or --campaign")
     if campaign:
         check_not_given("belongs to one log, --campaign tunes many; leave it out", repeat=repeat, report=report)
         tune_campaign(logs, task, out, load_columns(columns) if columns else None, as_json)
@@ -222,7 +224,9 @@ def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Column
 def certify(
     log: LogArgument,
     gains: Annotated[Path, typer.Option(help="Gains file to examine.")],
-    out: Annotated[Path | None, typer.Option(help="Write the gains with their certificate to this file.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Write the gains with their certificate to this file.")
+    ] = None,
     rate: Annotated[
         float | None,
         typer.Option(help="Carry the gains to this control rate, Hz, and examine them there; by default their own."),
@@ -258,7 +262,7 @@ def certify(
 def advise(
     log: LogArgument,
     spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
+    out: Annotated[Path | None, typer.Option(dir_okay=False, help="Write the recommended gains to this file.")] = None,
     columns: ColumnsOption = None,
     report: ReportOption = None,
     as_json: JsonOption = False,

@@ -192,7 +192,7 @@ class Variation(_VariationTable):
 
 def read_variation(path: Path) -> dict[str, Any]:
     """Read and check a specification file; returns its table, see `variation_from_toml`."""
-    table = read_toml(path, "specification")
+    table = read_toml(path, "specification of what varies", "give that with --gains")
     checked(Variation, table, str(path))
     return table
 

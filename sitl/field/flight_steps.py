@@ -44,7 +44,7 @@ def fly_experiment(run: AutotuneRun) -> Found:
     """
     before = list_logs(run)
     saved: dict[str, float] = {}
-    profile = experiment_profile(run.options.profile, _excitation(run.options), saved.update)
+    profile = experiment_profile(run.options.profile, excitation_of(run.options), saved.update)
     with run.vehicle(integers=profile.integers) as session:
         vehicle = session.run(session.client.await_heartbeat())
         try:
@@ -73,7 +73,8 @@ def fly_experiment(run: AutotuneRun) -> Found:
     return {"logs_before": before, "seconds": result.seconds}
 
 
-def _excitation(options: AutotuneOptions) -> ExcitationOptions:
+def excitation_of(options: AutotuneOptions) -> ExcitationOptions:
+    """What the experiment excites, from the options."""
     return ExcitationOptions(
         axis="all" if options.profile == "mimo" else None,
         seconds_per_axis=options.seconds_per_axis,

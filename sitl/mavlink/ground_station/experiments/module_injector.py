@@ -49,7 +49,7 @@ def check_settings(values: Mapping[str, float]) -> None:
         Naming the first one.
     """
     for setting in EXCITATION:
-        value = values[setting.name]
+        value = values.get(setting.name, setting.default)
         if not setting.minimum <= value <= setting.maximum:
             expected = f"{setting.minimum:g} to {setting.maximum:g} {setting.unit}".rstrip()
             raise SitlError(f"{setting.name}: got {value:g}, expected {expected} ({setting.description})")

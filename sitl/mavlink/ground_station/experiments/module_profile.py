@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import ClassVar
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.excitation_flight import AMPLITUDE, VEHICLE_YAW_AMPLITUDE
@@ -56,25 +57,26 @@ def injector_settings(excitation: ExcitationOptions, Ts: float) -> dict[str, flo
     TuningError
         If the bandwidth is wrong.
     """
-    axis = excitation.axis or "all"
-    for option, value, known in (("--axis", axis, AXES), ("--mode", excitation.mode, EXCITED_MODES)):
-        if value not in known:
-            raise SitlError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
     hold_min, hold_max = hold_from_bandwidth(excitation.bandwidth, Ts)
-    values = {
+    values = _settings(excitation) | {"MIMO_EX_HMIN": hold_min, "MIMO_EX_HMAX": hold_max}
+    check_settings(values)
+    return {name: single(values[name]) for name in NAMES}
+
+
+def _settings(excitation: ExcitationOptions) -> dict[str, float]:
+    """The parameters that do not depend on the control period, which only the vehicle knows."""
+    axis = excitation.axis or "all"
+    check_choice("--axis", axis, AXES, SitlError)
+    check_choice("--mode", excitation.mode, EXCITED_MODES, SitlError)
+    return {
         AXIS: AXES[axis],
         "MIMO_EX_AMP": AMPLITUDE if excitation.amplitude is None else excitation.amplitude,
         "MIMO_EX_AMPY": VEHICLE_YAW_AMPLITUDE if excitation.yaw_amplitude is None else excitation.yaw_amplitude,
-        "MIMO_EX_HMIN": hold_min,
-        "MIMO_EX_HMAX": hold_max,
         "MIMO_EX_DUR": excitation.seconds_per_axis,
         "MIMO_EX_SEED": excitation.seed,
         "MIMO_EX_MODE": EXCITED_MODES[excitation.mode][0],
         "MIMO_EX_TILT": math.radians(excitation.tilt_deg),
     }
-    wanted = {name: single(values[name]) for name in NAMES}
-    check_settings(wanted)
-    return wanted
 
 
 def check_log(session: VehicleSession) -> None:
@@ -106,6 +108,7 @@ class ModuleInjection(ExperimentProfile):
 
     def __init__(self, options: ExcitationOptions, save: SaveValues) -> None:
         super().__init__(options, save)
+        check_settings(_settings(options))  # before a vehicle is in the air
         self.wanted: dict[str, float] = {}
 
     def prepare(self, session: VehicleSession) -> Preparation:

@@ -20,6 +20,7 @@ from typing import ClassVar
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
     UNKNOWN_INDEX,
@@ -165,8 +166,7 @@ class Px4Autotune(ExperimentProfile):
                 f"--amplitude: got {amplitude:g}, expected {AMPLITUDES[0]:g} to {AMPLITUDES[1]:g} rad/s, of the rate "
                 "setpoint"
             )
-        if options.mode not in EXCITED_MODES:
-            raise SitlError(f"--mode: got {options.mode!r}, expected one of {', '.join(EXCITED_MODES)}")
+        check_choice("--mode", options.mode, EXCITED_MODES, SitlError)
         if options.axis not in (None, "all"):
             raise SitlError("--axis: PX4's autotune excites roll, pitch and yaw, one after the other; leave it out")
         self.runs = DEFAULT_RUNS if options.runs is None else options.runs

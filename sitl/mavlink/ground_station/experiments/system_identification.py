@@ -11,6 +11,7 @@ from typing import ClassVar
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.excitation_flight import AMPLITUDE
 from mimopilot.sitl.mavlink.ground_station.events import Exchange
@@ -80,8 +81,7 @@ class SystemIdentification(ExperimentProfile):
     def __init__(self, options: ExcitationOptions, save: SaveValues) -> None:
         super().__init__(options, save)
         axis = options.axis or "all"
-        if axis not in AXES:
-            raise SitlError(f"--axis: got {axis!r}, expected one of {', '.join(AXES)}")
+        check_choice("--axis", axis, AXES, SitlError)
         if options.runs is not None:
             raise SitlError("--runs: belongs to --profile px4-stock; give --seconds-per-axis for a longer chirp")
         self.axes, self.tilt = AXES[axis], math.radians(options.tilt_deg)

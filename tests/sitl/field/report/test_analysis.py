@@ -41,7 +41,7 @@ from mimopilot.sitl.field.report.sections.stability import crossover, loops_of, 
 from mimopilot.sitl.field.report.sections.tracking import busiest, tracking_error
 from mimopilot.tuning.axes import law_of
 from mimopilot.tuning.certificate import Thresholds
-from mimopilot.tuning.law_terms import StockFilters
+from mimopilot.tuning.law_filters import StockFilters
 from mimopilot.tuning.logs.resample import Series
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import TuningSpec
