@@ -17,6 +17,8 @@ from mimopilot.common.files import write_atomically
 LONGEST_CELL = 40
 #: Samples of a line below which a figure is of no use.
 FEWEST_SAMPLES = 100
+#: Share of the samples that is left where a page is too large; chosen: a step takes a fraction of a second.
+FEWER = 0.8
 
 TEMPLATE = Path(__file__).with_name("html_report.html.jinja")
 
@@ -86,7 +88,7 @@ def write_report(
     headline : Headline, optional
         Conclusion above the first paragraph.
     largest : int, optional
-        Bytes of the page, at most: its figures are drawn with fewer samples, in steps of a half, until they fit.
+        Bytes of the page, at most: its figures are drawn with fewer samples, step by step, until they fit.
 
     Raises
     ------
@@ -95,7 +97,7 @@ def write_report(
     """
     text, samples = _page(title, lead, sections, headline), MOST_SAMPLES
     while largest is not None and len(text.encode()) > largest:
-        samples //= 2
+        samples = int(FEWER * samples)
         if samples < FEWEST_SAMPLES:
             raise Error(
                 f"{path.name}: the page would have more than {largest / 1e6:g} MB; name fewer logs or gain sets"

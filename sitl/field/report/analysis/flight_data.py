@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.common.charts import INJECTED, IS_FLOWN, IS_NEW, IS_SISO, LIMIT, looks
-from mimopilot.common.figures import MOST_SAMPLES
+from mimopilot.common.figures import MOST_SAMPLES, thinned
 from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals, further_signals
 from mimopilot.tuning.analysis.certify import reason_unknown
 from mimopilot.tuning.design.cascade import certify_around
@@ -102,6 +102,13 @@ class ReportedFlight:
     def since_begin(self, series: Series) -> Series:
         """A series with its time from the beginning of the log, s."""
         return Series(series.time - self.span[0], series.values, series.topic)
+
+    def drawn(self, time: Signal, values: Signal, share: float = 1.0) -> tuple[Signal, Signal]:
+        """A signal (N,) as a line of at most a share of `samples`, interrupted where the log has a gap."""
+        pauses = np.diff(time)
+        after = np.flatnonzero(pauses > MAX_GAP * np.median(pauses)) + 1 if len(pauses) else []
+        x, y = np.insert(time, after, time[after]), np.insert(np.asarray(values, np.float64), after, np.nan)
+        return thinned(x, y, int(share * self.samples))
 
     @cached_property
     def airborne(self) -> tuple[Interval, ...]:

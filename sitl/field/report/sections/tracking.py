@@ -89,7 +89,7 @@ def yaw_charts(flight: ReportedFlight, number: int, count: int) -> list[Chart]:
             if name in yaw:
                 series = flight.since_begin(yaw[name])
                 inside = (series.time >= parts[0][0]) & (series.time <= parts[-1][1])
-                x, y = thinned(series.time[inside], factor * series.values[inside, 0], flight.samples)
+                x, y = flight.drawn(series.time[inside], factor * series.values[inside, 0])
                 if len(y) > 1 and (name != injected or y.any()):
                     lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
         if response in yaw and lines and np.ptp(yaw[response].values):  # a column of zeros is no signal
@@ -149,7 +149,7 @@ def _panels(flight: ReportedFlight, part: Interval, model: Gains | None) -> list
                 series = flight.signal(signal) if signal else None
                 if series is not None:
                     inside = (series.time >= part[0]) & (series.time <= part[1])
-                    x, y = thinned(series.time[inside], factor * series.values[inside, axis], flight.samples)
+                    x, y = flight.drawn(series.time[inside], factor * series.values[inside, axis])
                     if len(y) > 1 and (label != "injected" or y.any()):
                         lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
             if any(line.label in ("response", "torque u") for line in lines):

@@ -17,7 +17,7 @@ from mimopilot.common.html_report import Section, write_report
 from mimopilot.common.plotly_page import charts_json, plotly_script
 from mimopilot.sitl.field.report.analysis.flight_data import PHASES, ReportedFlight
 from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals
-from mimopilot.sitl.field.report.flight_report import LARGEST_PAGE, MOST_LOGS, make_report
+from mimopilot.sitl.field.report.flight_report import LARGEST_PAGE, MOST_LOGS, check_count, make_report
 from mimopilot.sitl.field.report.sections.timeline import contents_section, timeline_section
 from mimopilot.sitl.studies.reproduce import reproduce
 from mimopilot.tuning.logs.inspection import Inspection
@@ -212,6 +212,17 @@ def test_a_log_that_cannot_be_tuned_from_says_why_and_shows_the_rest(folder):
         assert section.charts or section.tables or section.text, section.heading
 
 
+def test_a_line_is_interrupted_where_the_log_has_a_gap(tmp_path):
+    columns = table(make_flight(seconds=12.0, Ts=0.02))
+    kept = (columns["t"] < 14.0) | (columns["t"] > 16.0)
+    report = make_report([write_csv(tmp_path / "gap.csv", {name: one[kept] for name, one in columns.items()})])
+    for name, title in (("timeline-1", "Angles"), ("tracking-1", "roll rate")):
+        chart = next(one for one in report.charts if one.name == name)
+        for line in next(panel for panel in chart.panels if panel.title == title).lines:
+            (gap,) = np.flatnonzero(np.isnan(line.y))
+            assert (line.x[gap - 1], line.x[gap + 1]) == pytest.approx((4.0, 6.0), abs=0.03)
+
+
 def test_a_crash_is_in_the_headline_and_in_the_timeline(tmp_path):
     columns = table(make_flight(seconds=20.0))
     fallen = columns["t"] > 26.0
@@ -256,6 +267,8 @@ def test_commands_write_the_page_and_refuse_what_is_no_log(folder, mimopilot, tm
     assert_one_clear_line(mimopilot("report", "no.txt", "--out", "page.html"), "no.txt", "not a flight log")
     too_many = mimopilot("report", *[folder / "slow.csv"] * (MOST_LOGS + 1), "--out", "page.html")
     assert_one_clear_line(too_many, f"{MOST_LOGS + 1} logs")
+    with pytest.raises(Error, match="2 logs and 4 gain sets: a report has colours for 5 together"):
+        check_count(2, 4)
 
 
 def test_thinning_keeps_extremes_gaps_and_equal_steps():
