@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from mimopilot.common.console import print_json, print_table
+from mimopilot.common.errors import check_choice
 from mimopilot.common.files import write_atomically
 from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
@@ -17,7 +18,7 @@ from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
 from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
-from mimopilot.tuning.law_terms import BETAFLIGHT
+from mimopilot.tuning.law_filters import BETAFLIGHT
 from mimopilot.tuning.parameters import PARAMETERS
 
 #: Format -> code generation target that emits it, and its path there.
@@ -65,8 +66,7 @@ def export(file: Path | None, options: LinkOptions, form: str, out: Path | None,
         If the format is unknown, or there is nothing to export.
     """
     from_gains = (*GENERATED, BETAFLIGHT)
-    if form not in (*FORMATS, *from_gains):
-        raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *from_gains])}")
+    check_choice("--format", form, (*FORMATS, *from_gains), SitlError)
     if file is not None:
         gains = load_gains(file)
         warning = check_verdict(gains, allow=uncertified)
