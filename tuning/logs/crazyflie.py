@@ -93,8 +93,8 @@ STOCK_NOTE = (
 RADIO_NOTE = "each log block over the radio is a sample at 100 Hz or less of a loop at 500 Hz, without a filter before"
 #: States in which the stock PID flies.
 STOCK_FLIES = (ControllerState.STOCK, ControllerState.OTHER_FIRMWARE)
-#: Our controller's setpoint of roll: NaN while rates are flown.
-SETPOINT = f"{GROUP}.rollSp"
+#: Our controller's setpoint of roll, NaN while rates are flown, and its rate, which is not.
+SETPOINT, RATE = f"{GROUP}.rollSp", f"{GROUP}.p"
 #: What flies, as our controller logs it; and the whole log.
 STATUS, ALWAYS = f"{GROUP}.state", ((-math.inf, math.inf),)
 STOCK_FLEW = (
@@ -270,7 +270,7 @@ def _what_flew(
 
 def _attitude_flown(block: LogBlock) -> tuple[LogBlock, list[str]]:
     """The samples in which our controller flew an attitude setpoint, and a warning if it flew rates in others."""
-    rates = np.isnan(block.variables.get(SETPOINT, np.zeros(1)))
+    rates = np.isnan(block.variables.get(SETPOINT, np.zeros(1))) & np.isfinite(block.variables.get(RATE, np.zeros(1)))
     if not rates.any():
         return block, []
     warning = f"{SETPOINT} is NaN for {_share(rates):.0f} % of the log: rates were flown, without an attitude setpoint"
