@@ -10,8 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationIn
 from mimopilot.common.errors import InputFileError
 from mimopilot.common.toml import checked, complaint, read_toml
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
+from mimopilot.tuning.control_laws import LAWS
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law_terms import LAWS, MIMO
+from mimopilot.tuning.law_filters import MIMO
 from mimopilot.tuning.reference_model import ContinuousModel, ReferenceModel, SecondOrder, model_from_table
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

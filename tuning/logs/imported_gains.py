@@ -18,7 +18,7 @@ from mimopilot.common.files import check_file, read_bytes, sha256
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains, Triple
-from mimopilot.tuning.law_terms import MIMO
+from mimopilot.tuning.law_filters import MIMO
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.logs.formats import log_format
 from mimopilot.tuning.logs.parameter_file import read_parameter_file

@@ -18,7 +18,7 @@ from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
 from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
-from mimopilot.tuning.law_terms import BETAFLIGHT
+from mimopilot.tuning.law_filters import BETAFLIGHT
 from mimopilot.tuning.parameters import PARAMETERS
 
 #: Format -> code generation target that emits it, and its path there.

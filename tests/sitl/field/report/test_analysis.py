@@ -35,7 +35,7 @@ from mimopilot.sitl.field.report.sections.frequency import coherence_band
 from mimopilot.sitl.field.report.sections.tracking import tracking_error
 from mimopilot.tuning.axes import law_of
 from mimopilot.tuning.certificate import Thresholds
-from mimopilot.tuning.law_terms import StockFilters
+from mimopilot.tuning.law_filters import StockFilters
 from mimopilot.tuning.logs.resample import Series
 from mimopilot.tuning.reference_model import second_order
 from tests.tuning.logs.flights import make_flight, px4_topics, table, write_csv, write_ulog
