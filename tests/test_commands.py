@@ -145,7 +145,7 @@ def test_models_window_and_specification_are_taken(mimopilot, log, tmp_path):
         (("tune", "cut.ulg", "--out", "x.toml"), ("cut.ulg",)),
         (("tune", "LOG", "--inner", "20", "--out", "x.toml"), ("expected OMEGA,ZETA,DELAY",)),
         (("tune", "LOG", "--inner", "20,-1,0", "--out", "x.toml"), ("inner", "damping -1")),
-        (("tune", "LOG", "--method", "magic", "--out", "x.toml"), ("method", "'mimo' or 'siso'")),
+        (("tune", "LOG", "--method", "magic", "--out", "x.toml"), ("--method: got 'magic', expected mimo or siso",)),
         (("tune", "LOG", "--outer", "0.5,0.7,0", "--out", "x.toml"), ("too short",)),
         (("generate", "bad.toml", "--out", "cpp"), ("bad.toml", "schema")),
         (("experiment", "adam0", "--axis", "up", "--out", "x.ulg"), ("axis: got 'up'",)),
@@ -311,8 +311,7 @@ def test_help_and_manual_name_every_target_and_airframe(mimopilot):
         assert f"{name}: {target.help}" in help_text
         assert f"--target {name}" in manual
         for option, values in target.options.items():
-            assert f"--{option.replace('_', '-')}" in help_text
-            assert all(value in help_text for value in values)
+            assert f"{option.replace('_', '-')} ({name}): {', '.join(values)}" in help_text
     flights = mimopilot("fly", "--help").stdout
     for name in known_airframes():
         assert name in flights

@@ -57,11 +57,14 @@ def report(
         charts = [chart.name for chart in found.charts]
         tables = {one.caption: [dict(zip(one.columns, row, strict=False)) for row in one.rows] for one in found.tables}
         head = {"headline": found.headline.sentence, "next": list(found.headline.steps), "tone": found.headline.tone}
+        head["notes"] = list(found.headline.notes)
         print_json({"out": str(out), **head, "figures": charts, "tables": tables})
         return
     print(found.headline.sentence)
     for step in found.headline.steps:
         print(f"next: {step}")
+    for note in found.headline.notes:
+        print(f"note: {note}")
     print(f"written to {out}" + (f", figures to {figures}" if figures else ""))
 
 
