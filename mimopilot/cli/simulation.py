@@ -184,7 +184,7 @@ def experiment(
             ),
         )
         return
-    from mimopilot.api import vehicle
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, default_amplitude
 
     check_not_given("belong to --connect", mode=mode, tilt_deg=tilt_deg, profile=profile, snapshot=snapshot)
@@ -192,7 +192,7 @@ def experiment(
         raise SitlError("--out: name the log to write, FILE.ulg")
     if out.is_dir() and runs is None:
         raise SitlError(f"--out: {out} is a folder; give the log to write, FILE.ulg, or --runs")
-    body, controller = vehicle(airframe or "", gains)
+    body, controller = given_vehicle(airframe or "", gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
     plan = ExperimentPlan(
         body,
@@ -271,14 +271,14 @@ def fly(
     from dataclasses import asdict, replace
 
     import mimopilot as mp
-    from mimopilot.api import vehicle
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.flight.fault_recovery import recovery
     from mimopilot.sitl.flight.flight_log import save_flight
     from mimopilot.sitl.flight.metrics import FIGURE_LABELS
     from mimopilot.sitl.flight.scenario import AXES, scenario_of
 
-    body, controller = vehicle(airframe, gains)
+    body, controller = given_vehicle(airframe, gains)
     task = scenario_of(scenario, axis, amplitude_deg, period_s, tail_s, fault or (), controller.Ts)
     flight = mp.fly(body, controller, task, seed=seed, on=cast("Literal['native', 'cortex-m4']", on))
     figures: dict[str, Any] = {**asdict(mp.performance(flight, controller)), "crashed_at_s": flight.crashed_at}

@@ -71,13 +71,13 @@ def sitl(
     period_s: PeriodOption = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
-    from mimopilot.api import vehicle
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.faults.kinds import parse_fault
     from mimopilot.sitl.flight.scenario import scenario_of
     from mimopilot.sitl.mavlink.vehicle.sitl_console import SitlOptions, run
 
     check_choice("--autopilot", autopilot, ("mimo", "px4-stock"))
-    body, controller = vehicle(airframe, gains)
+    body, controller = given_vehicle(airframe, gains)
     task, faults = None, tuple(map(parse_fault, fault or ()))
     if scenario is not None:
         task = scenario_of(scenario, axis, amplitude_deg, period_s, None, fault or (), controller.Ts)

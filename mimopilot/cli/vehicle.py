@@ -88,7 +88,7 @@ def upload(
     same system number) the old values are restored, also on an armed vehicle, and the exit code is 1. If the link is
     lost, every parameter that may hold a new value is listed.
     """
-    from mimopilot.api import prepare_upload
+    from mimopilot.api.vehicle import prepare_upload
     from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, upload_with_dialogue
 
     plan, options, loaded, doubt = prepare_upload(

@@ -95,7 +95,7 @@ def autotune(options: AutotuneOptions, dialogue: AutotuneDialogue) -> Decisions:
         raise SitlError(f"--take-off: not with --profile {options.profile}: {pilot}, and leave --take-off out")
     if options.take_off is not None and not TAKE_OFF_M[0] <= options.take_off <= TAKE_OFF_M[1]:
         raise SitlError(f"--take-off: got {options.take_off:g}, expected {TAKE_OFF_M[0]:g} to {TAKE_OFF_M[1]:g} m")
-    experiment_profile(options.profile, excitation_of(options), {}.update)  # refuses impossible options
+    experiment_profile(options.profile, excitation_of(options), lambda values: None)  # refuses impossible options
     run = AutotuneRun(options, load_decisions(options.folder, options.profile), dialogue)
     if run.decisions.result == "old":
         raise SitlError(

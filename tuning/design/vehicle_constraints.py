@@ -21,14 +21,13 @@ from mimopilot.tuning.design.constraints import (
     MotorLimit,
     NoiseLimit,
     ParameterRange,
-    gain_above_band,
-    structural_modes,
 )
 from mimopilot.tuning.design.disturbance_limit import no_softer_than
 from mimopilot.tuning.design.flown_loop import flown_amplitude, flown_loop, flown_noise
 from mimopilot.tuning.design.free_gains import FreeGains
 from mimopilot.tuning.design.positive_integral import MIN_INTEGRAL_RATIO
 from mimopilot.tuning.design.prediction import FAST
+from mimopilot.tuning.design.rate_loop_gain import gain_above_band, structural_modes
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Limits
 from mimopilot.tuning.law import ATTITUDE, TERMS, Filters

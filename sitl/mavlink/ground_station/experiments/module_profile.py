@@ -18,7 +18,6 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
     SaveValues,
     VehicleSession,
 )
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.experiments.module_injector import (
     INTEGERS,
     NAMES,
@@ -34,15 +33,15 @@ from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     values_of,
     write_back,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.upload import read_values
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES
 from mimopilot.tuning.excitation import hold_from_bandwidth
 from mimopilot.tuning.parameters import EXCITATION
+from mimopilot.tuning.px4_names import LOG_PROFILE, TUNING_PROFILE
 
 PX4 = 12  # MAV_AUTOPILOT_PX4
-#: Bits of SDLOG_PROFILE that tuning from a log needs: default, high rate, debug topics.
-LOG_PROFILE, NEEDED = "SDLOG_PROFILE", 1 | 16 | 32
 #: --axis -> value of `AXIS`.
 AXES = {"roll": 1, "pitch": 2, "both": 3, "yaw": 4, "all": 5}
 
@@ -92,10 +91,10 @@ def check_log(session: VehicleSession) -> None:
     if client.vehicle.autopilot != PX4:
         return
     profile = round(session.run(read_values(client, [LOG_PROFILE]))[LOG_PROFILE])
-    if profile & NEEDED != NEEDED:
+    if profile & TUNING_PROFILE != TUNING_PROFILE:
         raise SitlError(
-            f"{LOG_PROFILE} is {profile}: the log rate would be too low for tuning; land, set it to {NEEDED}, and "
-            "take off again",
+            f"{LOG_PROFILE} is {profile}: the log rate would be too low for tuning; land, set it to {TUNING_PROFILE}, "
+            "and take off again",
             exit_code=1,
         )
 
@@ -117,7 +116,7 @@ class ModuleInjection(ExperimentProfile):
         if not self._on_px4(session):
             return Preparation()
         old = values_of(session.run(read_known(session.client, [LOG_PROFILE])))
-        new = {LOG_PROFILE: float(round(old[LOG_PROFILE]) | NEEDED)}
+        new = {LOG_PROFILE: float(round(old[LOG_PROFILE]) | TUNING_PROFILE)}
         if new == old:
             return Preparation()
         self.remember(old)
