@@ -150,11 +150,6 @@ class Filters:
         return (self.shaping_s,) * 3 if self.stock is None else self.stock.shaping_s
 
     @property
-    def least_attitude(self) -> tuple[float, float, float]:
-        """Least Kp_o of a design, see `ControlLaw`; also of our law where the setpoint's rate is fed forward."""
-        return (self.law if self.stock or not self.shaping_s else LAWS[ARDUPILOT_STOCK]).least_attitude
-
-    @property
     def law(self) -> ControlLaw:
         """The law of the gains."""
         return LAWS[MIMO if self.stock is None else self.stock.controller]
@@ -208,9 +203,6 @@ class ControlLaw:
         Keys of the parameter table that it does not have.
     largest : mapping
         Gain -> largest value that the autopilot accepts: roll, pitch, yaw. None: the ranges of our parameter table.
-    least_attitude : tuple of 3 float, 1/s
-        Least Kp_o of a design, unless the flown one is less: where the setpoint's rate is fed forward, following asks
-        for none, and the angle's error after a gust would stay long.
     step : mapping
         Gain -> value of 1 on an autopilot whose gains are whole numbers; empty: they are not.
     shared : tuple of str
@@ -225,7 +217,6 @@ class ControlLaw:
     filters: tuple[str, ...] = ()
     lacks: tuple[str, ...] = field(default=("derivative_cutoff_hz", "Kff_o", "Kaff_i", SLEW, "model_damping", MODEL))
     largest: Mapping[str, tuple[float, float, float]] | None = None
-    least_attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
     step: Mapping[str, float] = field(default_factory=dict)
     shared: tuple[str, ...] = ()
 
@@ -372,8 +363,6 @@ LAWS = {
             "Kd_i": (0.05, 0.05, 0.02),
             "Kff_i": (0.5, 0.5, 0.5),
         },
-        # The same reference; not for yaw, whose torque is weak.
-        least_attitude=(3.0, 3.0, 0.0),
     ),
     BETAFLIGHT: ControlLaw(
         _BETAFLIGHT_TERMS,

@@ -329,7 +329,7 @@ class ResponseDesign:
             ),
             gain_above_band(plant),
             structural_modes(plant, self.limited[place]),
-            self._least_attitude(free.base, place),
+            Definite(ATTITUDE.matrix, np.eye(plant.axes), 0.0),
         ]
         if TERMS["I"].matrix in free.units:
             found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
@@ -340,18 +340,9 @@ class ResponseDesign:
         found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
         found += self._actuators(place, free.base.filters)
         flown = flown_law(self.experiments[place])
-        if flown is not None and any(free.base.filters.shaping):  # else following asks for stiffness
+        if flown is not None:
             found += no_softer_than(_loop_of(flown, plant), step, found)
         return found
-
-    def _least_attitude(self, base: Law, place: int) -> Definite:
-        """The least attitude gain of a design, or the flown one."""
-        axes, flown = self.plants[place].axes, flown_law(self.experiments[place])
-        least = base.filters.least_attitude[axes_slice(axes).start]
-        if flown is not None:
-            least = min(least, float(np.diag(getattr(flown, ATTITUDE.matrix)).min()))
-        name = f"the autopilot's range of {ATTITUDE.matrix}" if least else ""
-        return Definite(ATTITUDE.matrix, np.eye(axes), least, name)
 
     def _actuators(self, place: int, filters: Filters) -> list[Constraint]:
         """Limits of the motors in the manoeuvres of the flown size; for yaw those of its torque and its rate."""
