@@ -366,8 +366,8 @@ def test_a_loop_that_runs_slower_in_flight_is_left_to_the_main_controller_withou
     assert flown[:left].all() and not flown[left:].any()
     # The mean of a second with both intervals is wrong, or the next one's.
     assert 1250 <= left <= 1250 + 2 * 400
-    # Ours held `kept` in its integrators: its torque is that and Kp_i (0.15) times the rate error (0.1 rad/s) on roll.
-    kept = rows[left - 1, TORQUE] - rows[left - 1, LOG_EXCITATION] - [0.15 * 0.1, 0, 0]
+    # Ours held `kept` in its integrators: its torque is that and Kp_i times the rate error (0.1 rad/s of roll).
+    kept = rows[left - 1, TORQUE] - rows[left - 1, LOG_EXCITATION] - 0.1 * np.array([0.15, 0.01, 0])
     assert np.abs(kept).min() > 0.005
     np.testing.assert_allclose(rows[left, TORQUE], MAIN + kept, atol=ONE_PERIOD)
     np.testing.assert_allclose(rows[-1, TORQUE], MAIN + kept, atol=ONE_PERIOD)
