@@ -15,7 +15,8 @@ FROM debian:trixie-slim
 RUN apt-get update \
     && apt-get install -y --no-install-recommends python3 g++ make gcc-arm-none-eabi libnewlib-arm-none-eabi \
     && rm -rf /var/lib/apt/lists/* \
-    && useradd --create-home --uid 1000 pilot
+    && useradd --create-home --uid 1000 pilot \
+    && install --directory --owner=pilot /work
 COPY --from=build /opt/mimopilot /opt/mimopilot
 ENV PATH=/opt/mimopilot/bin:$PATH
 USER 1000

@@ -45,6 +45,7 @@ from mimopilot.codegen.errors import CodegenError
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.toolchain import CXX_FLAGS, cross_tool, run_tool
 from mimopilot.codegen.vectors import SEED, random_inputs
+from mimopilot.common.errors import check_choice
 from mimopilot.tuning.gains import Gains
 
 #: Core clock, Hz: that of the STM32F4 on Pixhawk boards.
@@ -201,8 +202,7 @@ def processor_in_the_loop(
     CodegenError
         If a tool is missing or fails.
     """
-    if emulator not in EMULATORS:
-        raise CodegenError(f"emulator: got {emulator!r}, expected one of {', '.join(EMULATORS)}")
+    check_choice("emulator", emulator, EMULATORS, CodegenError)
     inputs = random_inputs(rows, np.random.default_rng(SEED))
     with tempfile.TemporaryDirectory() as folder:
         image = build_image(gains, Path(folder), flags)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.common.errors import check_choice
 
 if TYPE_CHECKING:  # the command line reads the table for its help and must start fast
     from mimopilot.tuning.gains import Gains
@@ -88,15 +89,15 @@ class Target:
         Raises
         ------
         CodegenError
-            If a value is unknown. Options of other targets are ignored.
+            If an option or its value is unknown. Options of other targets are ignored.
         """
-        known = {name for target in targets().values() for name in target.options}
         for name, value in options.items():
-            if name not in known:
-                raise CodegenError(f"option {name!r}: no target has it; known: {', '.join(sorted(known))}")
-            values = self.options.get(name, (value,))
-            if value not in values:
-                raise CodegenError(f"{name.replace('_', '-')}: got {value!r}, expected one of {', '.join(values)}")
+            owners = [target for target in targets().values() if name in target.options]
+            if not owners:
+                known = sorted({name for target in targets().values() for name in target.options})
+                raise CodegenError(f"option {name!r}: no target has it; known: {', '.join(known)}")
+            values = (self if self in owners else owners[0]).options[name]
+            check_choice(name.replace("_", "-"), value, values, CodegenError)
         return {name: options.get(name, values[0]) for name, values in self.options.items()}
 
 
@@ -128,6 +129,5 @@ def find_target(name: str) -> Target:
     CodegenError
         If there is none; lists the known ones.
     """
-    if name not in targets():
-        raise CodegenError(f"target: got {name!r}, expected one of {', '.join(sorted(targets()))}")
+    check_choice("target", name, sorted(targets()), CodegenError)
     return targets()[name]

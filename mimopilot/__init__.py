@@ -19,28 +19,23 @@ from typing import TYPE_CHECKING, Any
 
 #: Public name -> where it is defined. It is imported when it is first asked for: numpy, scipy and numba take a second.
 _PUBLIC = {
-    **dict.fromkeys(
-        (
-            "read_log",
-            "inspect",
-            "tune",
-            "certify",
-            "advise",
-            "load_gains",
-            "import_params",
-            "generate",
-            "load_airframe",
-            "fly",
-            "performance",
-            "report",
-            "experiment",
-            "upload",
-            "autotune",
-            "list_logs",
-            "download_log",
-        ),
-        "mimopilot.api",
-    ),
+    "read_log": "mimopilot.api.tuning",
+    "inspect": "mimopilot.api.tuning",
+    "tune": "mimopilot.api.tuning",
+    "certify": "mimopilot.api.tuning",
+    "advise": "mimopilot.api.tuning",
+    "load_gains": "mimopilot.api.tuning",
+    "import_params": "mimopilot.api.vehicle",
+    "generate": "mimopilot.api.codegen",
+    "load_airframe": "mimopilot.api.bench",
+    "fly": "mimopilot.api.bench",
+    "performance": "mimopilot.api.bench",
+    "report": "mimopilot.api.report",
+    "experiment": "mimopilot.api.bench",
+    "upload": "mimopilot.api.vehicle",
+    "autotune": "mimopilot.api.vehicle",
+    "list_logs": "mimopilot.api.vehicle",
+    "download_log": "mimopilot.api.vehicle",
     "plot_flight": "mimopilot.plots",
     "plot_bode": "mimopilot.plots",
     "Error": "mimopilot.common.errors",
@@ -53,23 +48,23 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
-    from mimopilot.api import advise as advise
-    from mimopilot.api import autotune as autotune
-    from mimopilot.api import certify as certify
-    from mimopilot.api import download_log as download_log
-    from mimopilot.api import experiment as experiment
-    from mimopilot.api import fly as fly
-    from mimopilot.api import generate as generate
-    from mimopilot.api import import_params as import_params
-    from mimopilot.api import inspect as inspect
-    from mimopilot.api import list_logs as list_logs
-    from mimopilot.api import load_airframe as load_airframe
-    from mimopilot.api import load_gains as load_gains
-    from mimopilot.api import performance as performance
-    from mimopilot.api import read_log as read_log
-    from mimopilot.api import report as report
-    from mimopilot.api import tune as tune
-    from mimopilot.api import upload as upload
+    from mimopilot.api.bench import experiment as experiment
+    from mimopilot.api.bench import fly as fly
+    from mimopilot.api.bench import load_airframe as load_airframe
+    from mimopilot.api.bench import performance as performance
+    from mimopilot.api.codegen import generate as generate
+    from mimopilot.api.report import report as report
+    from mimopilot.api.tuning import advise as advise
+    from mimopilot.api.tuning import certify as certify
+    from mimopilot.api.tuning import inspect as inspect
+    from mimopilot.api.tuning import load_gains as load_gains
+    from mimopilot.api.tuning import read_log as read_log
+    from mimopilot.api.tuning import tune as tune
+    from mimopilot.api.vehicle import autotune as autotune
+    from mimopilot.api.vehicle import download_log as download_log
+    from mimopilot.api.vehicle import import_params as import_params
+    from mimopilot.api.vehicle import list_logs as list_logs
+    from mimopilot.api.vehicle import upload as upload
     from mimopilot.common.errors import Error as Error
     from mimopilot.plots import plot_bode as plot_bode
     from mimopilot.plots import plot_flight as plot_flight

@@ -23,7 +23,7 @@ from hypothesis import HealthCheck, settings
 
 import mimopilot.cli.main as front_door
 from mimopilot.tuning.gains import Gains, Limits, YawGains
-from mimopilot.tuning.law_terms import Filters, StockFilters
+from mimopilot.tuning.law_filters import Filters, StockFilters
 
 #: No deadlines: tests must not depend on the machine's speed.
 settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])

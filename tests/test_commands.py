@@ -311,8 +311,7 @@ def test_help_and_manual_name_every_target_and_airframe(mimopilot):
         assert f"{name}: {target.help}" in help_text
         assert f"--target {name}" in manual
         for option, values in target.options.items():
-            assert f"--{option.replace('_', '-')}" in help_text
-            assert all(value in help_text for value in values)
+            assert f"{option.replace('_', '-')} ({name}): {', '.join(values)}" in help_text
     flights = mimopilot("fly", "--help").stdout
     for name in known_airframes():
         assert name in flights

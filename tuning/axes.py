@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.experiment import MOVES, SIGNALS, Experiment, excited_segments, external_signal
+from mimopilot.tuning.experiment import MOVES, SIGNALS, Experiment, excited_segments, external_signal, largest_move
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import Filters
 from mimopilot.tuning.parameter_row import AXES
@@ -150,7 +150,7 @@ def _check_setpoint(axis: Experiment) -> None:
     """Refuse a heading setpoint that hardly moves, or that is the measured heading while a pilot turns the vehicle."""
     assert axis.r_o is not None
     used = np.concatenate([np.arange(start, stop) for start, stop in axis.segments])
-    moved = float(np.ptp(axis.r_o[used]))
+    moved = largest_move(axis.r_o[:, 0], axis.segments)
     if moved < MOVES:
         raise TuningError(
             f"nothing is injected on yaw, and its heading setpoint moves by {np.degrees(moved):.1f} degrees only (at "

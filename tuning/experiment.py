@@ -197,15 +197,21 @@ def excited_segments(segments: Sequence[tuple[int, int]], signal: Signal) -> lis
     return found
 
 
-def external_yaw_signal(yaw: YawSignals) -> tuple[Signal, str] | None:
-    """External signal of yaw, (N,), and its name, chosen as in `external_signal`; None: yaw is not excited.
+def largest_move(signal: Signal, segments: Sequence[tuple[int, int]]) -> float:
+    """Largest change of an external signal (N,) within a segment, in its unit; 0 without segments."""
+    return max((float(np.ptp(signal[start:stop])) for start, stop in segments), default=0.0)
 
-    A heading setpoint counts when it moves by `MOVES`.
-    """
+
+def excites(name: str, signal: Signal, segments: Sequence[tuple[int, int]]) -> bool:
+    """Whether an external signal (N,) of this name excites an axis: a setpoint counts when it moves by `MOVES`."""
+    return largest_move(signal, segments) > (MOVES if name == "r_o" else 0.0)
+
+
+def external_yaw_signal(yaw: YawSignals) -> tuple[Signal, str] | None:
+    """External signal of yaw, (N,), and its name, chosen as in `external_signal`; None: yaw is not excited."""
     for name in EXTERNAL:
         signal = getattr(yaw, name)
-        least = MOVES if name == "r_o" else 0.0
-        if signal is not None and any(np.ptp(signal[start:stop]) > least for start, stop in yaw.segments):
+        if signal is not None and excites(name, signal, yaw.segments):
             return signal, name
     return None
 

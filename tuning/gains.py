@@ -10,10 +10,8 @@ them is `tuning.parameters`.
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.common.files import sha256, write_atomically
-from mimopilot.common.toml import toml_entries, toml_value
 from mimopilot.tuning.certificate import Certificate, Verdict
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law_terms import LATER_FILTERS, MIMO, Filters, StockFilters
-from mimopilot.tuning.parameter_row import ANY, AXES, NOT_NEGATIVE, POSITIVE, Row, Shape, Valid
+from mimopilot.tuning.gains_text import gains_text
+from mimopilot.tuning.law_filters import LATER_FILTERS, MIMO, Filters, StockFilters
+from mimopilot.tuning.parameter_checks import check_values
+from mimopilot.tuning.parameter_row import AXES, NOT_NEGATIVE, POSITIVE, Row, Shape
 from mimopilot.tuning.parameters import IDENTITY, MATRICES, ROWS, YAW_GAINS, rows
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder
@@ -38,8 +38,6 @@ THESIS_INNER = (SecondOrder(20.0, 0.4),) * 2
 THESIS_OUTER = (SecondOrder(10.0, 0.7),) * 2
 #: Stands for a matrix that was not given: zeros, but only while the option that it belongs to is off.
 _NOT_GIVEN: Matrix = np.empty((0, 0))
-#: Schema of the gains file.
-SCHEMA = 2
 #: Seal of a certificate that was read from a gains file of schema 1.
 SCHEMA_1 = "schema 1"
 #: Largest relative difference of the ratios of roll and pitch at which a certificate stays valid: rounding of the unit.
@@ -141,17 +139,7 @@ class Gains:
             matrix.flags.writeable = False
             object.__setattr__(self, name, matrix)
         for row in ROWS:
-            valid, values = _valid(row), self._values(row)
-            if all(valid.holds(value) and not _exceeds_period(row, value, self.Ts) for value in values):
-                continue
-            for where, value in self._named(row):
-                if not valid.holds(value):
-                    raise TuningError(f"{where}: got {value}{_unit(row)}, expected {_expectation(valid)}")
-                if _exceeds_period(row, value, self.Ts):
-                    raise TuningError(
-                        f"{where}: got {value}{_unit(row)}, expected at most {row.largest_in_period:g}/Ts, "
-                        f"{row.largest_in_period / self.Ts:g}{_unit(row)}"
-                    )
+            check_values(row, self._values(row), self.Ts)
         self._check_law()
         shaping = self.filters.shaping_s
         if not NOT_NEGATIVE.holds(shaping) or (shaping and self.filters.stock):
@@ -163,7 +151,7 @@ class Gains:
 
     def _check_law(self) -> None:
         """Refuse what the law of a stock controller does not have."""
-        law = self.filters.law
+        law = control_law(self.filters)
         for row in ROWS:
             if row.key in law.lacks and any(value != (row.default or 0.0) for value in self._values(row)):
                 raise TuningError(f"{row.key}: got {self.of(row)}, but the {self.controller} controller has none")
@@ -248,13 +236,6 @@ class Gains:
     def _values(self, row: Row) -> list[float]:
         """`of` as a list, in the order of `Row.codes`."""
         return [float(value) for value in np.ravel(self.of(row))]
-
-    def _named(self, row: Row) -> Iterator[tuple[str, float]]:
-        """Each number of a row and its name in messages."""
-        where = f"{row.section}.{row.key}" if row.shape in (Shape.YAW, Shape.AXES) else row.key
-        for i, value in enumerate(self._values(row)):
-            index = {Shape.MATRIX: f"[{i // 2}][{i % 2}]", Shape.AXES: f" ({AXES[i]})" if i < 3 else ""}
-            yield where + index.get(row.shape, ""), value
 
     def elements(self) -> dict[str, float]:
         """Every number of our controller by code, in the order of the C++ struct.
@@ -407,75 +388,7 @@ class Gains:
         write_atomically(Path(path), gains_to_toml(self))
 
 
-@cache
-def _valid(row: Row) -> Valid:
-    """Valid values of a row's numbers in a gains set."""
-    return replace(row.valid, highest=np.inf) if row.shape is Shape.POLE else row.valid  # a cut-off, Hz
-
-
-def _unit(row: Row) -> str:
-    return f" {row.unit}" if row.unit and row.shape in (Shape.SCALAR, Shape.AXES) and row.unit != "norm" else ""
-
-
-def _exceeds_period(row: Row, value: float, Ts: float) -> bool:
-    """Whether the product with the period is too large; in single precision, as the controller checks it."""
-    if not math.isfinite(row.largest_in_period):
-        return False
-    with np.errstate(over="ignore"):
-        return bool(np.float32(value) * np.float32(Ts) > np.float32(row.largest_in_period))
-
-
-def _expectation(valid: Valid) -> str:
-    return str(valid) if valid != ANY else f"{valid}; tune again or correct the file"
-
-
-#: Key of `Filters.shaping_s` in the file of our law.
-SHAPING = "shaping_s"
-_SHAPING_COMMENT = ("# r_o is shaped by ArduPilot (shaping_s) and dr_o/dt added to r_i, as in the flight of the log.",)
-#: The law of a set with model following, in its file.
-_MODEL_COMMENT = (
-    "# Model following, roll and pitch: th is the angle of the attitude model, second order from r_o (model_omega,",
-    "# model_damping):  r_i = Kp_o (th - y_o) + Kff_o dth/dt;  u has the additional term Kaff_i d2th/dt2",
-)
-
-
 def gains_to_toml(gains: Gains) -> str:
     """Text of the gains file; reading it back restores the same bits of every float."""
-
-    def line(row: Row) -> str:
-        value = gains.of(row)
-        note = {Shape.SCALAR: row.unit, Shape.POLE: "0: no filter"}.get(row.shape, "")
-        plain = np.asarray(value, dtype=np.float64).tolist()
-        return f"{row.key} = {toml_value(plain)}{f'  # {note}' if note else ''}"
-
-    def left_out(row: Row) -> bool:
-        return row.key in law.lacks or bool(row.option and not gains.uses(row) and gains.at_default(row))
-
-    def lines_of(shape: Shape) -> list[str]:
-        return [line(row) for row in rows(shape) if not left_out(row)]
-
-    following, law, stock = bool(gains.filters.model_omega), gains.filters.law, gains.filters.stock
-    shaping = gains.filters.shaping_s
-    scale = toml_value(list(gains.moment_scale)) if gains.moment_scale else '"unknown"'
-    lines = [
-        *law.text,
-        *(_MODEL_COMMENT if following else ()),
-        *(_SHAPING_COMMENT if shaping else ()),
-        f"schema = {SCHEMA}",
-        *(() if stock is None else (f"controller = {toml_value(stock.controller)}",)),
-        *lines_of(Shape.SCALAR),
-        *lines_of(Shape.POLE),
-        *((f"{SHAPING} = {toml_value(shaping)}  # s",) if shaping else ()),
-        f"moment_scale = {scale}  # N m that u = 1 stands for: roll, pitch, yaw",
-    ]
-    for shape, head in ((Shape.MATRIX, ""), (Shape.YAW, ""), (Shape.AXES, "  # roll, pitch, yaw")):
-        lines += ["", f"[{rows(shape)[0].section}]{head}", *lines_of(shape)]
-    if stock is not None:
-        lines += ["", "[filters]  # roll, pitch, yaw; Hz, 0: none"]
-        lines += [f"{name} = {toml_value(list(getattr(stock, name)))}" for name in law.filters]
-    tables = {"certificate": gains.certificate, "provenance": gains.provenance}
-    for name, content in tables.items():
-        entries = content.as_table() if content is not None else {}
-        if entries:
-            lines += ["", f"[{name}]", *toml_entries(entries)]
-    return "\n".join(lines) + "\n"
+    written = {row: gains.of(row) for row in ROWS if gains.uses(row) or not gains.at_default(row)}
+    return gains_text(written, gains.filters, gains.moment_scale, gains.certificate, gains.provenance)

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from mimopilot.common.errors import Error
-from mimopilot.common.toml import parse_toml, read_toml, shown, shown_text
+from mimopilot.common.toml import GAINS_FILE, parse_toml, read_toml, shown, shown_text
 from mimopilot.tuning.certificate import Certificate
+from mimopilot.tuning.control_laws import LAWS
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.gains import SCHEMA, SCHEMA_1, SHAPING, Gains
-from mimopilot.tuning.law_terms import LAWS, MIMO, StockFilters
+from mimopilot.tuning.gains import SCHEMA_1, Gains
+from mimopilot.tuning.gains_text import SCHEMA, SHAPING
+from mimopilot.tuning.law_filters import MIMO, StockFilters
 from mimopilot.tuning.parameter_row import Row, Shape
 from mimopilot.tuning.parameters import ROWS, rows
 from mimopilot.tuning.provenance import Provenance
@@ -38,7 +40,7 @@ def load_gains(path: str | Path) -> Gains:
     Error
         When the file is missing, is not TOML, lacks a matrix, or has a number that is not finite.
     """
-    return _gains(read_toml(Path(path), "gains file"), str(path))
+    return _gains(read_toml(Path(path), GAINS_FILE), str(path))
 
 
 def gains_from_toml(text: str, where: str) -> Gains:

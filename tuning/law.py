@@ -9,11 +9,11 @@ With model following, roll and pitch follow an attitude model with angle th, rat
     r = Kp_o (th - y_o) + Kff_o w
     u = Kp e + Ki I(e) - Kd D(y) + Kff r + Kaff al + u_bar
 
-Each term is a gain matrix, the signal that it acts on and its filters; `tuning.law_terms` has the tables of this law
-and of the stock ones. All of tuning derives the law from the table of the set's `Filters.law`: VRFT's regressors, the
-inverse (`tuning.law_inverse`), the frequency response, the state space and the predicted doublets. The generated C++
-and its reference, `tuning.controller`, are written by hand. Tests compare the response of the compiled C++ with
-`response`, for every parameter.
+Each term is a gain matrix, the signal that it acts on and its filters; `tuning.law_terms` has those of this law,
+`tuning.stock_laws` those of the stock ones. All of tuning derives the law from the table of the set's
+`tuning.control_laws.control_law`: VRFT's regressors, the inverse (`tuning.law_inverse`), the frequency response, the
+state space and the predicted doublets. The generated C++ and its reference, `tuning.controller`, are written by hand.
+Tests compare the response of the compiled C++ with `response`, for every parameter.
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.first_order_filter import Chain, Filter, Response, Signal
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.law_terms import (
     ATTITUDE,
     ATTITUDE_FEEDFORWARD,
@@ -36,7 +38,6 @@ from mimopilot.tuning.law_terms import (
     RATE,
     SETPOINT,
     TERMS,
-    Filters,
     Term,
 )
 
@@ -92,7 +93,7 @@ def rate_matrices(gains: Matrices) -> dict[str, Signal]:
 
 def fixed_matrices(filters: Filters, n: int) -> dict[str, Signal]:
     """Letter -> (n, n) matrix of the law's terms with a gain that is not tuned; most have none."""
-    fixed = {letter: term for letter, term in filters.law.terms.items() if letter not in LOOP_TERMS}
+    fixed = {letter: term for letter, term in control_law(filters).terms.items() if letter not in LOOP_TERMS}
     return {letter: np.diag(getattr(filters.stock, term.matrix)[:n]) for letter, term in fixed.items()}
 
 
@@ -125,13 +126,13 @@ def regressors(letters: str, error: Signal, rate: Signal, setpoint: Signal, filt
     (N, n len(letters)) array
     """
     filters = filters.on(slice(0, error.shape[1]))
-    reached = _run(filters.law.setpoint(filters), setpoint)
+    reached = _run(control_law(filters).setpoint(filters), setpoint)
     if reached is not setpoint:
         error = error + (reached - setpoint)
     signals = {ERROR: error, RATE: rate, SETPOINT: reached}
     columns = []
     for letter in letters:
-        term = filters.law.terms[letter]
+        term = control_law(filters).terms[letter]
         filtered = _run(term.filter(filters), signals[term.signal])
         columns.append(filtered if term.sign > 0 else -filtered)
     return np.hstack(columns)
@@ -156,12 +157,12 @@ def rate_response(matrices: Mapping[str, Signal], filters: Filters, omega: Signa
     of_r: Any = np.zeros_like(z)
     of_y: Any = np.zeros_like(z)
     filters = filters.on(slice(0, np.shape(next(iter(matrices.values()), of_r))[-1]))
-    for letter, term in filters.law.terms.items():
+    for letter, term in control_law(filters).terms.items():
         if letter in matrices:
             part = _times(term.sign * matrices[letter], term.filter(filters), z)
             of_r = of_r + part if term.signal in (ERROR, SETPOINT) else of_r
             of_y = of_y + part if term.signal == ERROR else of_y - part if term.signal == RATE else of_y
-    return _times(of_r, filters.law.setpoint(filters), z), of_y
+    return _times(of_r, control_law(filters).setpoint(filters), z), of_y
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +195,7 @@ def state_space(matrices: Mapping[str, Signal], filters: Filters) -> StateSpaceL
     """
     n_u, n = np.shape(next(iter(matrices.values())))
     filters = filters.on(slice(0, n))
-    law = filters.law
+    law = control_law(filters)
     terms = [
         (term, term.filter(filters), term.sign * np.asarray(matrices[letter], float))
         for letter, term in law.terms.items()
@@ -234,7 +235,7 @@ def attitude_matrix(gains: Matrices) -> Signal:
 
 def attitude_response(filters: Filters, omega: Signal) -> Response:
     """Delay of a rate setpoint from the attitude controller to the rate controller, (K, 1, 1)."""
-    delay: Response = np.exp(-1j * np.asarray(omega) * filters.Ts * filters.law.delay)[:, None, None]
+    delay: Response = np.exp(-1j * np.asarray(omega) * filters.Ts * control_law(filters).delay)[:, None, None]
     return delay
 
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from mimopilot.common.errors import InputFileError
-from mimopilot.common.toml import checked, read_toml
+from mimopilot.common.toml import checked, complaint, read_toml
 from mimopilot.tuning.certificate import DEFAULT_THRESHOLDS, Thresholds
+from mimopilot.tuning.control_laws import LAWS
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law_terms import LAWS, MIMO
+from mimopilot.tuning.law_filters import MIMO
 from mimopilot.tuning.reference_model import ContinuousModel, ReferenceModel, SecondOrder, model_from_table
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -115,7 +116,7 @@ class TuningSpec(_SpecTable):
     method: Literal["mimo", "siso"] = "mimo"
     inner: Models | None = None
     outer: Models | None = None
-    structure: Annotated[str, Field(pattern="^PI?D?F?$")] = "PID"
+    structure: Literal["P", "PI", "PD", "PID", "PF", "PIF", "PDF", "PIDF"] = "PID"
     instrument: Literal["external", "u", "model", "repeated"] = "external"
     trim: bool = True
     window: Annotated[int, Field(ge=1, le=500)] | None = None
@@ -192,14 +193,17 @@ def load_spec(path: Path | None = None, **overrides: object) -> TuningSpec:
     Error
         When the file cannot be read, is not TOML, or has an unknown or invalid entry.
     """
-    table = read_toml(path, "specification") if path is not None else {}
-    if "schema" in table and "roll_pitch" in table:
-        raise InputFileError(f"{path}: is a gains file, expected a specification; leave out --spec")
-    table |= {name: value for name, value in overrides.items() if value is not None}
+    table = read_toml(path, "specification", "leave out --spec") if path is not None else {}
+    given = {name: value for name, value in overrides.items() if value is not None}
+    try:
+        TuningSpec.model_validate(given)
+    except ValidationError as error:
+        raise InputFileError(f"--{complaint(error, TuningSpec)}") from error
+    table |= given
     return checked(TuningSpec, table, str(path or "specification"))
 
 
-def parse_model(text: str) -> tuple[float, float, int]:
+def parse_model(text: str, option: str = "") -> tuple[float, float, int]:
     """Parse a second-order reference model of the command line: ``OMEGA,ZETA,DELAY`` (rad/s, damping, samples).
 
     Raises
@@ -218,4 +222,6 @@ def parse_model(text: str) -> tuple[float, float, int]:
             raise ValueError
         return float(parts[0]), float(parts[1]), int(parts[2]) if len(parts) == 3 else 0
     except ValueError:
-        raise TuningError(f"reference model: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0") from None
+        raise TuningError(
+            f"{option or 'reference model'}: got {text!r}, expected OMEGA,ZETA,DELAY such as 20,0.4,0"
+        ) from None

@@ -20,7 +20,7 @@ from mimopilot.cli.options import (
     WorkersOption,
 )
 from mimopilot.common.console import json_text, print_json, print_table, print_text
-from mimopilot.common.errors import check_not_given
+from mimopilot.common.errors import check_choice, check_not_given
 from mimopilot.common.extras import CAMPAIGN, REPORT
 
 
@@ -35,7 +35,9 @@ def register(app: typer.Typer) -> None:
 
 def campaign(
     airframe: AirframeArgument,
-    out: Annotated[Path, typer.Option(help="Folder for the results; what is done is kept when it is interrupted.")],
+    out: Annotated[
+        Path, typer.Option(file_okay=False, help="Folder for the results; what is done is kept when it is interrupted.")
+    ],
     more_gains: Annotated[list[Path] | None, typer.Argument(hidden=True)] = None,
     gains: Annotated[
         list[Path] | None, typer.Option(help="Gains files: --gains FILE [FILE...]; by default the airframe's own.")
@@ -116,7 +118,6 @@ def campaign(
 
 def _task(scenario: str, axis: str | None, sizes: dict[str, float | None], faults: list[str] | None) -> dict[str, Any]:
     """Entries of the plan from the options that say what is flown."""
-    from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.faults.kinds import parse_fault
     from mimopilot.sitl.flight.scenario import AMPLITUDE_DEG, AXES, PERIOD_S, TAIL_S, read_scenario
 
@@ -127,8 +128,8 @@ def _task(scenario: str, axis: str | None, sizes: dict[str, float | None], fault
         task, own = read_scenario(Path(scenario))
         given = {name: getattr(task, name) for name in sizes}
         scenario, axis, named = task.manoeuvre, task.axis, [*map(str, own), *named]
-    if axis not in (*AXES, "both", None):
-        raise SitlError(f"--axis: got {axis!r}, expected roll, pitch or both")
+    if axis is not None:
+        check_choice("--axis", axis, (*AXES, "both"))
     usual = {"amplitude_deg": AMPLITUDE_DEG, "period_s": PERIOD_S, "tail_s": TAIL_S}
     axes = [axis] if axis in AXES else list(AXES)
     return {"manoeuvre": scenario, "axes": axes, **usual, **given, "faults": named}

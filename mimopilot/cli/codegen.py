@@ -12,6 +12,16 @@ from mimopilot.codegen.targets import targets
 from mimopilot.common.verbosity import warn
 
 
+def _known_options() -> str:
+    """The options of all targets with their values."""
+    named = [
+        f"{option.replace('_', '-')} ({name}): {', '.join(values)}"
+        for name, target in targets().items()
+        for option, values in target.options.items()
+    ]
+    return "; ".join(named)
+
+
 def register(app: typer.Typer) -> None:
     """Add these commands to the command line."""
     app.command(epilog="Example: mimopilot generate my.gains.toml --target native --out firmware")(generate)
@@ -21,7 +31,11 @@ def register(app: typer.Typer) -> None:
 def generate(
     gains: GainsArgument,
     out: Annotated[
-        Path, typer.Option(help="Folder to write to; changed files are replaced, nothing is deleted, no link followed.")
+        Path,
+        typer.Option(
+            file_okay=False,
+            help="Folder to write to; changed files are replaced, nothing is deleted, no link followed.",
+        ),
     ],
     target: Annotated[
         str,
@@ -31,7 +45,7 @@ def generate(
         str, typer.Option(help="PX4's module interface: crtp, up to v1.17, or descriptor, later.")
     ] = "crtp",
     option: Annotated[
-        list[str] | None, typer.Option("--option", help="Further option of a target, NAME=VALUE; see its target.toml.")
+        list[str] | None, typer.Option("--option", help=f"Option of a target, NAME=VALUE: {_known_options()}.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files that mimopilot did not generate.")] = False,
     uncertified: UncertifiedOption = False,

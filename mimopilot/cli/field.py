@@ -18,7 +18,9 @@ def register(app: typer.Typer) -> None:
 
 def autotune(
     connect: ConnectOption,
-    out: Annotated[Path, typer.Option(help="Folder of logs, gains, decisions and report; the same one goes on.")],
+    out: Annotated[
+        Path, typer.Option(file_okay=False, help="Folder of logs, gains, decisions and report; the same one goes on.")
+    ],
     profile: ProfileOption = None,
     take_off: Annotated[
         float | None,
@@ -45,10 +47,6 @@ def autotune(
     Exit code 0: the new gains are kept; 1: the old ones are back, or a step failed.
     """
     from mimopilot.common.console import print_json
-    from mimopilot.common.extras import REPORT, VEHICLE
-
-    VEHICLE.need()
-    REPORT.need()
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.field.autotune_console import AutotuneTerminal
     from mimopilot.sitl.field.autotune_run import AutotuneOptions

@@ -45,7 +45,9 @@ def identify(
     order: Annotated[int | None, typer.Option(help="States; by default those that fit the measured response.")] = None,
     past: Annotated[int, typer.Option(help="Past window, samples.")] = 20,
     future: Annotated[int | None, typer.Option(help="Future window, samples; the past window by default.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Where the state space is written: FILE.toml.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Where the state space is written: FILE.toml.")
+    ] = None,
     columns: ColumnsOption = None,
     as_json: JsonOption = False,
 ) -> None:

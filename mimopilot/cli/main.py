@@ -24,18 +24,22 @@ from mimopilot.cli import (
     tuning,
     vehicle,
 )
+from mimopilot.cli.command import use_command
 from mimopilot.common.errors import Error
 from mimopilot.common.verbosity import Verbosity, set_verbosity
 
 app = typer.Typer(
     name="mimopilot",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for group in (studies, simulation, sitl, campaign, identification, tuning, report, codegen, vehicle, field, doctor):
     group.register(app)
+use_command(app)
+
+#: What is wrong with the line itself: an option, a value, a name. Typer has had it from several modules.
+UsageError: type[typer.BadParameter] = typer.BadParameter.__bases__[0]
 
 
 def _print_version(wanted: bool) -> None:
@@ -70,9 +74,17 @@ def main() -> None:
     """Run the command line; a user's mistake is one clear message and exit code 2, never a traceback."""
     output, code = sys.stdout, 0
     try:
-        app(_global_options_first(sys.argv[1:]), prog_name="mimopilot")
+        # Without standalone mode the parser raises its errors, in place of printing them in lines of its own.
+        arguments = _global_options_first(sys.argv[1:]) or ["--help"]
+        code = app(arguments, prog_name="mimopilot", standalone_mode=False) or 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else 0
+    except UsageError as error:
+        print(f"mimopilot: {_usage_message(error)}", file=sys.stderr)
+        code = 2
+    except typer.Abort:
+        print("mimopilot: interrupted", file=sys.stderr)
+        code = 1
     except Error as error:
         print(f"mimopilot: {error}", file=sys.stderr)
         code = error.exit_code
@@ -95,3 +107,16 @@ def _global_options_first(arguments: list[str]) -> list[str]:
     end = arguments.index("--") if "--" in arguments else len(arguments)
     moved = [text for text in arguments[:end] if text in ("--quiet", "--verbose")]
     return [*moved, *(text for text in arguments[:end] if text not in moved), *arguments[end:]]
+
+
+def _usage_message(error: typer.BadParameter) -> str:
+    """A mistake on the command line in one line: the command, what is wrong, and where its options are explained."""
+    text = (
+        " ".join(error.format_message().split())
+        .replace("Value error, ", "")
+        .replace("Input should be", "expected")
+        .removesuffix(".")
+    )
+    path = error.ctx.command_path if error.ctx else "mimopilot"
+    where = path.removeprefix("mimopilot").strip()
+    return f"{where}{': ' if where else ''}{text[:1].lower()}{text[1:]}; see {path} --help"

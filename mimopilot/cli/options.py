@@ -51,11 +51,13 @@ TailOption = Annotated[float | None, typer.Option(help="Level flight after a dou
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all randomness.")]
 WorkersOption = Annotated[int | None, typer.Option(min=1, max=1024, help="Processes; by default one for each core.")]
 SpeedOption = Annotated[str, typer.Option(help="Times real time, or max: as fast as possible.")]
-LogOutOption = Annotated[Path | None, typer.Option(help="Also write the flight as a log (ULog, .ulg).")]
+LogOutOption = Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the flight as a log (ULog, .ulg).")]
 UncertifiedOption = Annotated[bool, typer.Option("--uncertified", help="Accept gains whose stability is in doubt.")]
 ReportOption = Annotated[
     Path | None,
-    typer.Option(callback=_page, help="Also write a page with figures of the log and of these gains (HTML)."),
+    typer.Option(
+        dir_okay=False, callback=_page, help="Also write a page with figures of the log and of these gains (HTML)."
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 ProfileOption = Annotated[

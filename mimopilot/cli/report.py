@@ -29,12 +29,13 @@ def report(
     logs: Annotated[
         list[Path], typer.Argument(help="Any flight log; two or three to compare flights, the one before first.")
     ],
-    out: Annotated[Path, typer.Option(help="The page to write (HTML).")],
+    out: Annotated[Path, typer.Option(dir_okay=False, help="The page to write (HTML).")],
     gains: Annotated[
         list[Path] | None, typer.Option(help="Gains file to show beside the flown gains; may be repeated.")
     ] = None,
     figures: Annotated[
-        Path | None, typer.Option(help="Folder for the same figures as PNG and SVG; made if it is missing.")
+        Path | None,
+        typer.Option(file_okay=False, help="Folder for the same figures as PNG and SVG; made if it is missing."),
     ] = None,
     spec: Annotated[
         Path | None, typer.Option(help="Specification (TOML) whose [certificate] says what margins are needed.")
@@ -56,11 +57,14 @@ def report(
         charts = [chart.name for chart in found.charts]
         tables = {one.caption: [dict(zip(one.columns, row, strict=False)) for row in one.rows] for one in found.tables}
         head = {"headline": found.headline.sentence, "next": list(found.headline.steps), "tone": found.headline.tone}
+        head["notes"] = list(found.headline.notes)
         print_json({"out": str(out), **head, "figures": charts, "tables": tables})
         return
     print(found.headline.sentence)
     for step in found.headline.steps:
         print(f"next: {step}")
+    for note in found.headline.notes:
+        print(f"note: {note}")
     print(f"written to {out}" + (f", figures to {figures}" if figures else ""))
 
 

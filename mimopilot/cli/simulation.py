@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
@@ -56,7 +56,7 @@ def register(app: typer.Typer) -> None:
 def convert(
     gains: Annotated[Path, typer.Argument(help="Gains file of this vehicle, made with another allocator.")],
     airframe: Annotated[str, typer.Argument(help="Airframe with the target allocator.")],
-    out: Annotated[Path, typer.Option(help="Where the converted gains are written: FILE.gains.toml.")],
+    out: Annotated[Path, typer.Option(dir_okay=False, help="Where the converted gains are written: FILE.gains.toml.")],
 ) -> None:
     """Convert gains to the unit of torque of an airframe's allocator: the torque in N m stays the same."""
     import mimopilot as mp
@@ -184,13 +184,15 @@ def experiment(
             ),
         )
         return
-    from mimopilot.api import vehicle
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.flight.excitation_flight import ExperimentPlan, default_amplitude
 
     check_not_given("belong to --connect", mode=mode, tilt_deg=tilt_deg, profile=profile, snapshot=snapshot)
     if out is None:
         raise SitlError("--out: name the log to write, FILE.ulg")
-    body, controller = vehicle(airframe or "", gains)
+    if out.is_dir() and runs is None:
+        raise SitlError(f"--out: {out} is a folder; give the log to write, FILE.ulg, or --runs")
+    body, controller = given_vehicle(airframe or "", gains)
     strength = default_amplitude(body) if amplitude is None else amplitude
     plan = ExperimentPlan(
         body,
@@ -269,19 +271,16 @@ def fly(
     from dataclasses import asdict, replace
 
     import mimopilot as mp
-    from mimopilot.api import vehicle
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.flight.fault_recovery import recovery
     from mimopilot.sitl.flight.flight_log import save_flight
     from mimopilot.sitl.flight.metrics import FIGURE_LABELS
     from mimopilot.sitl.flight.scenario import AXES, scenario_of
 
-    body, controller = vehicle(airframe, gains)
+    body, controller = given_vehicle(airframe, gains)
     task = scenario_of(scenario, axis, amplitude_deg, period_s, tail_s, fault or (), controller.Ts)
-    if on not in ("native", "cortex-m4"):
-        raise SitlError(f"--on: got {on!r}, expected native or cortex-m4")
-    processor: Literal["native", "cortex-m4"] = "cortex-m4" if on == "cortex-m4" else "native"
-    flight = mp.fly(body, controller, task, seed=seed, on=processor)
+    flight = mp.fly(body, controller, task, seed=seed, on=cast("Literal['native', 'cortex-m4']", on))
     figures: dict[str, Any] = {**asdict(mp.performance(flight, controller)), "crashed_at_s": flight.crashed_at}
     if task.faults:
         healthy = mp.fly(body, controller, replace(task, faults=()), seed=seed)

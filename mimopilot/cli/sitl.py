@@ -18,7 +18,7 @@ from mimopilot.cli.options import (
     SeedOption,
     SpeedOption,
 )
-from mimopilot.common.errors import check_not_given
+from mimopilot.common.errors import check_choice, check_not_given
 
 
 def register(app: typer.Typer) -> None:
@@ -71,15 +71,13 @@ def sitl(
     period_s: PeriodOption = None,
 ) -> None:
     """Run the vehicle for ground stations: autopilot host and plant in two processes. Ctrl-C ends it."""
-    from mimopilot.api import vehicle
-    from mimopilot.sitl.errors import SitlError
+    from mimopilot.api.arguments import given_vehicle
     from mimopilot.sitl.faults.kinds import parse_fault
     from mimopilot.sitl.flight.scenario import scenario_of
     from mimopilot.sitl.mavlink.vehicle.sitl_console import SitlOptions, run
 
-    if autopilot not in ("mimo", "px4-stock"):
-        raise SitlError(f"--autopilot: got {autopilot!r}, expected mimo or px4-stock")
-    body, controller = vehicle(airframe, gains)
+    check_choice("--autopilot", autopilot, ("mimo", "px4-stock"))
+    body, controller = given_vehicle(airframe, gains)
     task, faults = None, tuple(map(parse_fault, fault or ()))
     if scenario is not None:
         task = scenario_of(scenario, axis, amplitude_deg, period_s, None, fault or (), controller.Ts)
@@ -160,8 +158,7 @@ def plant(
     def report(text: str) -> None:
         print(f"mimopilot: plant: {text}", file=sys.stderr, flush=True)
 
-    if protocol not in ("px4", "ardupilot-json"):
-        raise SitlError(f"--protocol: got {protocol!r}, expected px4 or ardupilot-json")
+    check_choice("--protocol", protocol, ("px4", "ardupilot-json"))
     json = protocol == "ardupilot-json"
     if json:
         check_not_given(

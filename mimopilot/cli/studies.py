@@ -42,7 +42,9 @@ def register(app: typer.Typer) -> None:
 
 
 def demo(
-    out: Annotated[Path, typer.Option(help="Folder for the log, the gains, the C++ and the report.")] = Path("demo"),
+    out: Annotated[
+        Path, typer.Option(file_okay=False, help="Folder for the log, the gains, the C++ and the report.")
+    ] = Path("demo"),
     seed: SeedOption = 0,
     as_json: JsonOption = False,
 ) -> None:
@@ -103,7 +105,7 @@ def faults(
 
 def reproduce(
     study: Annotated[Study, typer.Argument(help="Which study, or all of them.")],
-    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("reproduction"),
+    out: Annotated[Path, typer.Option(file_okay=False, help="Folder for the report.")] = Path("reproduction"),
     seeds: Annotated[
         int | None, typer.Option(min=1, help="Experiments of each vehicle, with other noise; 50 by default, gains: 5.")
     ] = None,

@@ -2,34 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mimopilot.cli.gains_tables import PREDICTED_TITLE, print_certificate, print_comparison, print_gains
 from mimopilot.cli.identification import read_warned
 from mimopilot.cli.options import ColumnsOption, JsonOption, LogArgument, ProfileOption, ReportOption
 from mimopilot.cli.report import check_count, write_report_of
-from mimopilot.cli.yaw_tables import print_cross_terms, print_yaw, yaw_cell, yaw_mapping, yaw_margins
+from mimopilot.cli.yaw_tables import print_yaw, yaw_mapping
 from mimopilot.common.console import print_json, print_table, print_text, progress_console
-from mimopilot.common.errors import check_not_given
+from mimopilot.common.errors import Error, check_not_given
 from mimopilot.common.progress import step
-from mimopilot.common.text_table import with_deviation
 from mimopilot.common.verbosity import warn
 
 if TYPE_CHECKING:
-    from mimopilot.tuning.gains import Gains
     from mimopilot.tuning.logs.columns import Columns
     from mimopilot.tuning.spec import TuningSpec
 
 #: Details of a designed set that `tune --json` has, too.
 SHARED = ("predicted", "better_than_flown", "keep_flown", "worth_of_off_diagonals")
-#: Title of the tables of predicted figures.
-PREDICTED_TITLE = (
-    "Predicted, roll / pitch. RMS in doublets of 10 degrees, 0.4 to 2 s: to the model\n"
-    "({model}) and of the other axis; after a step of torque; of the torque at hover"
-)
 
 
 def register(app: typer.Typer) -> None:
@@ -106,13 +99,15 @@ def tune(
         spec,
         profile=profile,
         method=method,
-        inner=parse_model(inner) if inner else None,
-        outer=parse_model(outer) if outer else None,
+        inner=parse_model(inner, "--inner") if inner else None,
+        outer=parse_model(outer, "--outer") if outer else None,
         structure=structure,
         follow_model=follow_model or None,
         instrument=instrument or ("repeated" if repeat else None),
         window=window,
     )
+    if out.is_dir() and not campaign:
+        raise Error(f"--out: {out} is a folder; give the file to write, FILE.gains.toml, or --campaign")
     if campaign:
         check_not_given("belongs to one log, --campaign tunes many; leave it out", repeat=repeat, report=report)
         tune_campaign(logs, task, out, load_columns(columns) if columns else None, as_json)
@@ -167,33 +162,6 @@ def tune(
         raise typer.Exit(1)
 
 
-def print_comparison(gains: Gains, logs: list[str]) -> None:
-    """Predicted figures of a designed set beside those of the flown gains, and the conclusion."""
-    from mimopilot.tuning.design.prediction_rows import PREDICTED, predicted_rows, softer
-
-    details = gains.provenance.details
-    if "predicted" not in details or gains.provenance.outer_model is None:
-        return
-    model = f"{gains.provenance.outer_model[0].bandwidth:g} rad/s"
-    print_table(PREDICTED_TITLE.format(model=model), PREDICTED, predicted_rows(gains, logs))
-    if details.get("better_than_flown"):
-        print_text(
-            "better than the gains that flew: in following and on the other axis, within the limits of Ms and noise"
-        )
-        for trade_off in softer(details["predicted"]):
-            print_text(trade_off)
-    worth = details.get("worth_of_off_diagonals", {})
-    for before, after in zip(worth.get("tuned", ()), worth.get("module", ()), strict=True):
-        print_text(
-            f"off-diagonals would bring: the other axis moves {after[0]:.2f} / {after[1]:.2f} instead of "
-            f"{before[0]:.2f} / {before[1]:.2f} degrees with our module"
-        )
-    for reason in details.get("keep_flown", ()):
-        print_text(f"keep what you fly: {reason}")
-    if details["limited_by"]:
-        print_text(f"limited by: {', '.join(details['limited_by'])}")
-
-
 def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Columns | None, as_json: bool) -> None:
     """`tune --campaign`: every log by itself, and the distributions."""
     from mimopilot.common.parallel import cores
@@ -222,7 +190,9 @@ def tune_campaign(logs: list[Path], task: TuningSpec, out: Path, columns: Column
 def certify(
     log: LogArgument,
     gains: Annotated[Path, typer.Option(help="Gains file to examine.")],
-    out: Annotated[Path | None, typer.Option(help="Write the gains with their certificate to this file.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Write the gains with their certificate to this file.")
+    ] = None,
     rate: Annotated[
         float | None,
         typer.Option(help="Carry the gains to this control rate, Hz, and examine them there; by default their own."),
@@ -258,7 +228,7 @@ def certify(
 def advise(
     log: LogArgument,
     spec: Annotated[Path | None, typer.Option(help="Specification (TOML), as for tune.")] = None,
-    out: Annotated[Path | None, typer.Option(help="Write the recommended gains to this file.")] = None,
+    out: Annotated[Path | None, typer.Option(dir_okay=False, help="Write the recommended gains to this file.")] = None,
     columns: ColumnsOption = None,
     report: ReportOption = None,
     as_json: JsonOption = False,
@@ -324,48 +294,3 @@ def advise(
         if found.zero is None
         else f"non-minimum-phase zero at {found.zero:.1f} rad/s from torque to rates"
     )
-
-
-def print_certificate(gains: Gains) -> None:
-    """Verdict, reason and margins of a certified set."""
-    certificate = gains.certificate
-    assert certificate is not None
-    figures = certificate.figures
-    print_text(f"{certificate.verdict}: {certificate.reason}")
-    if not figures:
-        return
-    rows = [
-        ["peak of the sensitivity, Ms", f"{figures['Ms']:.2f} +- {figures['Ms_error']:.2f}"],
-        ["disk margin", f"{figures['disk_margin']:.2f}"],
-        ["all axes at once", f"{figures['simultaneous_gain_db']:.1f} dB, {figures['simultaneous_phase_deg']:.0f} deg"],
-    ]
-    if "predicted" not in gains.provenance.details:  # asked for a model of the rate loop
-        delta = f"{figures['delta']:.2f} +- {figures['delta_error']:.2f}"
-        rows.append(["small gain of the rate loop, delta", delta])
-    for axis in figures["phase_margin_deg"]:
-        kind = figures["gain_margin"][axis]
-        gain = "gain not known" if kind == "not known" else f"{figures['gain_margin_db'][axis]:.1f} dB"
-        phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
-        rows.append(
-            [
-                axis,
-                f"{'at least ' if kind == 'at least' else ''}{gain}, {phase:.0f} +- {error:.0f} deg, "
-                f"{figures['delay_margin_ms'][axis]:.1f} ms",
-            ]
-        )
-    low, high = certificate.band
-    rows += yaw_margins(figures)
-    print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)
-    print_cross_terms(figures)
-
-
-def print_gains(title: str, gains: Gains, deviations: Mapping[str, Any]) -> None:
-    """The matrices and the yaw gains of a set as a table, with standard deviations where they are known."""
-    from mimopilot.tuning.parameters import with_unit
-
-    rows = []
-    for name, matrix in gains.matrices.items():
-        known = deviations.get(name, [[None, None], [None, None]])
-        cells = [with_deviation(matrix[i][j], known[i][j]) for i in range(2) for j in range(2)]
-        rows.append([with_unit(name), *cells, yaw_cell(gains, name, deviations)])
-    print_table(title, ["", "roll<-roll", "roll<-pitch", "pitch<-roll", "pitch<-pitch", "yaw"], rows)

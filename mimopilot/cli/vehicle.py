@@ -39,7 +39,8 @@ ForceArmedOption = Annotated[
     bool, typer.Option("--force-armed", help="Write even to a vehicle that is or becomes armed.")
 ]
 SnapshotOption = Annotated[
-    Path | None, typer.Option(help="Where the old values go; by default a new file beside the other one.")
+    Path | None,
+    typer.Option(dir_okay=False, help="Where the old values go; by default a new file beside the other one."),
 ]
 
 
@@ -84,7 +85,7 @@ def upload(
     same system number) the old values are restored, also on an armed vehicle, and the exit code is 1. If the link is
     lost, every parameter that may hold a new value is listed.
     """
-    from mimopilot.api import prepare_upload
+    from mimopilot.api.vehicle import prepare_upload
     from mimopilot.sitl.mavlink.ground_station.upload_console import parse_scale, upload_with_dialogue
 
     plan, options, loaded, doubt = prepare_upload(
@@ -156,7 +157,7 @@ def params(
         ),
     ] = "qgc",
     profile: Annotated[str | None, typer.Option(help=CONTROLLERS, show_default="that of the gains, else mimo")] = None,
-    out: Annotated[Path | None, typer.Option(help="File to write; by default standard output.")] = None,
+    out: Annotated[Path | None, typer.Option(dir_okay=False, help="File to write; by default standard output.")] = None,
     uncertified: UncertifiedOption = False,
     timeout: TimeoutOption = 12.0,
     signing_key: KeyOption = None,
@@ -183,7 +184,7 @@ def logs(
     connect: ConnectOption,
     name: Annotated[str | None, typer.Argument(metavar="[LOG]", help="Log to download, by its listed name.")] = None,
     last: Annotated[bool, typer.Option("--last", help="Download the last log.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder of the downloaded log.")] = Path(),
+    out: Annotated[Path, typer.Option(file_okay=False, help="Folder of the downloaded log.")] = Path(),
     protocol: Annotated[
         str, typer.Option(help="ftp, log (LOG_REQUEST_LIST), or auto: FTP where the vehicle has it.")
     ] = "auto",
@@ -217,7 +218,10 @@ def import_params(
     ] = None,
     connect: Annotated[str | None, typer.Option(help="Vehicle to read from; see upload.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Gains file to write; by default a new one beside the source, NAME.gains.toml.")
+        Path | None,
+        typer.Option(
+            dir_okay=False, help="Gains file to write; by default a new one beside the source, NAME.gains.toml."
+        ),
     ] = None,
     defaults: Annotated[
         str | None, typer.Option(help="px4-v1.16: its defaults for what the file lacks. Without it that is refused.")

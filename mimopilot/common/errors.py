@@ -1,4 +1,8 @@
-"""Exceptions that the command line reports as one message."""
+"""Exceptions that the command line reports as one message, and the checks of options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
 
 
 class Error(Exception):
@@ -19,6 +23,30 @@ class Error(Exception):
 
 class InputFileError(Error, ValueError):
     """A file cannot be read, or its content is not as expected."""
+
+
+def check_choice(name: str, value: object, known: Iterable[str], error: type[Error] = Error) -> None:
+    """Refuse a value that is none of the known ones.
+
+    Parameters
+    ----------
+    name : str
+        What was chosen, for the message: ``--profile``.
+    value : object
+        As given.
+    known : iterable of str
+        All that it may be.
+    error : type
+        Raised, of the package that asks.
+
+    Raises
+    ------
+    Error
+        With all that are known.
+    """
+    choices = list(known)
+    if value not in choices:
+        raise error(f"{name}: got {value!r}, expected one of {', '.join(choices)}")
 
 
 def check_not_given(reason: str, **options: object) -> None:

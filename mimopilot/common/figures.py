@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,8 @@ Signal = NDArray[np.float64]
 
 #: Most samples of a drawn line: at 600 pixels more cannot be told apart, and a page holds some hundred lines.
 MOST_SAMPLES = 1600
+#: Cells of a heat map for each sample of a line where figures are reduced: a cell takes an eighth of a sample's bytes.
+CELLS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,3 +201,39 @@ def thinned(x: Signal, y: Signal, most: int = MOST_SAMPLES) -> tuple[Signal, Sig
     values[gaps.any(axis=1)] = np.nan
     places = (np.arange(count) * length)[:, None] + np.array([0, length // 2])
     return np.asarray(x, np.float64)[places.ravel()], values.ravel()
+
+
+def reduced(chart: Chart, most: int) -> Chart:
+    """The figure with at most about `most` samples of each line and band, and `CELLS` times as many of a heat map."""
+    panels = [replace(panel, lines=[_reduced(one, most) for one in panel.lines]) for panel in chart.panels]
+    return replace(chart, panels=panels)
+
+
+def _reduced(item: Line | Spread | HeatMap, most: int) -> Line | Spread | HeatMap:
+    if isinstance(item, HeatMap):
+        return _coarser(item, CELLS * most)
+    every = -(-len(item.x) // most)
+    if every <= 1:
+        return item
+    if isinstance(item, Spread):
+        return replace(item, x=item.x[::every], low=item.low[::every], high=item.high[::every])
+    if not item.marker and not item.text and np.all(np.diff(np.asarray(item.x, np.float64)) > 0):
+        x, y = thinned(item.x, item.y, most)
+        return replace(item, x=x, y=y)
+    error = None if item.error is None else item.error[::every]
+    return replace(item, x=item.x[::every], y=item.y[::every], text=item.text[::every], error=error)
+
+
+def _coarser(heat: HeatMap, cells: int) -> HeatMap:
+    """The largest value of each block of cells, so that tones stay."""
+    x, y, z = (np.asarray(values, np.float64) for values in (heat.x, heat.y, heat.z))
+    while z.size > cells and min(z.shape) > 1:
+        along = int(z.shape[1] >= z.shape[0])
+        even = z.shape[along] // 2 * 2
+        first, second = (np.take(z, np.arange(start, even, 2), axis=along) for start in (0, 1))
+        z = np.fmax(first, second)
+        if along:
+            x = (x[0:even:2] + x[1:even:2]) / 2
+        else:
+            y = (y[0:even:2] + y[1:even:2]) / 2
+    return replace(heat, x=x, y=y, z=z)

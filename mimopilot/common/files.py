@@ -9,7 +9,7 @@ import stat
 import tempfile
 from pathlib import Path
 
-from mimopilot.common.errors import InputFileError
+from mimopilot.common.errors import Error, InputFileError
 
 #: Largest text file that a user may give, bytes. The largest expected one, a full parameter file, has some 60 kB.
 MAX_TEXT_BYTES = 1 << 20
@@ -69,6 +69,31 @@ def missing_target(path: Path) -> str:
     except OSError:
         pass
     return ""
+
+
+def check_file(path: Path, wanted: str, error: type[Error]) -> None:
+    """Refuse what is no regular file, before it is opened.
+
+    Parameters
+    ----------
+    path : Path
+        Named by the user.
+    wanted : str
+        What to give, for the message.
+    error : type
+        Raised, of the package that asks.
+
+    Raises
+    ------
+    Error
+        With what it is instead.
+    """
+    if path.is_file():
+        return
+    reason = missing_target(path) or ("it is a folder" if path.is_dir() else "")
+    if not reason:
+        reason = "it is a device or a pipe" if path.exists() else "no such file"
+    raise error(f"{path}: {reason}; give {wanted}")
 
 
 def read_text(path: Path, what: str) -> str:

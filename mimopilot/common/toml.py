@@ -20,6 +20,8 @@ from mimopilot.common.files import read_text
 MAX_DEPTH = 16
 #: Longest number or unquoted key, characters. A double needs at most 24; `int` fails at 4300 digits.
 MAX_TOKEN = 128
+#: Kind of the file that is most often given in place of another one, and entries that only that has.
+GAINS_FILE, GAINS_ENTRIES = "gains file", {"schema", "roll_pitch"}
 #: Longest value in a message, characters; chosen so that the message stays readable.
 MAX_SHOWN = 80
 
@@ -42,7 +44,7 @@ _BARE_KEY = re.compile(r"[A-Za-z0-9_-]{1,64}")
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def read_toml(path: Path, what: str) -> dict[str, Any]:
+def read_toml(path: Path, what: str, instead: str = "") -> dict[str, Any]:
     """Read a TOML file that a user names.
 
     Parameters
@@ -51,16 +53,18 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
         The file.
     what : str
         Its kind, for messages: ``gains file``.
+    instead : str
+        What to do if it is a gains file and should not be: where that belongs.
 
     Raises
     ------
     InputFileError
         If it cannot be read, see `mimopilot.common.files.read_bytes`, or parsed, see `parse_toml`.
     """
-    return parse_toml(read_text(path, what), str(path))
+    return parse_toml(read_text(path, what), str(path), what, instead)
 
 
-def parse_toml(text: str, where: str) -> dict[str, Any]:
+def parse_toml(text: str, where: str, what: str = GAINS_FILE, instead: str = "") -> dict[str, Any]:
     """Parse a TOML text.
 
     The text is checked before parsing: the parser's time grows with the square of a key's length, and its recursion
@@ -72,11 +76,14 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
         With line ends of either kind.
     where : str
         Names the text in messages.
+    what, instead : str
+        As in `read_toml`.
 
     Raises
     ------
     InputFileError
-        If it is not TOML, is nested deeper than `MAX_DEPTH`, or holds a token longer than `MAX_TOKEN`.
+        If it is not TOML, is a gains file where another kind is wanted, is nested deeper than `MAX_DEPTH`, or holds a
+        token longer than `MAX_TOKEN`.
     """
     bare = _SPACES.sub(" ", _STRING_OR_COMMENT.sub("s", text)).replace(" .", ".").replace(". ", ".")
     depth = deepest = 0
@@ -97,6 +104,11 @@ def parse_toml(text: str, where: str) -> dict[str, Any]:
         raise InputFileError(f"{where}: not a TOML file: {error}") from error
     if _depth(table) > MAX_DEPTH:
         raise _too_deep(where)
+    if what != GAINS_FILE and table.keys() >= GAINS_ENTRIES:
+        article = "an" if what[0] in "aeiou" else "a"
+        raise InputFileError(
+            f"{where}: is a gains file, expected {article} {what}" + (f"; {instead}" if instead else "")
+        )
     return table
 
 
@@ -129,12 +141,18 @@ def complaint(error: ValidationError, model: type[BaseModel]) -> str:
     """The first error that pydantic found in a table for `model`, in one line; for an unknown entry a similar one."""
     first = error.errors()[0]
     field = ".".join(str(part) for part in first["loc"])
-    message = first["msg"].removeprefix("Value error, ")
+    message = "missing" if first["type"] == "missing" else first["msg"].removeprefix("Value error, ")
     if first["type"] == "extra_forbidden":
         return f"{shown_text(field)}: unknown entry; {_meant(first['loc'], model)}"
     if first["type"] == "missing":  # its input is then the table, not a value
         return f"{shown_text(field)}: {message}"
-    return f"{shown_text(field)}: {message}, got {shown(first.get('input'))}" if field else message
+    if not field:
+        return message
+    value = shown(first.get("input"))
+    if (wanted := message.removeprefix("Input should be ")) != message:
+        wanted = wanted.replace("'", "") if first["type"] == "literal_error" else wanted
+        return f"{shown_text(field)}: got {value}, expected {wanted}"
+    return f"{shown_text(field)}: {message}" + ("" if "got " in message else f", got {value}")
 
 
 def _meant(place: Sequence[str | int], model: type[BaseModel]) -> str:

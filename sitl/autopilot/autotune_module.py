@@ -11,8 +11,8 @@ from collections.abc import Iterator, MutableMapping
 from enum import IntEnum
 
 from mimopilot.sitl.autopilot.excitation_injector import NO_MOMENT, Moment
-from mimopilot.sitl.autopilot.px4_parameters import AUTOTUNE_AMPLITUDE, AUTOTUNE_START
 from mimopilot.sitl.autopilot.setpoints import Sticks
+from mimopilot.tuning.px4_names import AUTOTUNE_AMPLITUDE, AUTOTUNE_START
 
 PUBLISHED_S = 0.1  # s between two values of the signal
 FILTER_S = 0.2  # s, time constant of the high-pass

@@ -8,11 +8,18 @@ from typing import NamedTuple
 from mimopilot.sitl.autopilot.px4_law import AXES, INTEGRAL_LIMITS
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import YAW_GAINS
+from mimopilot.tuning.px4_names import (
+    AUTOTUNE_AMPLITUDE,
+    AUTOTUNE_APPLY,
+    AUTOTUNE_ENABLE,
+    AUTOTUNE_RISE_TIME,
+    AUTOTUNE_START,
+    DEFAULT_TOPICS,
+    LOG_PROFILE,
+)
 
-AUTOTUNE_ENABLE, AUTOTUNE_START, AUTOTUNE_AMPLITUDE = "MC_AT_EN", "MC_AT_START", "MC_AT_SYSID_AMP"
-LOG_PROFILE, HIGH_RATE = "SDLOG_PROFILE", 16
 #: Parameters that only the autotune's module uses: without it they are in no list.
-OF_THE_AUTOTUNE = (AUTOTUNE_AMPLITUDE, "MC_AT_APPLY", "MC_AT_RISE_TIME", AUTOTUNE_START)
+OF_THE_AUTOTUNE = (AUTOTUNE_AMPLITUDE, AUTOTUNE_APPLY, AUTOTUNE_RISE_TIME, AUTOTUNE_START)
 
 
 class Px4Parameter(NamedTuple):
@@ -56,9 +63,9 @@ def px4_parameters(gains: Gains, gyro_cutoff_hz: float) -> tuple[Px4Parameter, .
         Px4Parameter("IMU_DGYRO_CUTOFF", gains.derivative_cutoff_hz),
         Px4Parameter("IMU_GYRO_RATEMAX", round(1 / gains.Ts), integer=True, writable=False),
         Px4Parameter(AUTOTUNE_ENABLE, 0, integer=True),
-        Px4Parameter("MC_AT_APPLY", 1, integer=True),
-        Px4Parameter("MC_AT_RISE_TIME", 0.14),
+        Px4Parameter(AUTOTUNE_APPLY, 1, integer=True),
+        Px4Parameter(AUTOTUNE_RISE_TIME, 0.14),
         Px4Parameter(AUTOTUNE_START, 0, integer=True),
         Px4Parameter(AUTOTUNE_AMPLITUDE, 0.7),
-        Px4Parameter(LOG_PROFILE, 1, integer=True),
+        Px4Parameter(LOG_PROFILE, DEFAULT_TOPICS, integer=True),
     )

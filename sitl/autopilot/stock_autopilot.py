@@ -5,9 +5,10 @@ from __future__ import annotations
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.autopilot.autotune_module import AutotuneModule
 from mimopilot.sitl.autopilot.px4_law import Px4Controller
-from mimopilot.sitl.autopilot.px4_parameters import AUTOTUNE_ENABLE, AUTOTUNE_START, LOG_PROFILE, px4_parameters
+from mimopilot.sitl.autopilot.px4_parameters import px4_parameters
 from mimopilot.sitl.physics.airframe import Airframe
 from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.px4_names import AUTOTUNE_ENABLE, AUTOTUNE_START, LOG_PROFILE
 
 
 class StockAutopilot(Autopilot):

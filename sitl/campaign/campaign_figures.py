@@ -147,9 +147,11 @@ def parse_map(plan: CampaignPlan, text: str) -> tuple[str, str]:
         When these are not two different quantities that vary.
     """
     known = varied(plan)
+    if len(known) < 2:
+        raise SitlError(f"--map: needs two quantities that vary, got {', '.join(known) or 'none'}; give more in --vary")
     first, _, second = text.partition(",")
     if first == second or not {first, second} <= set(known):
-        raise SitlError(f"--map: got {text!r}, expected two varied quantities: {', '.join(known) or 'none'}")
+        raise SitlError(f"--map: got {text!r}, expected two varied quantities: {', '.join(known)}")
     return first, second
 
 

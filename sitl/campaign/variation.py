@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from mimopilot.common.toml import checked, parse_toml, read_toml
+from mimopilot.common.toml import checked, read_toml
 from mimopilot.sitl.physics.airframe import Vector
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -191,21 +191,16 @@ class Variation(_VariationTable):
 
 
 def read_variation(path: Path) -> dict[str, Any]:
-    """Read and check a specification file; returns its table, see `variation_from_toml`."""
-    table = read_toml(path, "specification")
-    checked(Variation, table, str(path))
-    return table
-
-
-def variation_from_toml(text: str, where: str) -> Variation:
-    """Parse a specification; `where` names it in messages.
+    """Read a specification file, and check it; returns its table.
 
     Raises
     ------
     InputFileError
         When it is not TOML, or an entry is unknown or impossible.
     """
-    return checked(Variation, parse_toml(text, where), where)
+    table = read_toml(path, "specification of what varies", "give that with --gains")
+    checked(Variation, table, str(path))
+    return table
 
 
 #: Prefix of a varied quantity's name -> its unit.

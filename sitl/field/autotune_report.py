@@ -11,7 +11,7 @@ from mimopilot.common.figures import Chart, Line, Panel, thinned
 from mimopilot.common.html_report import Headline, ReportTable, Section, write_report
 from mimopilot.sitl.field.autotune_run import CHECK, FLIGHT, REPORT, AutotuneRun
 from mimopilot.sitl.field.check_flight import FIGURES, SHARE, CheckResult
-from mimopilot.sitl.field.report.flight_report import make_report
+from mimopilot.sitl.field.report.flight_report import LARGEST_PAGE, make_report
 from mimopilot.tuning.gains import Gains
 
 #: Columns of `check_rows`.
@@ -63,4 +63,5 @@ def write_autotune_report(run: AutotuneRun, gains: Gains, result: CheckResult) -
         flights.lead,
         [check, *flights.sections],
         Headline(f"The check flight was {outcome}.", tone="bad" if result.worse else "good"),
+        LARGEST_PAGE,
     )

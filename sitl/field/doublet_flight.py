@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from mimopilot.sitl.field.flight_watch import FlightWatch
+from mimopilot.sitl.field.flight_watch import not_followed, trip
 from mimopilot.sitl.mavlink.ground_station.events import (
     ARDUPILOT,
     AttitudeTarget,
@@ -20,6 +20,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     Outgoing,
     SendCommand,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 
@@ -92,7 +93,7 @@ def doublet_plan(flown: float | None, yaw: bool) -> DoubletPlan:
     return DoubletPlan(min(LARGEST, max(LEAST, flown or LEAST)), 3 if yaw else 2)
 
 
-def fly_doublets(watch: FlightWatch, plan: DoubletPlan) -> Exchange[tuple[str, bool]]:
+def fly_doublets(watch: FlightMonitor, plan: DoubletPlan) -> Exchange[tuple[str, bool]]:
     """Fly the doublets from hover. The vehicle is left in the mode of setpoints: the caller lands it or hands it back.
 
     Returns
@@ -112,7 +113,7 @@ def fly_doublets(watch: FlightWatch, plan: DoubletPlan) -> Exchange[tuple[str, b
     started: float | None = None
     while True:
         late = client.now - watch.seen["ATTITUDE"] > CLOCK_S
-        time = 0.0 if started is None else watch.time - started
+        time = 0.0 if started is None else watch.clock - started
         send: list[Outgoing] = []
         if client.now >= send_at:
             send_at = client.now + SETPOINT_S
@@ -124,10 +125,10 @@ def fly_doublets(watch: FlightWatch, plan: DoubletPlan) -> Exchange[tuple[str, b
             parameters = (float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED), *mode)
             send.append(SendCommand(*address, mavlink.MAV_CMD_DO_SET_MODE, parameters))
         yield from client.send_and_wait(send, send_at)
-        reason = watch.trip(height)
+        reason = trip(watch, height)
         if reason:
             return reason, True
-        reason = "interrupted" if client.interrupted else watch.link_problem()
+        reason = "interrupted" if client.interrupted else not_followed(watch)
         if not reason and not client.vehicle.armed:
             reason = "the vehicle was disarmed"
         elif not reason and started is not None and client.vehicle.mode != number:
@@ -138,13 +139,13 @@ def fly_doublets(watch: FlightWatch, plan: DoubletPlan) -> Exchange[tuple[str, b
         if reason:
             return reason, False
         if started is None and client.vehicle.mode == number:
-            started = watch.time
+            started = watch.clock
         if time > plan.seconds:
             return "", False
         client.progress("check flight", round(time), round(plan.seconds))
 
 
-def _collective(watch: FlightWatch, hover: float, height: float) -> float:
+def _collective(watch: FlightMonitor, hover: float, height: float) -> float:
     """Collective that holds a height (m) from the vehicle's own: a critically damped second-order loop."""
     acceleration = HEIGHT_RATE**2 * (height - watch.altitude) - 2 * HEIGHT_RATE * watch.climb
     share = min(max(acceleration / GRAVITY, -HEIGHT_SHARE), HEIGHT_SHARE)

@@ -11,20 +11,18 @@ from collections.abc import Callable, Sequence
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.field.flight_watch import IN_AIR, POLL_S, FlightWatch
+from mimopilot.sitl.field.flight_watch import no_answer
 from mimopilot.sitl.mavlink.ground_station.events import (
     ACCEPTED,
     IN_PROGRESS,
     CommandAck,
     Exchange,
-    Outgoing,
-    SendCommand,
 )
-from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S, VehicleLinkState
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor
+from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import VehicleLinkState
 
 NAN = math.nan
 # Times are chosen.
-COMMAND_TIMEOUT_S = 12.0  # without an answer; 24 tries, as for parameters
 READY_TIMEOUT_S = 30.0  # until a vehicle that has just started lets itself be armed
 HOVERED_S = 1.0  # of a hover, until it counts as one
 CLIMB_S_PER_M, CLIMB_MARGIN_S = 4.0, 20.0  # of a take-off: at least 0.25 m/s
@@ -55,36 +53,29 @@ def send_command(
     SitlError
         If it is refused, or not answered.
     """
-    assert client.vehicle is not None
-    begin, due = client.now, client.now
-    answered = client.now
-    while True:
-        send: list[Outgoing] = []
-        if client.now >= due:
-            due = client.now + TRY_S
-            send = [SendCommand(client.vehicle.system, client.vehicle.component, number, tuple(parameters))]
-        for message in (yield from client.send_and_wait(send, due)):
-            if not isinstance(message, CommandAck) or message.command != number:
-                continue
-            if message.result == ACCEPTED:
-                return
-            answered = client.now
-            if message.result != IN_PROGRESS and client.now >= begin + retry_s:
-                raise SitlError(f"the vehicle refused to {what} (MAV_RESULT {message.result})", exit_code=1)
-        if client.closed:
-            raise SitlError(f"the link was lost on the command to {what}", exit_code=1)
-        if client.now >= answered + COMMAND_TIMEOUT_S:
-            raise SitlError(f"no answer to the command to {what} in {COMMAND_TIMEOUT_S:g} s", exit_code=1)
+    begin = client.now
+
+    def is_final(ack: CommandAck) -> bool:
+        refused = ack.result not in (ACCEPTED, IN_PROGRESS)
+        return ack.result == ACCEPTED or (refused and client.now >= begin + retry_s)
+
+    ack = yield from client.command(number, parameters, is_final)
+    if ack is None and client.closed:
+        raise SitlError(f"the link was lost on the command to {what}", exit_code=1)
+    if ack is None:
+        raise SitlError(f"no answer to the command to {what} in {client.timeout:g} s", exit_code=1)
+    if ack.result != ACCEPTED:
+        raise SitlError(f"the vehicle refused to {what} (MAV_RESULT {ack.result})", exit_code=1)
 
 
 def wait_for(
-    watch: FlightWatch, condition: Callable[[], bool], seconds: float, what: str, careful: bool = True
+    watch: FlightMonitor, condition: Callable[[], bool], seconds: float, what: str, careful: bool = True
 ) -> Exchange[None]:
     """Wait until a condition is true.
 
     Parameters
     ----------
-    watch : FlightWatch
+    watch : FlightMonitor
     condition : callable
     seconds : float, s
         Time limit.
@@ -101,7 +92,7 @@ def wait_for(
     client = watch.client
     deadline = client.now + seconds
     while not condition():
-        reason = watch.contact_problem()
+        reason = no_answer(watch)
         if careful and client.interrupted:
             reason = "interrupted"
         elif client.now > deadline:
@@ -112,7 +103,7 @@ def wait_for(
         yield from client.send_and_wait([], client.now + POLL_S)
 
 
-def take_off(watch: FlightWatch, height: float) -> Exchange[None]:
+def take_off(watch: FlightMonitor, height: float) -> Exchange[None]:
     """Arm, climb to a height above the ground (m), and wait until it hovers there.
 
     Raises
@@ -136,15 +127,13 @@ def take_off(watch: FlightWatch, height: float) -> Exchange[None]:
     yield from send_command(client, mavlink.MAV_CMD_NAV_TAKEOFF, place, "take off")
     yield from wait_for(
         watch,
-        lambda: (
-            abs(watch.altitude - ground - height) < ARRIVED and abs(watch.climb) < ARRIVED and watch.landed == IN_AIR
-        ),
+        lambda: abs(watch.altitude - ground - height) < ARRIVED and abs(watch.climb) < ARRIVED and watch.in_air,
         CLIMB_MARGIN_S + CLIMB_S_PER_M * height,
         f"climb to {height:g} m",
     )
 
 
-def land(watch: FlightWatch) -> Exchange[None]:
+def land(watch: FlightMonitor) -> Exchange[None]:
     """Land, and wait until the vehicle has disarmed; Ctrl-C does not end it.
 
     Raises
@@ -159,7 +148,9 @@ def land(watch: FlightWatch) -> Exchange[None]:
     yield from wait_until_disarmed(watch, LAND_TIMEOUT_S)
 
 
-def wait_until_disarmed(watch: FlightWatch, seconds: float = PILOT_TIMEOUT_S, careful: bool = False) -> Exchange[None]:
+def wait_until_disarmed(
+    watch: FlightMonitor, seconds: float = PILOT_TIMEOUT_S, careful: bool = False
+) -> Exchange[None]:
     """Wait until the vehicle stands and is disarmed."""
     client = watch.client
 
@@ -169,13 +160,13 @@ def wait_until_disarmed(watch: FlightWatch, seconds: float = PILOT_TIMEOUT_S, ca
     yield from wait_for(watch, disarmed, seconds, "land and disarm", careful)
 
 
-def wait_until_hovering(watch: FlightWatch) -> Exchange[None]:
+def wait_until_hovering(watch: FlightMonitor) -> Exchange[None]:
     """Wait until a pilot has taken off and has hovered for a while: a vehicle that lifts off climbs slowly, too."""
     since = math.inf
 
     def hovers() -> bool:
         nonlocal since
-        still = watch.flying and watch.landed == IN_AIR and abs(watch.climb) < ARRIVED
+        still = watch.flying and watch.in_air and abs(watch.climb) < ARRIVED
         since = min(since, watch.client.now) if still else math.inf
         return watch.client.now - since >= HOVERED_S
 

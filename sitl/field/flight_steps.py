@@ -12,13 +12,14 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import FLIGHT, GAINS, AutotuneOptions, AutotuneRun, Decided
 from mimopilot.sitl.field.doublet_flight import doublet_plan, fly_doublets
 from mimopilot.sitl.field.flight_commands import land, send_command, take_off, wait_until_disarmed, wait_until_hovering
-from mimopilot.sitl.field.flight_watch import POLL_S, FlightWatch, start_watch
+from mimopilot.sitl.field.flight_watch import not_followed, start_watch
 from mimopilot.sitl.field.ground_steps import Found, list_logs
 from mimopilot.sitl.field.vehicle_set import NEW, compare_set
 from mimopilot.sitl.mavlink.ground_station.events import ARDUPILOT, Exchange
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
 from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import experiment_profile
 from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.session import Session
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
@@ -44,7 +45,7 @@ def fly_experiment(run: AutotuneRun) -> Found:
     """
     before = list_logs(run)
     saved: dict[str, float] = {}
-    profile = experiment_profile(run.options.profile, _excitation(run.options), saved.update)
+    profile = experiment_profile(run.options.profile, excitation_of(run.options), saved.update)
     with run.vehicle(integers=profile.integers) as session:
         vehicle = session.run(session.client.await_heartbeat())
         try:
@@ -73,7 +74,8 @@ def fly_experiment(run: AutotuneRun) -> Found:
     return {"logs_before": before, "seconds": result.seconds}
 
 
-def _excitation(options: AutotuneOptions) -> ExcitationOptions:
+def excitation_of(options: AutotuneOptions) -> ExcitationOptions:
+    """What the experiment excites, from the options."""
     return ExcitationOptions(
         axis="all" if options.profile == "mimo" else None,
         seconds_per_axis=options.seconds_per_axis,
@@ -140,7 +142,7 @@ def bring_down(run: AutotuneRun) -> None:
     run.took_off = False
 
 
-def _hover(run: AutotuneRun, session: Session, flight: str) -> FlightWatch:
+def _hover(run: AutotuneRun, session: Session, flight: str) -> FlightMonitor:
     """The vehicle in hover: it already does, or takes off, or a pilot takes off."""
     session.run(session.client.await_heartbeat())
     watch = session.run(start_watch(session.client))
@@ -173,13 +175,13 @@ def _come_down(run: AutotuneRun, session: Session) -> None:
     session.run(wait_until_disarmed(watch, careful=True))
 
 
-def _settle(watch: FlightWatch) -> Exchange[float]:
+def _settle(watch: FlightMonitor) -> Exchange[float]:
     """Watch the hover; returns the larger spread of roll and pitch, rad."""
     client = watch.client
     end, seen = client.now + HOVER_S, [(watch.roll, watch.pitch)]
     while client.now < end:
         yield from client.send_and_wait([], client.now + POLL_S)
-        reason = "interrupted" if client.interrupted else watch.link_problem()
+        reason = "interrupted" if client.interrupted else not_followed(watch)
         if reason:
             raise SitlError(reason, exit_code=1)
         seen.append((watch.roll, watch.pitch))
@@ -190,7 +192,7 @@ def _settle(watch: FlightWatch) -> Exchange[float]:
     return max(spreads)
 
 
-def _check_wind(watch: FlightWatch) -> Exchange[None]:
+def _check_wind(watch: FlightMonitor) -> Exchange[None]:
     spread = yield from _settle(watch)
     if not spread <= WIND_TILT:
         raise SitlError(

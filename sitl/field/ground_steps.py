@@ -15,13 +15,13 @@ from mimopilot.sitl.field.check_flight import check_flight
 from mimopilot.sitl.field.doublet_flight import doublet_plan
 from mimopilot.sitl.field.flight_watch import start_watch
 from mimopilot.sitl.field.vehicle_set import NEW, OLD, held_set, new_plan, old_plan, save_snapshot, write_set
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     FLIGHT_STREAMS,
     request_status,
-    request_streams,
     supplies_problem,
 )
 from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import request_streams
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import check_kind
 from mimopilot.sitl.mavlink.log_transfer.log_session import LogSession

@@ -18,7 +18,7 @@ from mimopilot.sitl.mavlink.ground_station.transaction import Upload
 from mimopilot.sitl.mavlink.ground_station.upload import write_and_verify
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.tuning.gains_file import load_gains
-from mimopilot.tuning.law_terms import MIMO
+from mimopilot.tuning.law_filters import MIMO
 from mimopilot.tuning.logs.imported_gains import import_gains
 from mimopilot.tuning.parameters import PARAMETERS
 

@@ -13,10 +13,11 @@ from contextlib import contextmanager
 from typing import NamedTuple
 
 from mimopilot.common.errors import Error
+from mimopilot.common.extras import REPORT
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import GAINS, SNAPSHOT, AutotuneDialogue, AutotuneOptions, AutotuneRun, Decided
 from mimopilot.sitl.field.decisions import Decisions, load_decisions
-from mimopilot.sitl.field.flight_steps import bring_down, fly_check, fly_experiment
+from mimopilot.sitl.field.flight_steps import bring_down, excitation_of, fly_check, fly_experiment
 from mimopilot.sitl.field.ground_steps import (
     Found,
     check_vehicle,
@@ -30,7 +31,11 @@ from mimopilot.sitl.field.ground_steps import (
     upload_gains,
 )
 from mimopilot.sitl.field.vehicle_set import NEITHER, NEW, OLD, held_set, old_plan, write_set
-from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import EXPERIMENTS, check_experiment
+from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import (
+    EXPERIMENTS,
+    check_experiment,
+    experiment_profile,
+)
 
 
 class AutotuneStep(NamedTuple):
@@ -53,6 +58,8 @@ STEPS = (
     AutotuneStep("judgement", judge),
     AutotuneStep("kept", keep),
 )
+#: Heights of a take-off, m: from one that clears the ground, chosen, to the ceiling of the EU's open category.
+TAKE_OFF_M = 1.0, 120.0
 UNKNOWN = "unknown"
 #: What the vehicle holds -> its description.
 SETS = {
@@ -81,10 +88,14 @@ def autotune(options: AutotuneOptions, dialogue: AutotuneDialogue) -> Decisions:
     SitlError
         If not: with the reason, and the set that the vehicle holds.
     """
+    REPORT.need()
     check_experiment(options.profile)
     pilot = EXPERIMENTS[options.profile].pilot
     if pilot and options.take_off is not None:
         raise SitlError(f"--take-off: not with --profile {options.profile}: {pilot}, and leave --take-off out")
+    if options.take_off is not None and not TAKE_OFF_M[0] <= options.take_off <= TAKE_OFF_M[1]:
+        raise SitlError(f"--take-off: got {options.take_off:g}, expected {TAKE_OFF_M[0]:g} to {TAKE_OFF_M[1]:g} m")
+    experiment_profile(options.profile, excitation_of(options), lambda values: None)  # refuses impossible options
     run = AutotuneRun(options, load_decisions(options.folder, options.profile), dialogue)
     if run.decisions.result == "old":
         raise SitlError(

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
-from mimopilot.common.errors import check_not_given
+from mimopilot.common.errors import check_choice, check_not_given
 from mimopilot.common.toml import checked, read_toml
 from mimopilot.sitl.autopilot.failure_detector import MAX_TILT
 from mimopilot.sitl.errors import SitlError
@@ -80,8 +80,7 @@ class Scenario:
 
 
 def _axis_index(axis: str) -> int:
-    if axis not in AXES:
-        raise SitlError(f"axis: got {axis!r}, expected roll or pitch")
+    check_choice("axis", axis, AXES, SitlError)
     return AXES.index(axis)
 
 
@@ -261,8 +260,7 @@ def excitation_flight(
         Torque on yaw (normalised), at most 1; by default `amplitude`. Its pulses are `YAW_HOLD` times longer.
     """
     _check_length("seconds_per_axis", seconds_per_axis, Ts)
-    if axes not in EXCITED_AXES:
-        raise SitlError(f"axis: got {axes!r}, expected one of {', '.join(EXCITED_AXES)}")
+    check_choice("axis", axes, EXCITED_AXES, SitlError)
     excited = EXCITED_AXES[axes]
     if together and not {0, 1} <= set(excited):
         raise SitlError(f"axis: got {axes!r}, expected both or all to excite roll and pitch at once")

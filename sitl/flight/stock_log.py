@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.sitl.autopilot.autotune_module import AXIS_STATES, PUBLISHED_S
-from mimopilot.sitl.autopilot.px4_parameters import HIGH_RATE, LOG_PROFILE
 from mimopilot.sitl.flight.flight_log import autopilot_topics, log_information, vehicle_topics
 from mimopilot.sitl.flight.ulog_writer import ulog_bytes
 from mimopilot.sitl.physics.airframe import Airframe
+from mimopilot.tuning.px4_names import HIGH_RATE, LOG_PROFILE
 
 #: Topic -> interval (s) in the default log profile and in that for high rates (logged_topics.cpp of v1.16); 0: all.
 INTERVALS = {

@@ -249,9 +249,7 @@ def load_airframe(name_or_path: str) -> AirframeFile:
 
 def airframe_from_toml(text: str, where: str) -> Airframe:
     """Parse the text of an airframe file; `where` names it in messages. Raises as `load_airframe`."""
-    table = parse_toml(text, where)
-    if "roll_pitch" in table:
-        raise SitlError(f"{where}: is a gains file, expected an airframe; give that first, then --gains {where}")
+    table = parse_toml(text, where, "airframe", f"give that first, then --gains {where}")
     airframe = checked(Airframe, table, where)
     try:
         checked_inertia(airframe.inertia)

@@ -36,8 +36,8 @@ from mimopilot.sitl.studies.true_plant import TruePlant, optimum_on_true_plant, 
 from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.flown_loop import flown_amplitude
 from mimopilot.tuning.design.prediction import Prediction, predict
-from mimopilot.tuning.design.response_design import flown_amplitude
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.motors import fit_motors

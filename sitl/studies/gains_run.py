@@ -19,8 +19,8 @@ from mimopilot.sitl.studies.lqg import lqg_with_noise
 from mimopilot.sitl.studies.true_plant import TruePlant, optimum_on_true_plant
 from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.flown_loop import flown_amplitude
 from mimopilot.tuning.design.prediction import TAIL
-from mimopilot.tuning.design.response_design import flown_amplitude
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains, gains_to_toml
 from mimopilot.tuning.gains_file import gains_from_toml

@@ -21,8 +21,9 @@ from mimopilot.sitl.studies.drawn_vehicle import DrawnVehicle, draw_vehicle
 from mimopilot.sitl.studies.true_plant import GUST_SECONDS, TruePlant, optimum_on_true_plant, true_response
 from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.design.cascade import tune
+from mimopilot.tuning.design.flown_loop import flown_amplitude
 from mimopilot.tuning.design.prediction import TAIL, Prediction, predict, reasons_to_keep
-from mimopilot.tuning.design.response_design import Design, flown_amplitude
+from mimopilot.tuning.design.response_design import Design
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains

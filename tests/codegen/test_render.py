@@ -316,7 +316,7 @@ def test_an_option_of_a_target_reaches_its_templates_and_an_unknown_one_is_refus
     assert mimopilot(*start, "b", "--option", "px4-api=descriptor").returncode == 0
     module = "px4/src/modules/mc_mimo_pid/mc_mimo_pid.cpp"
     assert (tmp_path / "a" / module).read_bytes() == (tmp_path / "b" / module).read_bytes()
-    for text, message in (("colour=red", "no target has it; known: px4_api"), ("px4_api", "expected NAME=VALUE")):
+    for text, message in (("nonsense=1", "no target has it; known: "), ("px4_api", "expected NAME=VALUE")):
         assert_one_clear_line(mimopilot(*start, "c", "--option", text), message)
     assert not (tmp_path / "c").exists()
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning import law
 from mimopilot.tuning.axes import Law
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.statespace import StateSpace
@@ -71,7 +72,7 @@ def closed_loop_poles(gains: Law, plant: StateSpace) -> Complex:
     before, angle = angle, angle + gains.Ts / 2 * (now + rate)
     poles = []
     # The attitude controller's setpoint is that of this period or, with a delay, of the one before.
-    measured = before if gains.filters.law.delay else angle
+    measured = before if control_law(gains.filters).delay else angle
     for setpoint in (np.zeros_like(now), -law.attitude_matrix(gains) @ measured):
         signals = {law.ERROR: setpoint - now, law.RATE: now, law.SETPOINT: setpoint}
         torque = flown.C @ memory + sum(flown.D[signal] @ values for signal, values in signals.items())

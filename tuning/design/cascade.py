@@ -106,7 +106,9 @@ def _with_origin(gains: Gains, flights: Sequence[Experiment], doubts: Sequence[S
 def _check_one_vehicle(flights: Sequence[Experiment]) -> None:
     """Refuse logs that cannot be of one vehicle: another period or unit of torque."""
     first = flights[0]
-    for other in flights[1:]:
+    for index, other in enumerate(flights[1:], 1):
+        if other.sha256 and other.sha256 in (one.sha256 for one in flights[:index]):
+            raise TuningError(f"{other.source}: is given twice; errors of its noise would count as confirmed")
         if abs(other.Ts / first.Ts - 1) > SAME_PERIOD:
             raise TuningError(f"{other.source}: sampled every {other.Ts:g} s, {first.source} every {first.Ts:g} s")
         ours, theirs = (one.flown.moment_scale if one.flown else None for one in (first, other))

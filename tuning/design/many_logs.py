@@ -197,7 +197,7 @@ def tune_all(
         run_all(executor, 2 * workers, partial(_tune, spec, columns), logs, keep)
     found = RepeatedTuning(tuple(outcomes[log] for log in logs))
     if not found.tuned:
-        raise TuningError(f"all {len(logs)} logs were refused, the first: {found.outcomes[0].refusal}")
+        raise TuningError(f"{len(logs)} of {len(logs)} logs were refused, the first: {found.outcomes[0].refusal}")
     write_atomically(summary, json_text(found.as_json()))
     write_atomically(figure, svg(gains_figure(found), "gains"))
     return found

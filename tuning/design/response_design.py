@@ -14,33 +14,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mimopilot.tuning.analysis.beyond_band import MAX_SENSITIVITY_BELOW_BAND, exceeded_frequencies
+from mimopilot.tuning.analysis.beyond_band import exceeded_frequencies
 from mimopilot.tuning.analysis.closed_loop import model_spectral_radius
-from mimopilot.tuning.analysis.manoeuvres import doublet_torque, family_of, manoeuvres
-from mimopilot.tuning.axes import Law, axes_slice, flown_law
-from mimopilot.tuning.design.constraints import (
-    SHARE,
-    Constraint,
-    Cut,
-    Definite,
-    Distance,
-    MotorLimit,
-    NoiseLimit,
-    ParameterRange,
-    gain_above_band,
-    structural_modes,
-)
-from mimopilot.tuning.design.descent import INFEASIBLE, LARGEST_RADIUS, DesignTask, PlantTask, descend
-from mimopilot.tuning.design.disturbance_limit import no_softer_than
+from mimopilot.tuning.analysis.manoeuvres import manoeuvres
+from mimopilot.tuning.axes import Law, flown_law
+from mimopilot.tuning.design.constraints import Definite
+from mimopilot.tuning.design.descent import INFEASIBLE, DesignTask, PlantTask, descend
 from mimopilot.tuning.design.free_gains import FreeGains, free_gains
-from mimopilot.tuning.design.loop_gradient import LoopGradient
-from mimopilot.tuning.design.positive_integral import MIN_INTEGRAL_RATIO
-from mimopilot.tuning.design.prediction import FAST, SLOWEST, bandwidth, sensitivity_peak
-from mimopilot.tuning.experiment import Experiment, manoeuvre_size
-from mimopilot.tuning.gains import Gains, Limits
-from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS, TERMS, Filters
-from mimopilot.tuning.motors import Motors
-from mimopilot.tuning.plant.noise_spectrum import flown_torque_noise
+from mimopilot.tuning.design.prediction import SLOWEST, bandwidth, sensitivity_peak
+from mimopilot.tuning.design.vehicle_constraints import MeasuredVehicle, vehicle_constraints
+from mimopilot.tuning.experiment import Experiment
+from mimopilot.tuning.gains import Gains
+from mimopilot.tuning.law import LOOP_TERMS, TERMS
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
 from mimopilot.tuning.reference_model import SecondOrder
@@ -55,21 +40,11 @@ BANDWIDTHS: tuple[float, ...] = (*_DECADE, 22.4, 25.0)
 SHAPED_BANDWIDTHS = (*BANDWIDTHS, 28.0, 31.5, 35.5, 40.0, 45.0, 50.0, 56.0, 63.0, 71.0, 80.0, 90.0, 100.0)
 #: Where the search begins, rad/s, and its first step along the table.
 FIRST_BANDWIDTH, FIRST_STRIDE = 10.0, 2
-#: Share of the limit of noise that is used: the ratio of two predictions errs by 1 to 2 % (simulated airframes).
-NOISE = 0.98
 #: Damping of the attitude model: 5 % overshoot, the usual choice.
 DAMPING = 0.7
 #: A descent during the search ends with a step that lowers the merit by less than this share, the last one sooner than
 #: that.
 ROUGHLY, EXACTLY = 2e-2, 1e-4
-#: Motors of a log that does not hold their commands: a quadrotor, X, that hovers at half thrust.
-USUAL_MOTORS = Motors(np.array([[-0.5, 0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, -0.5]]), np.full(4, 0.5))
-#: Share of a motor's range that the rotors' torque may use in the doublets, and the peak of its command. In PX4's
-#: simulator sets with peaks of 1.25 flew as predicted, those with 1.5 and 1.8 lost following. Those are for the size of
-#: the setpoints; the angles, whose size counts here, overshoot them by a fifth.
-RANGE, PEAK = 0.95, 1.5
-#: Plants drawn from the error of the response for the standard deviations.
-DRAWS = 12
 #: Factor on the limit of Ms after gains without a certificate.
 TIGHTER = 0.95
 #: Factors on the rate gains of a starting point.
@@ -130,14 +105,9 @@ class ResponseDesign:
 
     Attributes
     ----------
-    plants : sequence of WideResponse
+    vehicles : sequence of MeasuredVehicle
         One for each log.
-    experiments : sequence of Experiment
     limits : DesignLimits
-    noise : sequence of (2, n) array
-        RMS of the torque at hover under the flown gains, for each log: all of it, and its part above `FAST`.
-    limited : sequence of (K,) bool array
-        Frequencies of each measured response at which the rate loop's gain is limited, whatever the fitted body says.
     flown_bandwidth : float or None, rad/s
         Of the attitude model that the flown gains follow best, the fastest of all logs. None: not known.
     slowest : float, rad/s
@@ -146,11 +116,8 @@ class ResponseDesign:
         Those that the attitude model may have, in rising order.
     """
 
-    plants: Sequence[WideResponse]
-    experiments: Sequence[Experiment]
+    vehicles: Sequence[MeasuredVehicle]
     limits: DesignLimits
-    noise: Sequence[Signal]
-    limited: Sequence[NDArray[np.bool_]]
     flown_bandwidth: float | None = None
     slowest: float = BANDWIDTHS[0]
     bandwidths: tuple[float, ...] = BANDWIDTHS
@@ -183,16 +150,20 @@ class ResponseDesign:
         if not bandwidths:
             shaped = all(one.flown is not None and any(one.flown.filters.shaping) for one in experiments)
             bandwidths = SHAPED_BANDWIDTHS if shaped else BANDWIDTHS
-        noise = [flown_noise(one, plant) for one, plant in zip(experiments, plants, strict=True)]
-        limited = [np.zeros(len(one.response.omega), bool) for one in plants]
+        vehicles = [MeasuredVehicle.of(plant, one) for one, plant in zip(experiments, plants, strict=True)]
         flown = [flown_law(one) for one in experiments]
         pairs = [(one, plant) for one, plant in zip(flown, plants, strict=True) if one is not None]
         if len(pairs) < len(plants):
-            return cls(plants, experiments, limits, noise, limited, None, bandwidths[0], bandwidths)
+            return cls(vehicles, limits, None, bandwidths[0], bandwidths)
         fastest = max(bandwidth(one, plant, bandwidths, DAMPING) for one, plant in pairs)
         safe = all(sensitivity_peak(one, plant) <= limits.Ms for one, plant in pairs)
         slowest = SLOWEST * fastest if safe else bandwidths[0]
-        return cls(plants, experiments, limits, noise, limited, fastest, slowest, bandwidths)
+        return cls(vehicles, limits, fastest, slowest, bandwidths)
+
+    @property
+    def plants(self) -> list[WideResponse]:
+        """Response of each vehicle."""
+        return [vehicle.plant for vehicle in self.vehicles]
 
     def tighter(self, gains: Law) -> ResponseDesign:
         """The design after gains that lacked a certificate.
@@ -202,7 +173,8 @@ class ResponseDesign:
         """
         exceeded = [exceeded_frequencies(gains, plant.response) for plant in self.plants]
         if any(which.any() for which in exceeded):
-            return replace(self, limited=[a | b for a, b in zip(self.limited, exceeded, strict=True)])
+            pairs = zip(self.vehicles, exceeded, strict=True)
+            return replace(self, vehicles=[replace(one, limited=one.limited | which) for one, which in pairs])
         return replace(self, limits=self.limits.model_copy(update={"Ms": TIGHTER * self.limits.Ms}))
 
     def design(
@@ -274,34 +246,6 @@ class ResponseDesign:
             best += 1
         return table[best], *found[best][1:]
 
-    def deviations(self, design: Design) -> dict[str, Signal]:
-        """Matrix -> (n, n) standard deviations in its unit: the spread to expect if the flight were repeated.
-
-        Of the steps that plants drawn from the errors of the response ask for.
-        """
-        task, vector = design.task, design.vector
-        generator = np.random.default_rng(0)
-        around = task.step(vector, LARGEST_RADIUS)
-        steps = [self._drawn(task, generator).step(vector, LARGEST_RADIUS) - around for _ in range(DRAWS)]
-        found = {name: np.zeros(task.free.where.shape) for name in task.free.units}
-        spread = np.sqrt(np.mean(np.square(steps), axis=0)) * task.free.size
-        for (name, row, column), value in zip(task.free.places(), spread, strict=True):
-            found[name][row, column] = value
-        return found
-
-    def _drawn(self, task: DesignTask, generator: np.random.Generator) -> DesignTask:
-        """The task around plants drawn from the errors of the responses."""
-        plants = []
-        for one, experiment in zip(task.plants, self.experiments, strict=True):
-            plant = one.plant.draw(generator)
-            parts = iter(NOISE * self.limits.noise * flown_noise(experiment, plant))
-            limits = [
-                replace(limit, limit=next(parts)) if isinstance(limit, NoiseLimit) else limit
-                for limit in one.constraints
-            ]
-            plants.append(replace(one, plant=plant, constraints=limits))
-        return replace(task, plants=plants)
-
     def task(self, free: FreeGains, starts: Sequence[Law], bandwidth: float) -> DesignTask:
         """Cost and constraints around every plant."""
         model = SecondOrder(bandwidth, DAMPING).discretise(free.base.Ts)
@@ -309,90 +253,10 @@ class ResponseDesign:
         return DesignTask(
             _following(free, bandwidth),
             [
-                PlantTask(plant, one, self._constraints(free, starts, place, one.step))
-                for place, (plant, one) in enumerate(zip(self.plants, asked, strict=True))
+                PlantTask(vehicle.plant, one, vehicle_constraints(vehicle, self.limits, free, starts, one.step))
+                for vehicle, one in zip(self.vehicles, asked, strict=True)
             ],
         )
-
-    def _constraints(self, free: FreeGains, starts: Sequence[Law], place: int, step: Signal) -> list[Constraint]:
-        """The constraints around one of the plants."""
-        plant, noise = self.plants[place], self.noise[place]
-        B, floor = plant.body.B, 1 / self.limits.Ms
-        proportional = max(float(plant.body.least(start.Kp_i)) for start in starts)
-        begin = slice(plant.band.start, plant.band.start + 1)
-        found: list[Constraint] = [
-            *(Distance(cut, slice(0, plant.band.stop), floor) for cut in Cut),
-            Distance(Cut.TORQUE, begin, 1 / (SHARE * MAX_SENSITIVITY_BELOW_BAND)),
-            *(
-                NoiseLimit(NOISE * self.limits.noise * part, above)
-                for part, above in zip(noise, (0.0, FAST), strict=True)
-            ),
-            gain_above_band(plant),
-            structural_modes(plant, self.limited[place]),
-            Definite(ATTITUDE.matrix, np.eye(plant.axes), 0.0),
-        ]
-        if TERMS["I"].matrix in free.units:
-            found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
-        if TERMS["D"].matrix in free.units:
-            found += [Definite(TERMS["D"].matrix, each, 0.0) for each in (B, np.eye(plant.axes))]
-        largest = free.base.filters.law.largest or {}
-        axes = axes_slice(plant.axes)
-        found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
-        found += self._actuators(place, free.base.filters)
-        flown = flown_law(self.experiments[place])
-        if flown is not None:
-            found += no_softer_than(_loop_of(flown, plant), step, found)
-        return found
-
-    def _actuators(self, place: int, filters: Filters) -> list[Constraint]:
-        """Limits of the motors in the manoeuvres of the flown size; for yaw those of its torque and its rate."""
-        plant, experiment = self.plants[place], self.experiments[place]
-        size, flown, found = flown_amplitude(experiment), flown_law(experiment), list[Constraint]()
-        if plant.axes == 1:
-            limits = experiment.flown.limits if experiment.flown else Limits()
-            mixer, room, name = np.ones((1, 1)), np.full((1, 2), limits.moment_max[2]), "range of the yaw torque"
-            fastest = limits.rate_max[2] / (2 * size)  # a doublet's setpoint jumps by twice its size
-            found.append(Definite(ATTITUDE.matrix, -np.eye(1), -fastest, "limit of the yaw rate"))
-        else:
-            motors = experiment.motors or USUAL_MOTORS
-            mixer, room = motors.mixer, np.column_stack([motors.hover, 1 - motors.hover])
-            name = "range of the motors"
-        loop = None if flown is None else _loop_of(flown, plant)
-        # The rotors' torque stays within the range. Their command may exceed it for less than their lag.
-        torques = doublet_torque(plant, filters, size, (plant.shape[1], 0.0))
-        for share, torque in zip((RANGE, PEAK), torques, strict=True):
-            limit = MotorLimit(torque, mixer, share * room, name)
-            # What the flown gains use is allowed: the steps of a doublet are sharper than a pilot's.
-            used = 1.0 if loop is None else max(1.0, 1 - limit.margin(loop))
-            found.append(replace(limit, room=used * limit.room))
-        return found
-
-
-def flown_noise(experiment: Experiment, plant: WideResponse) -> Signal:
-    """RMS of the torque at hover (normalised) under the flown gains, all of it and its part above `FAST`, (2, n).
-
-    As recorded where the flown gains are not known.
-    """
-    flown = flown_law(experiment)
-    if flown is None:
-        return np.array([flown_torque_noise(experiment, plant.response, plant.omega, above) for above in (0.0, FAST)])
-    loop = _loop_of(flown, plant)
-    return np.array([loop.noise_rms(above) for above in (0.0, FAST)])
-
-
-def _loop_of(flown: Law, plant: WideResponse) -> LoopGradient:
-    """The loop of flown gains, at the period of the log: a logger's clock differs a little from the controller's."""
-    free = free_gains(replace(flown, filters=replace(flown.filters, Ts=plant.Ts)), plant.body)
-    return LoopGradient(plant, free, free.vector(flown))
-
-
-def flown_amplitude(experiment: Experiment) -> float:
-    """Size of the flown manoeuvres, rad, within the range of their family."""
-    size = experiment.amplitude
-    if size is None:
-        used = np.concatenate([experiment.y_o[start:stop] for start, stop in experiment.segments])
-        size = manoeuvre_size(used)
-    return float(np.clip(size, *family_of(experiment.u.shape[1]).amplitudes))
 
 
 def _scaled(task: DesignTask, start: Law) -> Signal:

@@ -9,13 +9,14 @@ from typing import Any, TypeVar
 import numpy as np
 
 from mimopilot.tuning.axes import Law, axes_slice
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.design.prediction import Prediction
 from mimopilot.tuning.design.response_design import Design, ResponseDesign
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains, Matrix
 from mimopilot.tuning.law import LOOP_TERMS
-from mimopilot.tuning.law_terms import MIMO
+from mimopilot.tuning.law_filters import MIMO
 from mimopilot.tuning.logs.flown_gains import LACKING, LOOP_RATE
 from mimopilot.tuning.logs.imported_gains import SAME_RATE
 from mimopilot.tuning.spec import TuningSpec
@@ -41,7 +42,7 @@ def check_profile(experiment: Experiment, spec: TuningSpec) -> None:
         return
     flown = experiment.flown
     if flown is not None and flown.controller == spec.profile:
-        largest = flown.filters.law.largest
+        largest = control_law(flown.filters).largest
         if "F" in spec.structure and largest is not None and not any(largest[LOOP_TERMS["F"].matrix]):
             raise TuningError(
                 f"structure: got {spec.structure}, but the {spec.profile} controller has no F; leave it out"
@@ -82,16 +83,16 @@ def stock_starts(base: Gains, experiment: Experiment, omega: float, B: Matrix) -
 
 def in_digits(law: AnyLaw) -> AnyLaw:
     """A stock law with its gains rounded to `DIGITS` or to its steps, within the autopilot's ranges; ours as it is."""
-    largest = law.filters.law.largest
+    largest = control_law(law.filters).largest
     if largest is None:
         return law
 
     def rounded(name: str) -> Matrix:
         values = np.diag(getattr(law, name))
         tops = np.array(largest[name])[axes_slice(len(values))].tolist()
-        step = law.filters.law.step.get(name)
+        step = control_law(law.filters).step.get(name)
         digits = [step * round(value / step) if step else float(f"{value:.{DIGITS}g}") for value in values]
-        digits = [min(digits)] * len(digits) if name in law.filters.law.shared else digits
+        digits = [min(digits)] * len(digits) if name in control_law(law.filters).shared else digits
         return np.diag([min(max(v, 0.0), top) for v, top in zip(digits, tops, strict=True)])
 
     changed: dict[str, Any] = {name: rounded(name) for name in largest}

@@ -13,6 +13,7 @@ from mimopilot.tuning.analysis.manoeuvres import manoeuvres
 from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.design.cascade_estimate import estimate, starting_set
 from mimopilot.tuning.design.certified_design import certified_design, rate_model, uncertified, weakest
+from mimopilot.tuning.design.design_spread import standard_deviations
 from mimopilot.tuning.design.prediction import Prediction, offaxis_doubt, predict, reasons_to_keep
 from mimopilot.tuning.design.response_design import BANDWIDTHS, FIRST_BANDWIDTH, Design, ResponseDesign, vehicle_damps
 from mimopilot.tuning.design.stock_profile import WORTH, at_loop_rates, our_module, stock_starts, worth
@@ -20,7 +21,7 @@ from mimopilot.tuning.design.yaw_design import tune_yaw, with_yaw
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS
-from mimopilot.tuning.law_terms import MIMO
+from mimopilot.tuning.law_filters import MIMO
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import SecondOrder
@@ -89,7 +90,7 @@ def tune_by_design(measured: Sequence[PlantEstimates], spec: TuningSpec) -> Gain
         method=spec.label,
         inner_model=(inner, inner),
         outer_model=(found.model, found.model),
-        standard_deviation={name: value.tolist() for name, value in bench.deviations(found).items()},
+        standard_deviation={name: value.tolist() for name, value in standard_deviations(bench, found).items()},
         warnings=tuple(warnings),
         details={
             "structure": spec.structure,

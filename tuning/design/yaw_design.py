@@ -18,6 +18,7 @@ from mimopilot.tuning.axes import AxesLaw, Law, flown_law, law_of
 from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.design.certified_design import certified_design, rate_model, uncertified
 from mimopilot.tuning.design.descent import INFEASIBLE
+from mimopilot.tuning.design.design_spread import standard_deviations
 from mimopilot.tuning.design.prediction import Prediction, predict, reasons_to_keep
 from mimopilot.tuning.design.quality_checks import check_saturation
 from mimopilot.tuning.design.response_design import BANDWIDTHS, Design, ResponseDesign
@@ -116,7 +117,7 @@ def tune_yaw(measured: Sequence[PlantEstimates], spec: TuningSpec, base: Gains, 
         "limited_by": design.active,
         **figures,
     }
-    deviations = {name: value.item() for name, value in bench.deviations(design).items()}
+    deviations = {name: value.item() for name, value in standard_deviations(bench, design).items()}
     found = replace(found, gains=_yaw_gains(design), details=details, deviations=deviations)
     return found.keep(base.yaw, f"the design is not better: {'; '.join(reasons)}") if reasons else found
 

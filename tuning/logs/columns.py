@@ -138,7 +138,7 @@ def load_columns(path: Path) -> Columns:
     InputFileError
         When it cannot be read, is not TOML, or an entry is unknown or impossible.
     """
-    table = read_toml(path, "column file")
+    table = read_toml(path, "column file", "leave out --columns, or give the columns' names")
     unknown = [name for name in table if name not in Columns.model_fields]
     if unknown:
         known = ", ".join(Columns.model_fields)

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from mimopilot.tuning.control_laws import LAWS
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law_terms import LAWS
 from mimopilot.tuning.logs.stock_controllers import stock_of
 from mimopilot.tuning.parameter_row import AXIS_LETTERS, PREFIX, Row, Shape
 from mimopilot.tuning.parameters import ENABLE, ROWS, SCALE, rows

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from mimopilot.common.files import read_bytes, sha256
+from mimopilot.common.errors import check_choice
+from mimopilot.common.files import check_file, read_bytes, sha256
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains, Triple
-from mimopilot.tuning.law_terms import MIMO
+from mimopilot.tuning.law_filters import MIMO
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.logs.formats import log_format
 from mimopilot.tuning.logs.parameter_file import read_parameter_file
@@ -125,8 +126,7 @@ def read_source(path: Path) -> ParameterSource:
     Error
         When the file cannot be read, is neither, or is a log of another vehicle than a multirotor.
     """
-    if not path.is_file():
-        raise TuningError(f"{path}: no such file; give a parameter file or a flight log")
+    check_file(path, "a parameter file or a flight log", TuningError)
     found, _ = log_format(path)
     if found is None or (found.takes_columns and ".csv" in found.suffixes):  # parameter files have commas, too
         values = {name: entry.value for name, entry in read_parameter_file(path).items()}
@@ -192,8 +192,8 @@ def import_gains(
     TuningError
         When the source holds no gains of a multirotor, lacks a parameter, or a value is not possible.
     """
-    if defaults is not None and defaults not in DEFAULTS:
-        raise TuningError(f"--defaults: got {defaults!r}, expected {' or '.join(DEFAULTS)}")
+    if defaults is not None:
+        check_choice("--defaults", defaults, DEFAULTS, TuningError)
     # The module's own gains may be on the vehicle, too: it is the stock ones that are wanted.
     values = {name: float(str(np.float32(v))) for name, v in source.values.items() if not name.startswith(PREFIX)}
     stock = _stock_controller(values, source)

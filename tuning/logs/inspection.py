@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.instrumental_variables import excited_stretches
-from mimopilot.tuning.experiment import MOVES, Experiment, external_signal, external_yaw_signal
+from mimopilot.tuning.experiment import Experiment, excites, external_signal, external_yaw_signal
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.flight_phase import flying_parts, intersection
@@ -179,7 +179,7 @@ def inspect_log(path: Path, columns: Columns | None = None) -> Inspection:
 
 
 def _excited_axes(experiment: Experiment | None) -> dict[str, str]:
-    """Axis -> name of its external signal, of the axes that one moves; a setpoint counts from `MOVES` on."""
+    """Axis -> name of its external signal, of the axes that one excites."""
     if experiment is None:
         return {}
     found = {}
@@ -188,9 +188,8 @@ def _excited_axes(experiment: Experiment | None) -> dict[str, str]:
     except TuningError:
         pass
     else:
-        least = MOVES if name == "r_o" else 0.0
         for i, axis in enumerate(AXES):
-            if any(np.ptp(signal[a:b, i]) > least for a, b in experiment.segments):
+            if excites(name, signal[:, i], experiment.segments):
                 found[axis] = name
     yaw = external_yaw_signal(experiment.yaw) if experiment.yaw else None
     return found | ({"yaw": yaw[1]} if yaw else {})

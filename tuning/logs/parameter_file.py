@@ -56,6 +56,8 @@ def read_parameter_file(path: Path) -> dict[str, FileParameter]:
         When the file does not match its checksum line.
     """
     text = read_text(path, "parameter file")
+    if path.suffix == ".toml":
+        raise TuningError(f"{path}: a TOML file (gains, airframe, specification), expected a parameter file")
     _verify_checksum(text, path)
     found: dict[str, FileParameter] = {}
     for number, line in enumerate(text.splitlines(), 1):

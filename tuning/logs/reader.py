@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mimopilot.common.files import missing_target, sha256
+from mimopilot.common.files import check_file, sha256
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment, manoeuvre_size
 from mimopilot.tuning.logs.columns import Columns
@@ -57,14 +57,13 @@ def open_log(path: Path, columns: Columns | None = None) -> Recording:
     TuningError
         When the format is not known or the file is damaged.
     """
-    if not path.is_file():
-        reason = missing_target(path) or ("it is a folder" if path.is_dir() else "no such file")
-        raise TuningError(f"{path}: {reason}; give the path of a flight log: {known_formats()}")
+    check_file(path, f"the path of a flight log: {known_formats()}", TuningError)
     if path.suffix == ".toml":
         raise TuningError(f"{path}: a TOML file (gains, airframe, specification), expected {known_formats()}")
     found, head = log_format(path)
     if found is None:
-        raise TuningError(f"{path}: not a flight log: it begins with {head[:8]!r}; known formats: {known_formats()}")
+        content = f"it begins with {head[:8]!r}" if head else "it is empty"
+        raise TuningError(f"{path}: not a flight log: {content}; known formats: {known_formats()}")
     module, _, function = found.reader.partition(":")
     read = getattr(import_module(module), function)
     if found.takes_columns:

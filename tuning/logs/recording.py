@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.logs.resample import REQUIRED, Interval, Series, monotone
+from mimopilot.tuning.px4_names import AUTOTUNE_PREFIX
 
 #: Damage of a log that ends too early.
 INCOMPLETE = "the file ends inside a message: the download is incomplete or power was lost"
@@ -44,7 +45,7 @@ LOOP_PREFIXES = (
     "Q_M_",
 )
 #: Those among them that only configure an experiment: our injector, PX4's autotune.
-EXPERIMENT_PREFIXES = ("MIMO_EX", "MC_AT_")
+EXPERIMENT_PREFIXES = ("MIMO_EX", AUTOTUNE_PREFIX)
 MAX_OUTLIERS = 0.01  # fraction of samples out of range that damage explains; more means a wrong unit
 
 

@@ -6,8 +6,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from mimopilot.tuning.control_laws import LAWS
 from mimopilot.tuning.gains import Limits
-from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, BETAFLIGHT, LAWS, PX4_STOCK, StockFilters
+from mimopilot.tuning.law_filters import ARDUPILOT_STOCK, BETAFLIGHT, PX4_STOCK, StockFilters
 from mimopilot.tuning.parameter_row import AXIS_LETTERS, Row, Shape
 
 
@@ -33,7 +34,7 @@ class StockController:
     rate : str
         Parameter of the control rate, Hz.
     profile : str
-        Its law, a key of `tuning.law_terms.LAWS`.
+        Its law, a key of `tuning.control_laws.LAWS`.
     filters : mapping
         Filter of its law -> parameter for roll, pitch and yaw; empty: none.
     later : tuple of str

@@ -18,10 +18,11 @@ from mimopilot.tuning.logs.columns import SIGNALS, TIME_UNITS, YAW_SIGNALS, Colu
 from mimopilot.tuning.logs.matlab_sizes import check_sizes
 from mimopilot.tuning.logs.recording import Recording, listed
 from mimopilot.tuning.logs.resample import MIN_RATE, MIN_SECONDS, REQUIRED, Series
+from mimopilot.tuning.px4_names import LOG_PROFILE, TUNING_PROFILE
 
 ADVICE = (
-    "log it at 100 Hz or more on the vehicle (PX4: SDLOG_PROFILE 49, ArduPilot: LOG_BITMASK bit 0) and export every "
-    "sample; if the columns have other names, give them with --columns"
+    f"log it at 100 Hz or more on the vehicle (PX4: {LOG_PROFILE} {TUNING_PROFILE}, ArduPilot: LOG_BITMASK bit 0) and "
+    "export every sample; if the columns have other names, give them with --columns"
 )
 NOTE = "the file does not hold the flown gains: give [yaw] and derivative_cutoff_hz in a --spec file"
 REQUIRED_COLUMNS = tuple(field for signal in REQUIRED for field in SIGNALS[signal])

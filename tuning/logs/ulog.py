@@ -17,6 +17,7 @@ from mimopilot.tuning.logs.torque_parts import PARTS_TOPIC, torque_parts
 from mimopilot.tuning.logs.ulog_file import UlogFile, open_ulog
 from mimopilot.tuning.logs.vehicle_type import px4_vehicle
 from mimopilot.tuning.parameters import ENABLE
+from mimopilot.tuning.px4_names import LOG_PROFILE, TUNING_PROFILE
 
 #: Signal -> (topic, fields) that hold it, newest PX4 first.
 LAYOUTS = {
@@ -104,7 +105,7 @@ def record_ulog(path: Path) -> Recording:
         signals=signals,
         wanted=wanted,
         contents=file.names(),
-        advice=_advice(now.get("SDLOG_PROFILE")),
+        advice=_advice(now.get(LOG_PROFILE)),
         airborne=vehicle.airborne(airborne),
         evidence=evidence or "vehicle_status",
         parameters=file.parameters,
@@ -170,11 +171,11 @@ def _notes(log: _UlogLog) -> tuple[str, ...]:
 
 def _advice(profile: float | None) -> str:
     """What to change so that the signals are logged fast enough; names no setting that is right already."""
-    if profile is None or int(profile) & 49 != 49:
+    if profile is None or int(profile) & TUNING_PROFILE != TUNING_PROFILE:
         now = f" (default, high rate and debug; it is {profile:.0f})" if profile is not None else ""
-        return f"set SDLOG_PROFILE to 49{now} and fly again"
+        return f"set {LOG_PROFILE} to {TUNING_PROFILE}{now} and fly again"
     return (
-        f"SDLOG_PROFILE is {profile:.0f}, which logs every loop, but PX4 reads it at startup: restart the vehicle, "
+        f"{LOG_PROFILE} is {profile:.0f}, which logs every loop, but PX4 reads it at startup: restart the vehicle, "
         "use a faster card if the log has gaps, and fly again"
     )
 

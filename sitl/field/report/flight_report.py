@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from mimopilot.common.charts import STYLES
 from mimopilot.common.errors import Error
 from mimopilot.common.extras import REPORT
 from mimopilot.common.figures import Chart
@@ -25,7 +26,9 @@ from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.logs.columns import Columns
 from mimopilot.tuning.spec import TuningSpec
 
-#: Most logs of one page, which stays below 6 MB: plotly.js has 4.8, a first log 0.5.
+#: Bytes of a page, at most: what mail and a slow link carry. plotly.js has 4.8 MB of it.
+LARGEST_PAGE = 6_000_000
+#: Most logs of one page; a fifth colour is left for a gain set.
 MOST_LOGS = 4
 
 
@@ -52,7 +55,7 @@ class FlightReport:
 
     def write(self, out: Path, figures: Path | None = None) -> list[Path]:
         """Write the page, and its figures as PNG and SVG into a folder; returns the files."""
-        write_report(out, self.title, self.lead, self.sections, self.headline)
+        write_report(out, self.title, self.lead, self.sections, self.headline, LARGEST_PAGE)
         if figures is None:
             return [out]
         from mimopilot.common.figure_images import write_images
@@ -60,8 +63,8 @@ class FlightReport:
         return [out, *write_images(self.charts, figures)]
 
 
-def check_count(logs: int) -> None:
-    """Refuse more logs than a page has room for.
+def check_count(logs: int, sets: int = 0) -> None:
+    """Refuse more logs and gain sets than a page can show.
 
     Raises
     ------
@@ -69,6 +72,10 @@ def check_count(logs: int) -> None:
     """
     if not 1 <= logs <= MOST_LOGS:
         raise Error(f"{logs} logs: a report has room for 1 to {MOST_LOGS}; make more than one")
+    if logs + sets > len(STYLES):
+        raise Error(
+            f"{logs} logs and {sets} gain sets: a report has colours for {len(STYLES)} together; make more than one"
+        )
 
 
 def make_report(
@@ -96,7 +103,7 @@ def make_report(
         When there are too many logs, a file is no flight log, two sets have one name, or plotly is not installed.
     """
     REPORT.need()
-    check_count(len(logs))
+    check_count(len(logs), len(sets))
     task = spec or TuningSpec()
     flights = read_flights(logs, columns)
     cases = gain_cases(flights, sets, task)

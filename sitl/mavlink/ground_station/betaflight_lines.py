@@ -1,6 +1,6 @@
 """Gains as lines for Betaflight's command line (CLI), which its configurator and presets take.
 
-Names and ranges: settings.c of Betaflight 2025.12; scales: `tuning.law_terms`. The lines also switch off what the
+Names and ranges: settings.c of Betaflight 2025.12; scales: `tuning.stock_laws`. The lines also switch off what the
 certificate does not cover: the growth of D in fast movements, and the rise of its low-pass with the throttle.
 """
 
@@ -11,8 +11,9 @@ import math
 import numpy as np
 
 from mimopilot.sitl.errors import SitlError
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law_terms import BETAFLIGHT, MIMO
+from mimopilot.tuning.law_filters import BETAFLIGHT, MIMO
 
 #: Letter of a setting -> gain.
 LETTERS = {"p": "Kp_i", "i": "Ki_i", "d": "Kd_i"}
@@ -70,7 +71,7 @@ def betaflight_lines(gains: Gains) -> str:
 
 def _whole(gains: Gains, key: str, axis: int, name: str) -> int:
     """The number on the command line of a gain; refuses one that would be rounded, as the certificate is not of it."""
-    law = gains.filters.law
+    law = control_law(gains.filters)
     assert law.largest is not None  # the set is for Betaflight
     number = float(getattr(gains, key)[axis, axis]) / law.step[key]
     most = round(law.largest[key][axis] / law.step[key])

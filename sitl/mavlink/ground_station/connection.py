@@ -49,6 +49,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
 from mimopilot.sitl.mavlink.wire.codec import Codec
 from mimopilot.sitl.mavlink.wire.float32 import INT32
 from mimopilot.sitl.mavlink.wire.ftp import FtpPacket
+from mimopilot.sitl.mavlink.wire.serial_ports import open_serial
 from mimopilot.sitl.mavlink.wire.signing import Signer
 from mimopilot.sitl.mavlink.wire.sockets import udp_socket
 from mimopilot.sitl.physics.state_estimate import quaternion_of
@@ -223,15 +224,10 @@ class Connection:
 
     @staticmethod
     def _open_serial(url: str) -> Any:
-        import serial
-
         device, _, baud = url.partition(",")
         if not device.startswith(("/", "COM")) or not (baud or str(BAUD)).isdigit():
             raise SitlError(f"--connect {url}: {FORMS}")
-        try:
-            return serial.Serial(device, int(baud or BAUD), timeout=0, write_timeout=CONNECT_S)
-        except (serial.SerialException, ValueError) as error:
-            raise SitlError(f"--connect {url}: cannot be opened: {error}", exit_code=1) from error
+        return open_serial("--connect", url, device, int(baud or BAUD), CONNECT_S)
 
     @property
     def hint(self) -> str:

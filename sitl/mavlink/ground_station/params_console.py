@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 from mimopilot.common.console import print_json, print_table
+from mimopilot.common.errors import check_choice
 from mimopilot.common.files import write_atomically
 from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
@@ -17,7 +18,7 @@ from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
 from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
-from mimopilot.tuning.law_terms import BETAFLIGHT, MIMO
+from mimopilot.tuning.law_filters import BETAFLIGHT, MIMO
 
 #: Format -> code generation target that emits it, and its path there.
 GENERATED = {
@@ -74,8 +75,7 @@ def export(
         If the format is unknown, or there is nothing to export.
     """
     from_gains = (*GENERATED, BETAFLIGHT)
-    if form not in (*FORMATS, *from_gains):
-        raise SitlError(f"--format: got {form!r}, expected one of {', '.join([*FORMATS, *from_gains])}")
+    check_choice("--format", form, (*FORMATS, *from_gains), SitlError)
     if form in from_gains and profile is not None:
         raise SitlError(f"--format {form}: is for one controller only; leave out --profile")
     if file is not None:

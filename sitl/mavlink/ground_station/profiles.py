@@ -12,11 +12,13 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.acceptance import check_ranges
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.gains import Gains, Limits, Triple
-from mimopilot.tuning.law_terms import ARDUPILOT_STOCK, BETAFLIGHT, MIMO, PX4_STOCK, StockFilters
+from mimopilot.tuning.law_filters import ARDUPILOT_STOCK, BETAFLIGHT, MIMO, PX4_STOCK, StockFilters
 from mimopilot.tuning.parameter_row import PREFIX, Parameter, Shape
 from mimopilot.tuning.parameters import (
     ARDUPILOT_EXCITATION,
@@ -156,7 +158,7 @@ def _ardupilot_stock(gains: Gains) -> UploadPlan:
 
 def _stock_law(gains: Gains) -> tuple[StockFilters, Mapping[str, Triple]]:
     """Filters of a stock set, and the largest gains of its controller."""
-    stock, largest = gains.filters.stock, gains.filters.law.largest
+    stock, largest = gains.filters.stock, control_law(gains.filters).largest
     assert stock is not None and largest is not None  # make_plan compares the profile with the set's controller
     return stock, largest
 
@@ -180,7 +182,7 @@ PROFILES: dict[str, Callable[[Gains], UploadPlan]] = {
 
 
 def law_of(profile: str) -> str:
-    """Law that the gains of a profile are for, a key of `tuning.law_terms.LAWS`."""
+    """Law that the gains of a profile are for, a key of `tuning.control_laws.LAWS`."""
     return MIMO if profile == ARDUPILOT_CUSTOM else profile
 
 
@@ -206,8 +208,7 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
             f"the gains are for {gains.controller}: Betaflight takes no parameters over MAVLink; write lines for its "
             f"command line: mimopilot params FILE --format {BETAFLIGHT}, of gains from tune LOG --profile {BETAFLIGHT}"
         )
-    if profile not in PROFILES:
-        raise SitlError(f"--profile: got {profile!r}, expected one of {', '.join(PROFILES)}")
+    check_choice("--profile", profile, PROFILES, SitlError)
     if law_of(profile) != gains.controller:
         raise SitlError(
             f"--profile {profile}: the gains are for {gains.controller}; upload them with --profile "

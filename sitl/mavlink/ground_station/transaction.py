@@ -24,7 +24,7 @@ from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.gains import Gains, Triple
-from mimopilot.tuning.law_terms import MIMO
+from mimopilot.tuning.law_filters import MIMO
 
 STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it",

@@ -22,6 +22,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
     ParameterValue,
     RequestMessage,
     SendAndWait,
+    SendCommand,
     TransferReport,
 )
 from mimopilot.sitl.mavlink.wire.float32 import shortest
@@ -221,3 +222,40 @@ class VehicleLinkState:
             return []
         self._request_due = self.now + TRY_S
         return [RequestMessage(self.vehicle.system, self.vehicle.component, HEARTBEAT)]
+
+    def command(
+        self,
+        number: int,
+        parameters: Sequence[float],
+        is_final: Callable[[CommandAck], bool] = lambda ack: True,
+        is_over: Callable[[], bool] = lambda: False,
+    ) -> Exchange[CommandAck | None]:
+        """Command the vehicle, again every `TRY_S` until it has acknowledged; returns None when it does not.
+
+        Parameters
+        ----------
+        number : int
+            MAV_CMD.
+        parameters : sequence of float
+            The first of its seven parameters.
+        is_final : callable
+            Whether an acknowledgement is the last one. After another, as of a command in progress, all tries are left.
+        is_over : callable
+            Asked before each repetition: whether no acknowledgement is to be expected any more.
+        """
+        assert self.vehicle is not None
+        order = SendCommand(self.vehicle.system, self.vehicle.component, number, tuple(parameters))
+        left, due, sent = self.tries, self.now, False
+        while not self.closed:
+            send: list[Outgoing] = []
+            if self.now >= due:
+                if not left or (sent and is_over()):
+                    return None
+                left, due, send, sent = left - 1, self.now + TRY_S, [order], True
+            for answer in (yield from self.send_and_wait(send, due)):
+                if not isinstance(answer, CommandAck) or answer.command != number:
+                    continue
+                if is_final(answer):
+                    return answer
+                left = self.tries
+        return None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 
+from mimopilot.common.errors import check_choice
 from mimopilot.common.files import inside
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import ARDUPILOT, Exchange
@@ -123,8 +124,7 @@ class VehicleLogs:
         SitlError
             If there is no vehicle, it has neither protocol, or cannot read its card.
         """
-        if protocol not in PROTOCOLS:
-            raise SitlError(f"--protocol: got {protocol!r}, expected one of {', '.join(PROTOCOLS)}")
+        check_choice("--protocol", protocol, PROTOCOLS, SitlError)
         vehicle = yield from self.client.await_heartbeat()
         self.client.progress("listing", 0, 1)
         reason = "FTP was not asked"

@@ -10,13 +10,13 @@ import select
 import time
 from typing import Any
 
-import serial
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.simulator_api.simulated_vehicle import MAX_CATCH_UP_S, SimulatedVehicle
 from mimopilot.sitl.mavlink.wire.codec import MAVLINK_VERSION
 from mimopilot.sitl.mavlink.wire.fast_codec import ACTUATORS, READ_BYTES
+from mimopilot.sitl.mavlink.wire.serial_ports import open_serial
 from mimopilot.sitl.physics.rigid_body import MAX_ROTORS
 
 STALE_S = 0.5  # s without commands after which the motors stop, as speed controllers do; chosen
@@ -47,15 +47,11 @@ class SerialPlant:
         if not self.device or not (baud.isascii() and baud.isdigit()):
             raise SitlError(f"--serial {url}: expected DEVICE,BAUD such as /dev/ttyACM0,921600")
         self.baud = int(baud)
-        try:
-            self.port = self._open()
-        except (OSError, ValueError) as error:
-            raise SitlError(
-                f"--serial {url}: cannot be opened: {error}; is the board connected?", exit_code=1
-            ) from error
+        self.url = url
+        self.port = self._open()
 
     def _open(self) -> Any:
-        return serial.Serial(self.device, self.baud, timeout=0, write_timeout=WRITE_S, exclusive=True)
+        return open_serial("--serial", self.url, self.device, self.baud, WRITE_S, exclusive=True)
 
     def serve(self) -> None:
         """Serve for ever; a board that disconnects (they do when they reboot) may reconnect."""
@@ -73,7 +69,7 @@ class SerialPlant:
             try:
                 self.port = self._open()
                 return
-            except OSError:
+            except SitlError:
                 time.sleep(REOPEN_S)
 
     def _fly(self) -> None:

@@ -6,11 +6,11 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.autopilot.autotune_module import PROGRESS, State
 from mimopilot.sitl.autopilot.excitation_injector import NO_MOMENT, Moment
-from mimopilot.sitl.autopilot.px4_parameters import AUTOTUNE_START
 from mimopilot.sitl.autopilot.stock_autopilot import StockAutopilot
 from mimopilot.sitl.mavlink.vehicle.torque_injection import NO_STICKS
 from mimopilot.sitl.mavlink.vehicle.vehicle_commands import Command, Progress
 from mimopilot.sitl.mavlink.vehicle.vehicle_state import VehicleState
+from mimopilot.tuning.px4_names import AUTOTUNE_START
 
 #: State -> MAV_RESULT; all others are in progress.
 RESULTS = {State.COMPLETE: mavlink.MAV_RESULT_ACCEPTED, State.FAIL: mavlink.MAV_RESULT_FAILED}

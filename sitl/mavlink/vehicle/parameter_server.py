@@ -15,7 +15,7 @@ from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.native import NativeController
 from mimopilot.sitl.autopilot.excitation_injector import AXIS, Injector
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
+from mimopilot.sitl.mavlink.vehicle.parameter_store import KeptParameters, ParameterStore
 from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest, single
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
@@ -49,7 +49,7 @@ class ServedParameter:
         return f"expected {'a whole number from ' if self.integer else ''}{self.minimum:g} to {self.maximum:g}"
 
 
-class ParameterServer:
+class ParameterServer(KeptParameters):
     """Answers the parameter protocol; a write acts on the controller at once, bumpless.
 
     Parameters
@@ -172,19 +172,6 @@ class ParameterServer:
         if self.store is not None:
             self.store.keep(self.stored_values)
         return None
-
-    def flush(self) -> bool:
-        """Store pending changes now; False when that fails."""
-        return self.store is None or self.store.flush()
-
-    def take_write_error(self) -> str:
-        """Return the store's last write error and clear it; empty: none."""
-        return self.store.take_write_error() if self.store else ""
-
-    def close(self) -> None:
-        """Store pending changes."""
-        if self.store is not None:
-            self.store.close()
 
     @property
     def stored_values(self) -> dict[str, float]:

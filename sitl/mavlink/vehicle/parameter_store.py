@@ -95,3 +95,28 @@ class ParameterStore:
             self._leaving.wait(DELAY_S)
             self._changed.clear()
             self.flush()
+
+
+class KeptParameters:
+    """Parameters of a vehicle that are stored, or not.
+
+    Attributes
+    ----------
+    store : ParameterStore or None
+        None: they are lost with the process.
+    """
+
+    store: ParameterStore | None
+
+    def flush(self) -> bool:
+        """Store pending changes now; False when that fails."""
+        return self.store is None or self.store.flush()
+
+    def take_write_error(self) -> str:
+        """Return the store's last write error and clear it; empty: none."""
+        return self.store.take_write_error() if self.store else ""
+
+    def close(self) -> None:
+        """Store pending changes."""
+        if self.store is not None:
+            self.store.close()

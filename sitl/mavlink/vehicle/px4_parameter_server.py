@@ -15,13 +15,13 @@ from pymavlink.dialects.v20 import common as mavlink
 from mimopilot.sitl.autopilot.px4_parameters import OF_THE_AUTOTUNE
 from mimopilot.sitl.autopilot.stock_autopilot import StockAutopilot
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.vehicle.parameter_store import ParameterStore
+from mimopilot.sitl.mavlink.vehicle.parameter_store import KeptParameters, ParameterStore
 from mimopilot.sitl.mavlink.wire.float32 import INT32, REAL32, shortest, single
 
 NO_INDEX = 65535  # PARAM_VALUE.param_index of an unlisted parameter
 
 
-class Px4ParameterServer:
+class Px4ParameterServer(KeptParameters):
     """Answers the parameter protocol; a write acts on the controllers at once.
 
     Parameters
@@ -94,16 +94,3 @@ class Px4ParameterServer:
             if self.store is not None:
                 self.store.keep(self.changed)
         return [self.message(name)]
-
-    def flush(self) -> bool:
-        """Store pending changes now; False when that fails."""
-        return self.store is None or self.store.flush()
-
-    def take_write_error(self) -> str:
-        """Return the store's last write error and clear it; empty: none."""
-        return self.store.take_write_error() if self.store else ""
-
-    def close(self) -> None:
-        """Store pending changes."""
-        if self.store is not None:
-            self.store.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import socket
 
 from mimopilot.sitl.errors import SitlError
@@ -55,4 +56,8 @@ def udp_socket(
 def _refused(protocol: str, host: str, port: int, error: OSError, advice: str) -> SitlError:
     if isinstance(error, PermissionError) and port < PRIVILEGED:
         advice = f"ports below {PRIVILEGED} are reserved for the system; choose one above"
+    elif isinstance(error, socket.gaierror):
+        advice = "give the name or address of this machine"
+    elif error.errno == errno.EADDRNOTAVAIL:
+        advice = f"this machine has no such address; give {LOOPBACK}, or 0.0.0.0 for all that it has"
     return SitlError(f"{protocol} port {port} on {host} cannot be used: {error.strerror or error}; {advice}")

@@ -3,10 +3,11 @@
 import tomllib
 from dataclasses import replace
 
+from mimopilot.common.toml import checked, parse_toml
 from mimopilot.sitl.campaign.draws import RunSampler
 from mimopilot.sitl.campaign.flights import CHUNK
 from mimopilot.sitl.campaign.plan import make_plan
-from mimopilot.sitl.campaign.variation import variation_from_toml
+from mimopilot.sitl.campaign.variation import Variation
 from mimopilot.sitl.flight.scenario import doublet
 
 RUNS = 16 * CHUNK  # enough to interrupt the campaign while it flies
@@ -39,6 +40,10 @@ def unstable(gains):
     return replace(gains, Kp_i=gains.Kp_i + 5 * gains.Kp_i[::-1], certificate=None)  # couples the axes
 
 
+def variation(text):
+    return checked(Variation, parse_toml(text, "spec.toml"), "spec.toml")
+
+
 def drawn(vehicle, vary, runs=2000):
-    sampler = RunSampler(vehicle.airframe, variation_from_toml(vary, "spec"), doublet("roll", 0.4, 0.42, 0.004))
+    sampler = RunSampler(vehicle.airframe, variation(vary), doublet("roll", 0.4, 0.42, 0.004))
     return [sampler.draw(5, run) for run in range(runs)]

@@ -9,12 +9,11 @@ import pytest
 from mimopilot.common.errors import InputFileError
 from mimopilot.sitl.autopilot.autopilot import Autopilot
 from mimopilot.sitl.campaign.flights import FlightRunner
-from mimopilot.sitl.campaign.variation import variation_from_toml
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.simulator import fly
 from mimopilot.sitl.physics.rigid_body import GRAVITY, checked_inertia
 from tests.paths import DOCS
-from tests.sitl.campaign.plans import VARY, drawn, plan_of
+from tests.sitl.campaign.plans import VARY, drawn, plan_of, variation
 
 
 def test_draws_have_the_moments_of_their_distributions(vehicle):
@@ -82,7 +81,7 @@ def test_impossible_draws_are_repeated_and_counted_and_an_impossible_specificati
 )
 def test_a_wrong_specification_is_refused_with_the_name_of_its_entry(text, words):
     with pytest.raises(InputFileError) as error:
-        variation_from_toml(text, "spec.toml")
+        variation(text)
     assert words in str(error.value)
 
 

@@ -9,19 +9,11 @@ from hypothesis import strategies as st
 
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.design.conic_problem import ConicProblem
-from mimopilot.tuning.design.constraints import (
-    Cut,
-    Definite,
-    Distance,
-    MotorLimit,
-    NoiseLimit,
-    ParameterRange,
-    gain_above_band,
-    structural_modes,
-)
+from mimopilot.tuning.design.constraints import Cut, Definite, Distance, MotorLimit, NoiseLimit, ParameterRange
 from mimopilot.tuning.design.disturbance_limit import DisturbanceLimit
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
+from mimopilot.tuning.design.rate_loop_gain import gain_above_band, structural_modes
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import wide_response
 from mimopilot.tuning.small_matrices import singular_values

@@ -7,6 +7,7 @@ import pytest
 
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.analysis.closed_loop import cascade_loop
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.law import cascade_response
@@ -47,7 +48,7 @@ def gains(request):
 
 
 def free_of(gains, plant):
-    return free_gains(gains, plant.body, full=gains.filters.law.coupled)
+    return free_gains(gains, plant.body, full=control_law(gains.filters).coupled)
 
 
 def test_the_responses_are_those_of_the_law(plant, gains):
@@ -82,7 +83,7 @@ def test_the_derivatives_are_those_of_finite_differences(plant, gains):
     free = free_of(gains, plant)
     vector = free.vector(gains)
     loop = LoopGradient(plant, free, vector)
-    assert len(vector) == (28 if gains.filters.model_omega else 20 if gains.filters.law.coupled else 10)
+    assert len(vector) == (28 if gains.filters.model_omega else 20 if control_law(gains.filters).coupled else 10)
     for place in range(len(vector)):
         step = STEP * np.eye(len(vector))[place]
         after, before = (LoopGradient(plant, free, vector + sign * step) for sign in (1, -1))

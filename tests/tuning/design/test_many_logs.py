@@ -66,7 +66,7 @@ def test_a_campaign_without_logs_is_refused(logs, mimopilot, tmp_path):
     (tmp_path / "empty").mkdir()
     assert_one_clear_line(mimopilot("tune", "empty", "--campaign", "--out", "t"), "no logs in this folder")
     assert_one_clear_line(
-        mimopilot("tune", logs / "notes.ulg", "--campaign", "--out", "t"), "all 1 logs were refused", "notes.ulg"
+        mimopilot("tune", logs / "notes.ulg", "--campaign", "--out", "t"), "1 of 1 logs were refused", "notes.ulg"
     )
     both = mimopilot("tune", logs, "--campaign", "--repeat", two[0], "--out", "t")
     assert_one_clear_line(both, "--repeat: belongs to one log")

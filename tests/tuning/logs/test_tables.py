@@ -85,10 +85,10 @@ def test_other_names_units_and_signs_are_converted(tmp_path, flight):
     [
         ('thrust = { column = "T" }', "thrust: not a signal; known signals: t, u_roll"),
         ('p = { column = "gx", units = "deg/s" }', "p.units: unknown entry"),
-        ('p = { unit = "deg" }', "p.unit: Input should be 'rad/s' or 'deg/s'"),
+        ('p = { unit = "deg" }', "p.unit: got 'deg', expected rad/s or deg/s"),
         ('t = { unit = "min" }', "t.unit"),
-        ('p = { column = "gyro", index = 0 }', "p.index: Input should be greater than or equal to 1"),
-        ("u_roll = { sign = 0 }", "u_roll.sign: Input should be 1 or -1"),
+        ('p = { column = "gyro", index = 0 }', "p.index: got 0, expected greater than or equal to 1"),
+        ("u_roll = { sign = 0 }", "u_roll.sign: got 0, expected 1 or -1"),
         ("u_roll = { sign = [", "not a TOML file"),
         ('p = { column = "" }', "p.column"),
     ],

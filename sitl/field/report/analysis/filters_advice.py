@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
 from mimopilot.sitl.field.report.analysis.loop_filters import DERIVATIVE, LOW_PASS, NOTCH, LoopFilter
 from mimopilot.sitl.field.report.analysis.vibration import AirSpectrum, Tone
-from mimopilot.tuning.analysis.certify import certify
+from mimopilot.tuning.analysis.certify import certify, reason_unknown
 from mimopilot.tuning.certificate import ACCEPTED, Certificate, Thresholds, Verdict
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
@@ -73,6 +73,14 @@ class FilterChange:
     why: str
 
 
+def of_both_axes(case: GainCase, thresholds: Thresholds) -> GainCase | None:
+    """The set with the certificate of roll and pitch alone, as behind the changes; None: its margins are not known."""
+    measured = case.flight.measured
+    if measured is None or case.unknown or case.gains.certificate is None or not case.gains.certificate.figures:
+        return None
+    return replace(case, gains=replace(case.gains, certificate=_examined(case.gains, measured.response, thresholds)))
+
+
 def filter_changes(
     case: GainCase,
     filters: Sequence[LoopFilter],
@@ -85,7 +93,7 @@ def filter_changes(
     Parameters
     ----------
     case : GainCase
-        With its certificate.
+        From `of_both_axes`.
     filters : sequence of LoopFilter
         In the flight.
     tones : sequence of Tone
@@ -94,11 +102,6 @@ def filter_changes(
         Of the torque in the air, without the injected part.
     thresholds : Thresholds
     """
-    measured = case.flight.measured
-    if measured is None or case.gains.certificate is None or not case.gains.certificate.figures:
-        return []
-    # Of roll and pitch alone, as behind the changes.
-    case = replace(case, gains=replace(case.gains, certificate=_examined(case.gains, measured.response, thresholds)))
     changes = []
     for old in filters:
         if old.kind == LOW_PASS or old.acts_on == DERIVATIVE:
@@ -182,19 +185,27 @@ def _examined(gains: Gains, plant: PlantResponse, thresholds: Thresholds) -> Cer
     return certify(gains, plant, spec.models("inner", gains.Ts), spec.models("outer", gains.Ts), thresholds=thresholds)
 
 
+def _margin_change(case: GainCase, gains: Gains, plant: PlantResponse, found: Certificate) -> float:
+    """Smallest phase margin behind a changed filter minus that of the case, deg; NaN: not known there."""
+    if reason_unknown(gains, plant.at_period(gains.Ts)):
+        return float("nan")
+    return least_phase(found) - least_phase(case.gains.certificate)
+
+
 def _cutoff(case: GainCase, old: LoopFilter, new: LoopFilter, thresholds: Thresholds) -> FilterChange:
     """Another cut-off of a low-pass filter, of the rates or of the derivative alone."""
     measured, wide, gains = case.flight.measured, case.flight.wide, case.gains
     assert measured is not None
     before = torque_noise(gains, wide) if wide else float("nan")
+    plant = measured.response
     if old.acts_on == DERIVATIVE:
         gains = with_derivative_filter(gains, new.hertz)
-        found = _examined(gains, measured.response, thresholds)
         after = torque_noise(gains, wide) if wide else float("nan")
     else:
-        found = _examined(gains, behind(measured.response, old, new), thresholds)
+        plant = behind(plant, old, new)
         after = torque_noise(gains, wide, old, new) if wide else float("nan")
-    margin, higher = least_phase(found) - least_phase(case.gains.certificate), new.hertz > old.hertz
+    found, higher = _examined(gains, plant, thresholds), new.hertz > old.hertz
+    margin = _margin_change(case, gains, plant, found)
     reason = ""
     if not np.isfinite(after):
         reason = "the torque's noise behind it is not known"
@@ -222,17 +233,22 @@ def _notch(
     measured, wide, gains = case.flight.measured, case.flight.wide, case.gains
     assert measured is not None
     new = LoopFilter("notch", NOTCH, float(round(tone.hertz)), width_hz=_width(tone))
-    found = _examined(gains, behind(measured.response, None, new), thresholds)
+    plant = behind(measured.response, None, new)
+    found = _examined(gains, plant, thresholds)
     noise = torque_noise(gains, wide, None, new) / torque_noise(gains, wide) if wide else float("nan")
     share = tone_share(tone, torque)
     if not np.isfinite(share):
         why, advised = "the tone's share of the torque is not known", False
     else:
         why = f"the tone is {share:.0%} of the torque's power above {NOISE_FROM:g} Hz"
-        advised = share >= WORTH and found.verdict in ACCEPTED
-        why += "" if share >= WORTH else ": not worth a notch"
+        loud = share >= WORTH and torque_rms(torque) > QUIET
+        advised = loud and found.verdict in ACCEPTED
+        if share < WORTH:
+            why += ": not worth a notch"
+        elif not loud:
+            why += f", which is quiet: {torque_rms(torque):.2g} RMS"
         why += "" if found.verdict in ACCEPTED else f"; but behind it the gains are {found.verdict}"
-    margin = least_phase(found) - least_phase(gains.certificate)
+    margin = _margin_change(case, gains, plant, found)
     ardupilot = case.flight.recording.format.startswith("dataflash")
     return FilterChange(f"add a notch: {_setting(new, tone, filters, ardupilot)}", found, margin, noise, advised, why)
 

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.common.charts import INJECTED, IS_FLOWN, IS_NEW, IS_SISO, LIMIT, looks
-from mimopilot.common.figures import MOST_SAMPLES
+from mimopilot.common.figures import MOST_SAMPLES, thinned
 from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals, further_signals
+from mimopilot.tuning.analysis.certify import reason_unknown
 from mimopilot.tuning.design.cascade import certify_around
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
@@ -101,6 +102,13 @@ class ReportedFlight:
     def since_begin(self, series: Series) -> Series:
         """A series with its time from the beginning of the log, s."""
         return Series(series.time - self.span[0], series.values, series.topic)
+
+    def drawn(self, time: Signal, values: Signal, share: float = 1.0) -> tuple[Signal, Signal]:
+        """A signal (N,) as a line of at most a share of `samples`, interrupted where the log has a gap."""
+        pauses = np.diff(time)
+        after = np.flatnonzero(pauses > MAX_GAP * np.median(pauses)) + 1 if len(pauses) else []
+        x, y = np.insert(time, after, time[after]), np.insert(np.asarray(values, np.float64), after, np.nan)
+        return thinned(x, y, int(share * self.samples))
 
     @cached_property
     def airborne(self) -> tuple[Interval, ...]:
@@ -262,23 +270,44 @@ class GainCase:
         """Label, colour and line style of its curves."""
         return {"label": self.label, "colour": self.colour, "dash": self.dash}
 
+    @cached_property
+    def unknown(self) -> str:
+        """Why the flight does not show the whole loop of roll and pitch; empty: it does, or there is no certificate.
+
+        Then the figures of the certificate are those of the known band alone: bounds, not margins.
+        """
+        if self.problem or self.flight.measured is None:
+            return ""
+        return reason_unknown(self.gains, self.flight.measured.response.at_period(self.gains.Ts))
+
 
 def read_flights(logs: Sequence[Path], columns: Columns | None) -> list[ReportedFlight]:
-    """The logs of a report; names that repeat get the name of their folder.
+    """The logs of a report; names that repeat get the name of their folder, or else a number.
 
     Raises
     ------
     TuningError
-        When a file is no flight log, or is damaged.
+        When a file is no flight log, is damaged, or is given twice.
     """
-    names = [path.name for path in logs]
-    labels = [str(Path(path.parent.name) / path.name) if names.count(path.name) > 1 else path.name for path in logs]
+    files = [path.resolve() for path in logs]
+    twice = next((path for path, file in zip(logs, files, strict=True) if files.count(file) > 1), None)
+    if twice is not None:
+        raise TuningError(f"{twice}: given twice: a log compared with itself shows no difference; give it once")
+    labels = _labels(files)
     flights = []
     for path, label, (colour, dash) in zip(logs, labels, looks(_kinds(len(logs))), strict=True):
         found = inspect_log(path, columns)
         samples = MOST_SAMPLES // len(logs)
         flights.append(ReportedFlight(label, found, further_signals(found.recording), colour, dash, samples))
     return flights
+
+
+def _labels(files: Sequence[Path]) -> list[str]:
+    """Names of logs, all different, as short as that allows."""
+    names = [path.name for path in files]
+    named = [str(Path(path.parent.name) / path.name) if names.count(path.name) > 1 else path.name for path in files]
+    counts = [named[: place + 1].count(name) for place, name in enumerate(named)]
+    return [f"{name} ({count})" if named.count(name) > 1 else name for name, count in zip(named, counts, strict=True)]
 
 
 def _kinds(flights: int) -> list[str]:

@@ -73,13 +73,14 @@ def predicted_motion(law: Law, plant: WideResponse) -> PredictedMotion | None:
     def motion(around: WideResponse) -> tuple[Signal, Signal]:
         free = free_gains(law, around.body)
         loop = LoopGradient(around, free, free.vector(law))
-        # D / (j w), the answer to a step, hardly changes where D falls like w: it is what is continued below.
-        answers = (
-            _between(fine, around.omega, loop.T) * sharp[:, None, None],
-            _between(fine, around.omega, loop.D / (1j * around.omega[:, None, None])) * torque,
-        )
+        yielded = loop.D / (1j * around.omega[:, None, None])
+        steps = _between(fine, around.omega, yielded)
+        low = fine < around.omega[0]
+        steps[low] = _from_stiffness(fine[low], float(around.omega[0]), yielded[0])
+        answers = (_between(fine, around.omega, loop.T) * sharp[:, None, None], steps * torque)
         doublet, pushed = ((turn @ one.reshape(len(fine), n * n)).real.reshape(-1, n, n) for one in answers)
-        return np.degrees(doublet), np.degrees(pushed)
+        # Without an integral the angle stays: the transform, whose mean is 0, then begins below 0.
+        return np.degrees(doublet), np.degrees(pushed - pushed[time < 0].mean(axis=0))
 
     doublet, pushed = motion(plant)
     drawn = [motion(one) for one in drawn_plants(plant)]
@@ -111,3 +112,14 @@ def _between(fine: Signal, omega: Signal, response: Complex) -> Complex:
         column = response[:, i, j]
         found[:, i, j] = np.interp(fine, omega, column.real) + 1j * np.interp(fine, omega, column.imag)
     return found
+
+
+def _from_stiffness(omega: Signal, above: float, response: Complex) -> Complex:
+    """Answer to a step of torque below the frequency `above` at which it is `response` (n, n), (K, n, n).
+
+    There a loop with an integral resists like a spring and a damper: the inverse, Kp_o Ki + s (Kp_o Kp + Ki) of one
+    axis, is a constant plus s times a constant. The pole of both is slower than the lowest measured frequency of yaw.
+    """
+    inverse = np.linalg.inv(response)
+    stiffness: Complex = inverse.real + 1j * inverse.imag * (omega / above)[:, None, None]
+    return np.asarray(np.linalg.inv(stiffness))

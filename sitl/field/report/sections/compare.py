@@ -111,17 +111,18 @@ def _flight_figures(one: FlightSpectra) -> dict[str, float]:
 
 def _set_figures(before: GainCase, after: GainCase) -> dict[str, Compared]:
     """Margins by the certificates and predicted figures of two sets, of roll and pitch, and of yaw."""
-    found = {}
+    found = dict[str, Compared]()
     certificates = [case.gains.certificate for case in (before, after)]
     tables = [certificate.figures for certificate in certificates if certificate]
-    # The errors of the margins are not known in pairs: their difference is at most as uncertain as if independent.
-    found["Ms"] = _apart([(one["Ms"], one["Ms_error"]) for one in tables])
-    for axis in AXES:
-        found[f"{axis}: phase margin [deg]"] = _apart(
-            [(one["phase_margin_deg"][axis], one["phase_margin_error_deg"][axis]) for one in tables]
-        )
-    for axis in AXES:
-        found[f"{axis}: delay margin [ms]"] = Compared(*(one["delay_margin_ms"][axis] for one in tables))
+    if not (before.unknown or after.unknown):  # else the figures are bounds
+        # The errors of the margins are not known in pairs: their difference is at most as uncertain as if independent.
+        found["Ms"] = _apart([(one["Ms"], one["Ms_error"]) for one in tables])
+        for axis in AXES:
+            found[f"{axis}: phase margin [deg]"] = _apart(
+                [(one["phase_margin_deg"][axis], one["phase_margin_error_deg"][axis]) for one in tables]
+            )
+        for axis in AXES:
+            found[f"{axis}: delay margin [ms]"] = Compared(*(one["delay_margin_ms"][axis] for one in tables))
     yaws = [one.get("yaw", {}) for one in tables]
     if all("Ms" in yaw for yaw in yaws):
         found["yaw: Ms"] = _apart([(yaw["Ms"], yaw["Ms_error"]) for yaw in yaws])

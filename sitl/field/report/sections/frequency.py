@@ -35,9 +35,9 @@ def frequency_section(flights: Sequence[ReportedFlight], cases: Sequence[GainCas
     band = next((c.gains.certificate.band for c in cases if c.gains.certificate and c.gains.certificate.band[1]), None)
     caption = (
         "From torque (normalised) to body rate, measured from what moves the vehicle from outside (injected torque or "
-        "rate, else the setpoint), which is consistent in closed loop. Bands: two standard deviations. Full lines: "
-        "roll by roll torque, pitch by pitch torque; broken: the coupling. Shaded: the band in which the response is "
-        "known, on which certificates rest."
+        "rate, else the setpoint), which is consistent in closed loop. Bands: two standard deviations. Solid: by the "
+        "torque of the same axis; dashed: by that of the other one, the coupling. Shaded: the band in which the "
+        "response is known, on which certificates rest."
     )
     panels = [_magnitude(responses, axis, band) for axis in range(2)]
     panels += [_phase(responses, axis, band) for axis in range(2)]
@@ -113,6 +113,9 @@ def _phase(flights: Measured, axis: int, band: Band) -> Panel:
         G, deviation, good = _element(plant, axis, axis)
         if not good.any():
             continue
+        # Across a gap the turn of the phase is not known: the longest stretch without one is drawn.
+        parts = np.split(np.flatnonzero(good), np.flatnonzero(np.diff(np.flatnonzero(good)) > 1) + 1)
+        good = np.isin(np.arange(len(G)), max(parts, key=len))
         phase = np.full(len(G), np.nan)
         phase[good] = np.degrees(np.unwrap(np.angle(G[good])))
         # A vehicle's response begins between -90 and 0 degrees: the turn in which its phase is counted.

@@ -73,9 +73,9 @@ def prediction_section(cases: Sequence[GainCase]) -> Section:
     panels = [_doublet_panel(motions[BOTH], moved, angle) for moved in range(2) for angle in (moved, 1 - moved)]
     panels += [_torque_panel(motions[BOTH], axis) for axis in range(2)]
     caption = (
-        f"Predicted from the measured response: a doublet of {_size(BOTH)} on roll, then on pitch (left: the axis that "
-        f"is moved, right: the other one), and {_push(BOTH)}. Bands: two standard deviations, from the error of the "
-        "response."
+        f"Predicted from the measured response: a doublet of {_size(BOTH)} on roll, then on pitch, with the answer of "
+        f"the axis that is moved and of the other one (off-axis); and {_push(BOTH)}. Bands: two standard deviations, "
+        "from the error of the response."
     )
     charts = [Chart("predicted-motion", caption, panels)]
     if motions[YAW]:

@@ -10,7 +10,13 @@ import numpy as np
 from mimopilot.common.charts import AXIS_COLOURS
 from mimopilot.common.figures import Chart, HeatMap, LimitLine, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
-from mimopilot.sitl.field.report.analysis.filters_advice import NOISE_FROM, FilterChange, filter_changes, least_phase
+from mimopilot.sitl.field.report.analysis.filters_advice import (
+    NOISE_FROM,
+    FilterChange,
+    filter_changes,
+    least_phase,
+    of_both_axes,
+)
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase, ReportedFlight
 from mimopilot.sitl.field.report.analysis.loop_filters import LoopFilter, filters_of, moving_filters
 from mimopilot.sitl.field.report.analysis.vibration import (
@@ -129,17 +135,17 @@ def filter_section(found: Sequence[FlightSpectra], cases: Sequence[GainCase], th
     total = sum(one.delay() for one in filters if one.acts_on != "derivative term")
     points = moving_filters(first.flight.recording.parameters)
     points += [f"All filters of the rates together delay slow signals by {1e3 * total:.1f} ms."] if total else []
-    if case is None or loops is None:
-        points.append(
-            "What a change of a filter costs or gives is not said: no gains have a certificate of this flight."
-        )
+    examined = of_both_axes(case, thresholds) if case and loops else None
+    if examined is None:
+        why = case.unknown if case and case.unknown else "no gains have a certificate of this flight"
+        points.append(f"What a change of a filter costs or gives is not said: {why}.")
         return Section(heading, "", tables=tables, points=points)
-    changes = filter_changes(case, filters, first.tones, first.own_torque, thresholds)
-    tables.append(_change_table(changes, case))
+    changes = filter_changes(examined, filters, first.tones, first.own_torque, thresholds)
+    tables.append(_change_table(changes, examined))
     points += advice(changes, first)
     text = (
-        "A change of a filter is examined by the certificate of the same gains behind it. Advice needs all three: a "
-        "tone in the gyro, the torque that it causes, and the margin left."
+        "A change of a filter is examined by the certificate of the same gains behind it, of roll and pitch without "
+        "yaw. Advice needs all three: a tone in the gyro, the torque that it causes, and the margin left."
     )
     return Section(heading, text, tables=tables, points=points)
 
@@ -183,7 +189,7 @@ def _change_table(changes: Sequence[FilterChange], case: GainCase) -> ReportTabl
         ]
     ]
     for change in changes:
-        figures = change.certificate.figures
+        figures = change.certificate.figures if np.isfinite(change.margin_deg) else {}
         rows.append(
             [
                 change.text,

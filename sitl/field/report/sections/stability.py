@@ -14,6 +14,7 @@ from mimopilot.common.figures import Chart, LimitLine, Line, Panel, SpanMark, Sp
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.common.text_table import plus_minus
 from mimopilot.sitl.field.report.analysis.flight_data import GainCase
+from mimopilot.sitl.field.report.sections.frequency import yaw_band
 from mimopilot.tuning.analysis import margins
 from mimopilot.tuning.analysis.closed_loop import CascadeLoop
 from mimopilot.tuning.analysis.stability_figures import nominal_and_drawn_loops
@@ -32,6 +33,8 @@ NYQUIST = 3.0
 SHOWN_DRAWS = 8
 #: Instead of a margin, for a loop whose gain is never 1.
 NEVER = "gain below 1"
+#: Of a margin that the flight does not show.
+UNKNOWN = "not known"
 #: Points of a circle.
 CIRCLE = 181
 
@@ -106,7 +109,7 @@ def stability_section(cases: Sequence[GainCase], thresholds: Thresholds) -> Sect
         text = "Not shown: " + ("no gains are known: give them with --gains." if not cases else "see below.")
         return Section(HEADING, text, points=reasons)
     charts = [
-        Chart("sensitivity", _SENSITIVITY, [_sensitivity(found, thresholds), _bode(found)], linked=True),
+        Chart("sensitivity", _SENSITIVITY, [_sensitivity(found, thresholds, _band(found)), _bode(found)], linked=True),
         Chart(
             "nyquist",
             _NYQUIST,
@@ -117,19 +120,27 @@ def stability_section(cases: Sequence[GainCase], thresholds: Thresholds) -> Sect
     ]
     yaws = [loops for case in cases if (loops := yaw_loops_of(case))]
     if yaws:
-        panels = [_sensitivity(yaws, thresholds), _nyquist(yaws, 0, thresholds, "yaw loop")]
+        known = yaw_band([loops.case for loops in yaws])
+        band = [SpanMark(*known)] if known else []
+        panels = [_sensitivity(yaws, thresholds, band), _nyquist(yaws, 0, thresholds, "yaw loop")]
         charts.append(Chart("stability-yaw", "Sensitivity and loop of yaw.", panels, linked=False))
-    if yaws:
+    if any(_counts_yaw(loops.case) for loops in found):
         reasons.append(
-            "The curves of both axes are of roll and pitch alone; the margins below count the coupling to yaw."
+            "The curves of roll and pitch are those of both axes alone; the margins in the table also count their "
+            "coupling to yaw, so they may be thinner."
         )
+    reasons += [
+        f"{loops.case.label}: the table holds bounds only: {loops.case.unknown}."
+        for loops in found
+        if loops.case.unknown
+    ]
     return Section(HEADING, charts=charts, tables=[margin_table([one.case for one in found])], points=reasons)
 
 
 _SENSITIVITY = (
-    "Left: the largest singular value of the sensitivity, cut at both torques; its peak is Ms. Below 1 the loop "
-    "rejects disturbances, above 1 it amplifies them. Bands: two standard deviations. Right: the loop of each axis "
-    "with the other one closed; dots and numbers: crossover and phase margin."
+    "Sensitivity: its largest singular value, cut at both torques; the peak is Ms. Below 1 the loop rejects "
+    "disturbances, above 1 it amplifies them. Bands: two standard deviations. Loop gain: of each axis with the other "
+    "one closed (solid: roll, dashed: pitch); dots and numbers: crossover and phase margin."
 )
 _NYQUIST = (
     "The loop of each axis with the other one closed: its distance from -1 is the margin. It must stay out of the "
@@ -144,20 +155,24 @@ def margin_table(cases: Sequence[GainCase]) -> ReportTable:
     rows: list[list[str]] = []
     shown = [(case, case.gains.certificate) for case in cases if case.gains.certificate is not None]
     rows.append(["verdict", *(str(certificate.verdict) for _, certificate in shown)])
-    rows.append(["Ms", *(plus_minus(c.figures["Ms"], c.figures["Ms_error"]) for _, c in shown)])
+    rows.append(["Ms", *(_peak(case, certificate.figures) for case, certificate in shown)])
     for axis in AXES:
-        rows.append([f"phase margin, {axis}", *(_phase_margin(c.figures, axis) for _, c in shown)])
+        rows.append([f"phase margin, {axis}", *(_phase_margin(case, c.figures, axis) for case, c in shown)])
     for axis in AXES:
         rows.append([f"gain margin, {axis}", *(_gain_margin(c.figures, axis) for _, c in shown)])
     for axis in AXES:
-        delays = [c.figures["delay_margin_ms"][axis] for _, c in shown]
-        rows.append([f"delay margin, {axis}", *(f"{ms:.1f} ms" if np.isfinite(ms) else NEVER for ms in delays)])
+        rows.append([f"delay margin, {axis}", *(_delay_margin(case, c.figures, axis) for case, c in shown)])
     rows += _yaw_rows([c.figures.get("yaw", {}) for _, c in shown])
-    rows.append(["disk margin", *(f"{c.figures['disk_margin']:.2f}" for _, c in shown)])
+    rows.append(["disk margin", *(_at_most(case, f"{c.figures['disk_margin']:.2f}") for case, c in shown)])
     at_once = "{simultaneous_gain_db:.1f} dB, {simultaneous_phase_deg:.0f} deg"
-    rows.append(["all axes at once", *(at_once.format(**c.figures) for _, c in shown)])
+    rows.append(["all axes at once", *(_at_most(case, at_once.format(**c.figures)) for case, c in shown)])
     rows.append(["known band", *(f"{c.band[0]:.1f} to {c.band[1]:.0f} rad/s" for _, c in shown)])
     return ReportTable("Margins by the certificate", ("", *(case.label for case, _ in shown)), rows)
+
+
+def _counts_yaw(case: GainCase) -> bool:
+    """Whether the certificate's margins are those of all three axes."""
+    return bool(case.gains.certificate and case.gains.certificate.figures.get("cross_terms", {}).get("matters"))
 
 
 def _yaw_of(case: GainCase) -> Mapping[str, Any]:
@@ -184,19 +199,37 @@ def _yaw_rows(yaws: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     ]
 
 
-def _phase_margin(figures: Mapping[str, Any], axis: str) -> str:
+def _peak(case: GainCase, figures: Mapping[str, Any]) -> str:
+    """Ms; of a loop that is known in part, that of the part."""
+    return f"{'at least ' if case.unknown else ''}{plus_minus(figures['Ms'], figures['Ms_error'])}"
+
+
+def _at_most(case: GainCase, text: str) -> str:
+    return f"at most {text}" if case.unknown else text
+
+
+def _phase_margin(case: GainCase, figures: Mapping[str, Any], axis: str) -> str:
+    if case.unknown:
+        return UNKNOWN
     phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
     return plus_minus(phase, error, " deg") if np.isfinite(phase) else NEVER
+
+
+def _delay_margin(case: GainCase, figures: Mapping[str, Any], axis: str) -> str:
+    if case.unknown:
+        return UNKNOWN
+    delay = figures["delay_margin_ms"][axis]
+    return f"{delay:.1f} ms" if np.isfinite(delay) else NEVER
 
 
 def _gain_margin(figures: Mapping[str, Any], axis: str) -> str:
     kind = figures["gain_margin"][axis]
     if kind == "not known":
-        return "not known"
+        return UNKNOWN
     return f"{'at least ' if kind == 'at least' else ''}{figures['gain_margin_db'][axis]:.1f} dB"
 
 
-def _sensitivity(found: Sequence[CaseLoops], thresholds: Thresholds) -> Panel:
+def _sensitivity(found: Sequence[CaseLoops], thresholds: Thresholds, band: Sequence[SpanMark]) -> Panel:
     lines: list[Line | Spread] = []
     highest = thresholds.thin_Ms
     for loops in found:
@@ -208,13 +241,13 @@ def _sensitivity(found: Sequence[CaseLoops], thresholds: Thresholds) -> Panel:
     marks: list[LimitLine | SpanMark] = [
         LimitLine(thresholds.Ms, f"certified: at most {thresholds.Ms:g}"),
         LimitLine(thresholds.thin_Ms, f"thin: at most {thresholds.thin_Ms:g}", dash=":"),
-        *_band(found),
+        *band,
     ]
     low = min(float(loops.omega[0]) for loops in found)
     top = max(float(loops.omega[-1]) for loops in found)
     return Panel(
         "Sensitivity",
-        "frequency [rad/s]; shaded: known",
+        f"frequency [rad/s]{'; shaded: known' if band else ''}",
         "largest singular value",
         lines,
         marks,

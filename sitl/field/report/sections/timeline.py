@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from mimopilot.common.charts import AXIS_COLOURS
-from mimopilot.common.figures import Chart, LimitLine, Line, Panel, thinned
+from mimopilot.common.figures import Chart, LimitLine, Line, Panel
 from mimopilot.common.html_report import ReportTable, Section
 from mimopilot.sitl.field.report.analysis.flight_data import PHASES, ReportedFlight
 from mimopilot.tuning.axes import axis_names
@@ -72,11 +72,11 @@ def timeline(flights: Sequence[ReportedFlight], number: int) -> Chart | None:
         motors = flight.since_begin(flight.further.motors)
         for column in range(motors.values.shape[1]):
             shade = ("#bbbbbb", "#999999", "#777777", "#555555")[column % 4]
-            x, y = thinned(motors.time, motors.values[:, column], flight.samples // 2)
+            x, y = flight.drawn(motors.time, motors.values[:, column], 0.5)
             lines.append(Line(x, y, f"motor {column + 1}", shade, width=0.8))
     if thrust is not None and thrust.values.any():  # a column of zeros is no signal
         thrust = flight.since_begin(thrust)
-        lines.append(Line(*thinned(thrust.time, thrust.values[:, 0], flight.samples), "thrust", "#1a1a1a", width=1.4))
+        lines.append(Line(*flight.drawn(thrust.time, thrust.values[:, 0]), "thrust", "#1a1a1a", width=1.4))
     if lines:
         panels.append(Panel("Thrust and motors", "time [s]", "share of the largest", lines, x_range=span, height=220))
     if not panels:
@@ -95,8 +95,7 @@ def _by_axis(series: Series, flight: ReportedFlight) -> list[Line]:
     """A line for each axis of angles or rates, in degrees."""
     looks = zip(axis_names(3), AXIS_COLOURS, series.values.T, strict=False)
     return [
-        Line(*thinned(series.time, np.degrees(values), flight.samples), name, colour, width=1.0)
-        for name, colour, values in looks
+        Line(*flight.drawn(series.time, np.degrees(values)), name, colour, width=1.0) for name, colour, values in looks
     ]
 
 

@@ -17,6 +17,8 @@ from mimopilot.tuning.logs.resample import Interval, Series, sampling_period
 
 #: Length of the detail, s: one or two manoeuvres.
 DETAIL = 4.0
+#: Share of the angles' range that setpoints must cover to be what moves the vehicle; of an injection they cover little.
+LED = 0.5
 #: Highest rate at which a reference model is run, Hz.
 MODEL_RATE = 250.0
 
@@ -56,7 +58,7 @@ def tracking_charts(flight: ReportedFlight, number: int, count: int, model: Gain
     charts = [
         Chart(
             f"tracking-{number + 1}",
-            f"Roll (left) and pitch (right){named}, in the air.{reference} Drag to zoom; double click: all.",
+            f"Roll and pitch{named}, in the air.{reference} Drag to zoom; double click: all.",
             _panels(flight, whole, model),
         )
     ]
@@ -87,7 +89,7 @@ def yaw_charts(flight: ReportedFlight, number: int, count: int) -> list[Chart]:
             if name in yaw:
                 series = flight.since_begin(yaw[name])
                 inside = (series.time >= parts[0][0]) & (series.time <= parts[-1][1])
-                x, y = thinned(series.time[inside], factor * series.values[inside, 0], flight.samples)
+                x, y = flight.drawn(series.time[inside], factor * series.values[inside, 0])
                 if len(y) > 1 and (name != injected or y.any()):
                     lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
         if response in yaw and lines and np.ptp(yaw[response].values):  # a column of zeros is no signal
@@ -98,8 +100,10 @@ def yaw_charts(flight: ReportedFlight, number: int, count: int) -> list[Chart]:
 
 
 def busiest(flight: ReportedFlight, whole: Interval) -> Interval | None:
-    """The stretch of `DETAIL` in which the setpoint moves most, or the answer if no setpoint does."""
-    for name in ("r_o", "y_o", "y_i"):
+    """The stretch of `DETAIL` in which the setpoint moves most, or the answer where that moves far more."""
+    moved_by = {name: _largest_move(flight.signal(name), whole) for name in ("r_o", "y_o")}
+    led = moved_by["r_o"] > LED * moved_by["y_o"]
+    for name in ("r_o", "y_o", "y_i")[0 if led else 1 :]:
         series = flight.signal(name)
         if series is None:
             continue
@@ -115,6 +119,14 @@ def busiest(flight: ReportedFlight, whole: Interval) -> Interval | None:
         begin = float(starts[int(np.argmax(amount))])
         return begin, begin + DETAIL
     return None
+
+
+def _largest_move(series: Series | None, part: Interval) -> float:
+    """Peak to peak of a signal in a part, the larger axis; 0: not logged there."""
+    if series is None:
+        return 0.0
+    inside = (series.time >= part[0]) & (series.time <= part[1])
+    return float(np.ptp(series.values[inside], axis=0).max()) if inside.any() else 0.0
 
 
 def _panels(flight: ReportedFlight, part: Interval, model: Gains | None) -> list[Panel]:
@@ -137,7 +149,7 @@ def _panels(flight: ReportedFlight, part: Interval, model: Gains | None) -> list
                 series = flight.signal(signal) if signal else None
                 if series is not None:
                     inside = (series.time >= part[0]) & (series.time <= part[1])
-                    x, y = thinned(series.time[inside], factor * series.values[inside, axis], flight.samples)
+                    x, y = flight.drawn(series.time[inside], factor * series.values[inside, axis])
                     if len(y) > 1 and (label != "injected" or y.any()):
                         lines.append(Line(x, y, label, **look))  # type: ignore[arg-type]
             if any(line.label in ("response", "torque u") for line in lines):

@@ -21,9 +21,9 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
     Restoration,
 )
 from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import experiment_profile
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import ModuleInjection
 from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import identify, wait
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
 from mimopilot.sitl.mavlink.ground_station.transaction import snapshot_path
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text

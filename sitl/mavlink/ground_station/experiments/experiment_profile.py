@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar, Protocol
 
 from mimopilot.sitl.mavlink.ground_station.events import Exchange, T
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import FlightMonitor
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 
 #: Saves the values that the vehicle has, name -> value, before the first of them is changed.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import (
     ExcitationOptions,
@@ -37,8 +38,7 @@ def check_experiment(name: str) -> None:
     """
     if name in BY_HAND:
         raise SitlError(f"--profile {name}: {BY_HAND[name]}")
-    if name not in EXPERIMENTS:
-        raise SitlError(f"--profile: got {name!r}, expected one of {', '.join(EXPERIMENTS)}")
+    check_choice("--profile", name, EXPERIMENTS, SitlError)
 
 
 def experiment_profile(name: str, options: ExcitationOptions, save: SaveValues) -> ExperimentProfile:

@@ -13,15 +13,16 @@ from mimopilot.sitl.autopilot.excitation_injector import AXIS, PAUSE_S, PHASES
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Exchange
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExperimentResult
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     FLIGHT_STREAMS,
     HOVER_TILT,
-    POLL_S,
-    STREAM_TIMEOUT_S,
-    FlightMonitor,
     not_hovering,
-    request_streams,
     stop_reason,
+)
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import (
+    POLL_S,
+    FlightMonitor,
+    request_streams,
 )
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import read_values, write_and_verify
@@ -49,7 +50,7 @@ def check_settings(values: Mapping[str, float]) -> None:
         Naming the first one.
     """
     for setting in EXCITATION:
-        value = values[setting.name]
+        value = values.get(setting.name, setting.default)
         if not setting.minimum <= value <= setting.maximum:
             expected = f"{setting.minimum:g} to {setting.maximum:g} {setting.unit}".rstrip()
             raise SitlError(f"{setting.name}: got {value:g}, expected {expected} ({setting.description})")
@@ -65,7 +66,7 @@ def start_monitor(client: ParameterClient, mode: int) -> Exchange[FlightMonitor]
     """
     assert client.vehicle is not None
     monitor = yield from request_streams(client, STREAMS)
-    missing = monitor.overdue(STREAM_TIMEOUT_S)
+    missing = monitor.overdue()
     reason = not_hovering(client, monitor)
     if "DEBUG_VECT" in missing and len(missing) == 1 and not client.interrupted:
         reason = "the vehicle does not send its injector's state (DEBUG_VECT MIMO_EXC): our controller does not fly it"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import ClassVar
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.autopilot.excitation_injector import AXIS
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.excitation_flight import AMPLITUDE, VEHICLE_YAW_AMPLITUDE
@@ -17,7 +18,6 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
     SaveValues,
     VehicleSession,
 )
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.experiments.module_injector import (
     INTEGERS,
     NAMES,
@@ -33,15 +33,15 @@ from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     values_of,
     write_back,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.upload import read_values
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES
 from mimopilot.tuning.excitation import hold_from_bandwidth
 from mimopilot.tuning.parameters import EXCITATION
+from mimopilot.tuning.px4_names import LOG_PROFILE, TUNING_PROFILE
 
 PX4 = 12  # MAV_AUTOPILOT_PX4
-#: Bits of SDLOG_PROFILE that tuning from a log needs: default, high rate, debug topics.
-LOG_PROFILE, NEEDED = "SDLOG_PROFILE", 1 | 16 | 32
 #: --axis -> value of `AXIS`.
 AXES = {"roll": 1, "pitch": 2, "both": 3, "yaw": 4, "all": 5}
 
@@ -56,25 +56,26 @@ def injector_settings(excitation: ExcitationOptions, Ts: float) -> dict[str, flo
     TuningError
         If the bandwidth is wrong.
     """
-    axis = excitation.axis or "all"
-    for option, value, known in (("--axis", axis, AXES), ("--mode", excitation.mode, EXCITED_MODES)):
-        if value not in known:
-            raise SitlError(f"{option}: got {value!r}, expected one of {', '.join(known)}")
     hold_min, hold_max = hold_from_bandwidth(excitation.bandwidth, Ts)
-    values = {
+    values = _settings(excitation) | {"MIMO_EX_HMIN": hold_min, "MIMO_EX_HMAX": hold_max}
+    check_settings(values)
+    return {name: single(values[name]) for name in NAMES}
+
+
+def _settings(excitation: ExcitationOptions) -> dict[str, float]:
+    """The parameters that do not depend on the control period, which only the vehicle knows."""
+    axis = excitation.axis or "all"
+    check_choice("--axis", axis, AXES, SitlError)
+    check_choice("--mode", excitation.mode, EXCITED_MODES, SitlError)
+    return {
         AXIS: AXES[axis],
         "MIMO_EX_AMP": AMPLITUDE if excitation.amplitude is None else excitation.amplitude,
         "MIMO_EX_AMPY": VEHICLE_YAW_AMPLITUDE if excitation.yaw_amplitude is None else excitation.yaw_amplitude,
-        "MIMO_EX_HMIN": hold_min,
-        "MIMO_EX_HMAX": hold_max,
         "MIMO_EX_DUR": excitation.seconds_per_axis,
         "MIMO_EX_SEED": excitation.seed,
         "MIMO_EX_MODE": EXCITED_MODES[excitation.mode][0],
         "MIMO_EX_TILT": math.radians(excitation.tilt_deg),
     }
-    wanted = {name: single(values[name]) for name in NAMES}
-    check_settings(wanted)
-    return wanted
 
 
 def check_log(session: VehicleSession) -> None:
@@ -90,10 +91,10 @@ def check_log(session: VehicleSession) -> None:
     if client.vehicle.autopilot != PX4:
         return
     profile = round(session.run(read_values(client, [LOG_PROFILE]))[LOG_PROFILE])
-    if profile & NEEDED != NEEDED:
+    if profile & TUNING_PROFILE != TUNING_PROFILE:
         raise SitlError(
-            f"{LOG_PROFILE} is {profile}: the log rate would be too low for tuning; land, set it to {NEEDED}, and "
-            "take off again",
+            f"{LOG_PROFILE} is {profile}: the log rate would be too low for tuning; land, set it to {TUNING_PROFILE}, "
+            "and take off again",
             exit_code=1,
         )
 
@@ -106,6 +107,7 @@ class ModuleInjection(ExperimentProfile):
 
     def __init__(self, options: ExcitationOptions, save: SaveValues) -> None:
         super().__init__(options, save)
+        check_settings(_settings(options))  # before a vehicle is in the air
         self.wanted: dict[str, float] = {}
 
     def prepare(self, session: VehicleSession) -> Preparation:
@@ -114,7 +116,7 @@ class ModuleInjection(ExperimentProfile):
         if not self._on_px4(session):
             return Preparation()
         old = values_of(session.run(read_known(session.client, [LOG_PROFILE])))
-        new = {LOG_PROFILE: float(round(old[LOG_PROFILE]) | NEEDED)}
+        new = {LOG_PROFILE: float(round(old[LOG_PROFILE]) | TUNING_PROFILE)}
         if new == old:
             return Preparation()
         self.remember(old)

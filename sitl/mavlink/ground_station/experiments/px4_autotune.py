@@ -20,6 +20,7 @@ from typing import ClassVar
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import (
     UNKNOWN_INDEX,
@@ -39,16 +40,10 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
     SaveValues,
     VehicleSession,
 )
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     FLIGHT_STREAMS,
-    POLL_S,
-    FlightMonitor,
-    not_hovering,
-    request_status,
-    request_streams,
+    check_hover,
     stop_reason,
-    supplies_problem,
-    watch_hover,
 )
 from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     identify,
@@ -59,13 +54,22 @@ from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     values_of,
     write_back,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Answer, ParameterClient
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 from mimopilot.sitl.mavlink.wire.px4_modes import EXCITED_MODES, nav_state
+from mimopilot.tuning.px4_names import (
+    AUTOTUNE_AMPLITUDE,
+    AUTOTUNE_APPLY,
+    AUTOTUNE_ENABLE,
+    AUTOTUNE_START,
+    DEFAULT_TOPICS,
+    HIGH_RATE,
+    LOG_PROFILE,
+)
 
-ENABLE, APPLY, AMPLITUDE, START = "MC_AT_EN", "MC_AT_APPLY", "MC_AT_SYSID_AMP", "MC_AT_START"
-LOG_PROFILE, NEEDED = "SDLOG_PROFILE", 1 | 16  # default and high rate
-NAMES = (ENABLE, APPLY, AMPLITUDE, LOG_PROFILE)
+NEEDED = DEFAULT_TOPICS | HIGH_RATE  # of the log's profile
+NAMES = (AUTOTUNE_ENABLE, AUTOTUNE_APPLY, AUTOTUNE_AMPLITUDE, LOG_PROFILE)
 COMMAND: int = mavlink.MAV_CMD_DO_AUTOTUNE_ENABLE
 #: rad/s; twice PX4's default, as in the flight of docs/logs.md that gave gains: tilt stayed below 13 degrees.
 DEFAULT_AMPLITUDE, AMPLITUDES = 1.5, (0.1, 6.0)  # the range is that of MC_AT_SYSID_AMP
@@ -155,7 +159,7 @@ class Px4Autotune(ExperimentProfile):
     """The experiment on a stock PX4."""
 
     name: ClassVar[str] = "px4-stock"
-    integers: ClassVar[frozenset[str]] = frozenset({ENABLE, APPLY, START, LOG_PROFILE})
+    integers: ClassVar[frozenset[str]] = frozenset({AUTOTUNE_ENABLE, AUTOTUNE_APPLY, AUTOTUNE_START, LOG_PROFILE})
 
     def __init__(self, options: ExcitationOptions, save: SaveValues) -> None:
         super().__init__(options, save)
@@ -165,8 +169,7 @@ class Px4Autotune(ExperimentProfile):
                 f"--amplitude: got {amplitude:g}, expected {AMPLITUDES[0]:g} to {AMPLITUDES[1]:g} rad/s, of the rate "
                 "setpoint"
             )
-        if options.mode not in EXCITED_MODES:
-            raise SitlError(f"--mode: got {options.mode!r}, expected one of {', '.join(EXCITED_MODES)}")
+        check_choice("--mode", options.mode, EXCITED_MODES, SitlError)
         if options.axis not in (None, "all"):
             raise SitlError("--axis: PX4's autotune excites roll, pitch and yaw, one after the other; leave it out")
         self.runs = DEFAULT_RUNS if options.runs is None else options.runs
@@ -180,15 +183,15 @@ class Px4Autotune(ExperimentProfile):
         answers = self._read(session)
         old = values_of(answers)
         new = {
-            ENABLE: max(old[ENABLE], 1.0),
-            APPLY: 0.0,
-            AMPLITUDE: self.amplitude,
+            AUTOTUNE_ENABLE: max(old[AUTOTUNE_ENABLE], 1.0),
+            AUTOTUNE_APPLY: 0.0,
+            AUTOTUNE_AMPLITUDE: self.amplitude,
             LOG_PROFILE: float(round(old[LOG_PROFILE]) | NEEDED),
         }
-        at_boot = [name for name in (ENABLE, LOG_PROFILE) if new[name] != old[name]]
+        at_boot = [name for name in (AUTOTUNE_ENABLE, LOG_PROFILE) if new[name] != old[name]]
         self.remember(old)
         session.run(set_values(session.client, new, old, store=True))
-        needed = bool(at_boot) or answers[AMPLITUDE].place == UNKNOWN_INDEX
+        needed = bool(at_boot) or answers[AUTOTUNE_AMPLITUDE].place == UNKNOWN_INDEX
         if needed:
             reboot(session, monitor)
             self._check_prepared(self._read(session))
@@ -196,8 +199,8 @@ class Px4Autotune(ExperimentProfile):
         return Preparation(changed, needed)
 
     def _read(self, session: VehicleSession) -> dict[str, Answer]:
-        answers = session.run(read_known(session.client, NAMES, (START,)))
-        self.has_start = START in answers
+        answers = session.run(read_known(session.client, NAMES, (AUTOTUNE_START,)))
+        self.has_start = AUTOTUNE_START in answers
         return answers
 
     @staticmethod
@@ -210,10 +213,10 @@ class Px4Autotune(ExperimentProfile):
             Naming all that is missing.
         """
         values, missing = values_of(answers), []
-        if values[ENABLE] <= 0:
-            missing.append(f"{ENABLE} is 0")
-        elif answers[AMPLITUDE].place == UNKNOWN_INDEX:
-            missing.append(f"{ENABLE} is {values[ENABLE]:g} but the autotune was not started at boot")
+        if values[AUTOTUNE_ENABLE] <= 0:
+            missing.append(f"{AUTOTUNE_ENABLE} is 0")
+        elif answers[AUTOTUNE_AMPLITUDE].place == UNKNOWN_INDEX:
+            missing.append(f"{AUTOTUNE_ENABLE} is {values[AUTOTUNE_ENABLE]:g} but the autotune was not started at boot")
         profile = round(values[LOG_PROFILE])
         if profile & NEEDED != NEEDED:
             missing.append(f"{LOG_PROFILE} is {profile}, too slow a log; {NEEDED} is needed")
@@ -226,31 +229,25 @@ class Px4Autotune(ExperimentProfile):
 
     def check(self, session: VehicleSession) -> FlightMonitor:
         """Check that the vehicle hovers in its mode in calm air, and that the autotune runs and the log is fast."""
-        client = session.client
-        vehicle = identify(session, self.name)
-        monitor = session.run(request_streams(client, FLIGHT_STREAMS))
-        session.run(request_status(client, monitor))
-        problem = not_hovering(client, monitor)
-        wanted = EXCITED_MODES[self.options.mode][0]
-        if not problem and nav_state(vehicle.mode) != wanted:
-            problem = f"the vehicle is not in the mode {self.options.mode}: change to it, or name its mode with --mode"
-        problem = problem or supplies_problem(monitor)
-        problem = problem or session.run(watch_hover(client, monitor, self.tilt))
-        if problem:
-            raise SitlError(f"{problem}; nothing was written", exit_code=1)
+        wrong_mode = ""
+        if nav_state(identify(session, self.name).mode) != EXCITED_MODES[self.options.mode][0]:
+            wrong_mode = (
+                f"the vehicle is not in the mode {self.options.mode}: change to it, or name its mode with --mode"
+            )
+        monitor = session.run(check_hover(session.client, FLIGHT_STREAMS, wrong_mode, self.tilt))
         self._check_prepared(self._read(session))
         return monitor
 
     @property
     def settings(self) -> dict[str, float]:
         """The autotune's parameters."""
-        return {AMPLITUDE: self.amplitude, APPLY: 0.0}
+        return {AUTOTUNE_AMPLITUDE: self.amplitude, AUTOTUNE_APPLY: 0.0}
 
     def describe(self) -> list[list[str]]:
         """The autotune's parameters and runs."""
         return [
-            [AMPLITUDE, shortest(self.amplitude), "rad/s", "autotune: amplitude added to the rate setpoint"],
-            [APPLY, "0", "", "autotune: apply no gains"],
+            [AUTOTUNE_AMPLITUDE, shortest(self.amplitude), "rad/s", "autotune: amplitude added to the rate setpoint"],
+            [AUTOTUNE_APPLY, "0", "", "autotune: apply no gains"],
             ["--runs", str(self.runs), "", "runs of roll, pitch and yaw, each about 40 s"],
         ]
 
@@ -260,10 +257,14 @@ class Px4Autotune(ExperimentProfile):
 
     def _excite(self, client: ParameterClient, monitor: FlightMonitor) -> Exchange[ExperimentResult]:
         assert client.vehicle is not None
-        names = [APPLY, AMPLITUDE, *([START] if self.has_start else [])]
+        names = [AUTOTUNE_APPLY, AUTOTUNE_AMPLITUDE, *([AUTOTUNE_START] if self.has_start else [])]
         old = values_of((yield from read_known(client, names)))
         self.remember(old)
-        idle = {APPLY: 0.0, AMPLITUDE: self.amplitude, **({START: 0.0} if self.has_start else {})}
+        idle = {
+            AUTOTUNE_APPLY: 0.0,
+            AUTOTUNE_AMPLITUDE: self.amplitude,
+            **({AUTOTUNE_START: 0.0} if self.has_start else {}),
+        }
         yield from set_values(client, idle, old, store=False)
         mode, seconds, reason = client.vehicle.mode, 0.0, ""
         for number in range(self.runs):
@@ -309,7 +310,7 @@ class Px4Autotune(ExperimentProfile):
         assert client.vehicle is not None
         target = client.vehicle.system, client.vehicle.component
         if self.has_start and run.requested:
-            return ReadParameter(*target, START)
+            return ReadParameter(*target, AUTOTUNE_START)
         return SendCommand(*target, COMMAND, (0.0 if run.requested else 1.0,))
 
     def _exchange(
@@ -327,7 +328,7 @@ class Px4Autotune(ExperimentProfile):
                     # Without MC_AT_START the end is the first idle state after the axes.
                     idle = answer.result == mavlink.MAV_RESULT_IN_PROGRESS and answer.progress == 0
                     run.ended |= not self.has_start and idle and run.over
-                elif isinstance(answer, ParameterValue) and answer.name == START and run.requested:
+                elif isinstance(answer, ParameterValue) and answer.name == AUTOTUNE_START and run.requested:
                     run.pass_time(monitor.clock)
                     run.ended |= answer.value == 0
                     if answer.value and not run.over:  # while it runs, the command reports the axis and starts nothing
@@ -335,9 +336,9 @@ class Px4Autotune(ExperimentProfile):
 
     def _stop(self, client: ParameterClient, monitor: FlightMonitor) -> Exchange[bool]:
         """Take the amplitude away and wait until the run has ended; returns whether nothing is injected any more."""
-        yield from client.write({AMPLITUDE: 0.0}, "stopping", keep_going=True)
+        yield from client.write({AUTOTUNE_AMPLITUDE: 0.0}, "stopping", keep_going=True)
         yield from client.wait_until_quiet()
-        if (yield from client.read([AMPLITUDE], "stopping", keep_going=True))[AMPLITUDE].value != 0.0:
+        if (yield from client.read([AUTOTUNE_AMPLITUDE], "stopping", keep_going=True))[AUTOTUNE_AMPLITUDE].value != 0.0:
             return False
         # The old amplitude goes back after the end of the run only: it would be injected.
         run, begin, due = _Run(requested=True), client.now, client.now
@@ -357,6 +358,6 @@ class Px4Autotune(ExperimentProfile):
         if not self.old:
             return Restoration()
         left = session.run(write_back(session.client, self.old))
-        at_boot = [name for name in (ENABLE, LOG_PROFILE) if name in self.old and name not in left]
+        at_boot = [name for name in (AUTOTUNE_ENABLE, LOG_PROFILE) if name in self.old and name not in left]
         note = f"{' and '.join(at_boot)} act again as before from the next reboot on"
         return Restoration(left, (note,) if at_boot else ())

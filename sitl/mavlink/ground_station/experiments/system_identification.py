@@ -11,6 +11,7 @@ from typing import ClassVar
 
 from pymavlink.dialects.v20 import common as mavlink
 
+from mimopilot.common.errors import check_choice
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.flight.excitation_flight import AMPLITUDE
 from mimopilot.sitl.mavlink.ground_station.events import Exchange
@@ -23,27 +24,21 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import
     SaveValues,
     VehicleSession,
 )
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     ALTITUDE_STREAM,
     FLIGHT_STREAMS,
-    POLL_S,
-    FlightMonitor,
-    not_hovering,
-    request_status,
-    request_streams,
+    check_hover,
     stop_reason,
-    supplies_problem,
-    watch_hover,
 )
 from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     identify,
     on_the_ground,
     read_known,
-    send_command,
     set_values,
     values_of,
     write_back,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import ParameterClient
 from mimopilot.sitl.mavlink.wire.float32 import shortest, single
 
@@ -80,8 +75,7 @@ class SystemIdentification(ExperimentProfile):
     def __init__(self, options: ExcitationOptions, save: SaveValues) -> None:
         super().__init__(options, save)
         axis = options.axis or "all"
-        if axis not in AXES:
-            raise SitlError(f"--axis: got {axis!r}, expected one of {', '.join(AXES)}")
+        check_choice("--axis", axis, AXES, SitlError)
         if options.runs is not None:
             raise SitlError("--runs: belongs to --profile px4-stock; give --seconds-per-axis for a longer chirp")
         self.axes, self.tilt = AXES[axis], math.radians(options.tilt_deg)
@@ -127,21 +121,13 @@ class SystemIdentification(ExperimentProfile):
 
     def check(self, session: VehicleSession) -> FlightMonitor:
         """Check that the vehicle hovers in Stabilize in calm air."""
-        client = session.client
-        vehicle = identify(session, self.name)
-        monitor = session.run(request_streams(client, {**FLIGHT_STREAMS, **ALTITUDE_STREAM}))
-        session.run(request_status(client, monitor))
-        problem = not_hovering(client, monitor)
-        if not problem and vehicle.mode != STABILIZE:
-            problem = (
-                f"the vehicle is in mode {vehicle.mode}: change to Stabilize; ArduCopter enters SystemID on the mixer "
-                "only from a mode with manual throttle, so the altitude is the pilot's"
+        wrong_mode, mode = "", identify(session, self.name).mode
+        if mode != STABILIZE:
+            wrong_mode = (
+                f"the vehicle is in mode {mode}: change to Stabilize; ArduCopter enters SystemID on the mixer only "
+                "from a mode with manual throttle, so the altitude is the pilot's"
             )
-        problem = problem or supplies_problem(monitor)
-        problem = problem or session.run(watch_hover(client, monitor, self.tilt))
-        if problem:
-            raise SitlError(f"{problem}; nothing was written", exit_code=1)
-        return monitor
+        return session.run(check_hover(session.client, {**FLIGHT_STREAMS, **ALTITUDE_STREAM}, wrong_mode, self.tilt))
 
     @property
     def settings(self) -> dict[str, float]:
@@ -192,7 +178,7 @@ class SystemIdentification(ExperimentProfile):
         """Change the mode; returns why that failed, empty: the vehicle reports the mode."""
         assert client.vehicle is not None
         flag = mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-        ack = yield from send_command(client, mavlink.MAV_CMD_DO_SET_MODE, flag, mode)
+        ack = yield from client.command(mavlink.MAV_CMD_DO_SET_MODE, (flag, mode))
         if ack is not None and ack.result not in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_IN_PROGRESS):
             return f"the vehicle refuses mode {mode} (MAV_RESULT {ack.result}): {monitor.text}"
         end = client.now + MODE_TIMEOUT_S

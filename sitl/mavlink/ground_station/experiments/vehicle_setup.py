@@ -8,20 +8,17 @@ from collections.abc import Mapping, Sequence
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.events import CommandAck, Exchange, Heartbeat, Outgoing, SendCommand
+from mimopilot.sitl.mavlink.ground_station.events import CommandAck, Exchange, Heartbeat, Outgoing
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import VehicleSession
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import (
+from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     FLIGHT_STREAMS,
-    STREAM_TIMEOUT_S,
-    FlightMonitor,
     request_status,
-    request_streams,
     supplies_problem,
 )
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor, request_streams
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import Answer, ParameterClient
 from mimopilot.sitl.mavlink.ground_station.upload import write_and_verify
 from mimopilot.sitl.mavlink.ground_station.vehicle_kinds import check_kind
-from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
 
 #: From the command to reboot until the vehicle must be back, s; chosen: a Pixhawk with many sensors takes 20.
 BOOT_S = 60.0
@@ -29,20 +26,6 @@ BOOT_S = 60.0
 HAND_S, LOOK_S = 180.0, 1.0
 #: Tries for a parameter that a vehicle may lack: at 30 % loss each way one answer in 3000 is missed.
 PROBE_TRIES = 12
-
-
-def send_command(client: ParameterClient, number: int, *params: float) -> Exchange[CommandAck | None]:
-    """Command the vehicle, again until it acknowledges; returns None when it does not."""
-    assert client.vehicle is not None
-    order = SendCommand(client.vehicle.system, client.vehicle.component, number, params)
-    for _ in range(client.tries):
-        due, send = client.now + TRY_S, [order]
-        while client.now < due and not client.closed:
-            for answer in (yield from client.send_and_wait(send, due)):
-                if isinstance(answer, CommandAck) and answer.command == number:
-                    return answer
-            send = []
-    return None
 
 
 def read_known(
@@ -132,7 +115,7 @@ def on_the_ground(session: VehicleSession, profile: str) -> FlightMonitor:
     identify(session, profile)
     monitor = session.run(request_streams(client, FLIGHT_STREAMS))
     session.run(request_status(client, monitor))
-    missing = monitor.overdue(STREAM_TIMEOUT_S)
+    missing = monitor.overdue()
     assert client.vehicle is not None
     if client.interrupted:
         problem = "interrupted"
@@ -175,7 +158,7 @@ def reboot(session: VehicleSession, monitor: FlightMonitor) -> FlightMonitor:
             before = session.client.now - begin  # on a link that has ended, the vehicle's clock must be younger
         session.client.progress(phase, round(session.client.now - begin), round(timeout))
         monitor = session.run(request_streams(session.client, FLIGHT_STREAMS))
-        if not monitor.overdue(STREAM_TIMEOUT_S) and monitor.clock < before:
+        if not monitor.overdue() and monitor.clock < before:
             return monitor
         session.run(wait(session.client, LOOK_S))
     if session.client.interrupted:
@@ -189,19 +172,12 @@ def reboot(session: VehicleSession, monitor: FlightMonitor) -> FlightMonitor:
 
 def _command_reboot(client: ParameterClient, monitor: FlightMonitor) -> Exchange[CommandAck | None]:
     """Command the reboot until it is acknowledged or the vehicle falls silent: not again once it is back."""
-    assert client.vehicle is not None
-    number: int = mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
-    order, before = SendCommand(client.vehicle.system, client.vehicle.component, number, (1.0,)), monitor.clock
-    for _ in range(client.tries):
-        due, send = client.now + TRY_S, [order]
-        while client.now < due and not client.closed:
-            for answer in (yield from client.send_and_wait(send, due)):
-                if isinstance(answer, CommandAck) and answer.command == number:
-                    return answer
-            send = []
-        if client.closed or monitor.overdue(STREAM_TIMEOUT_S) or monitor.clock < before:
-            return None
-    return None
+    before = monitor.clock
+    return client.command(
+        mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN,
+        (1.0,),
+        is_over=lambda: bool(monitor.overdue()) or monitor.clock < before,
+    )
 
 
 def wait(client: ParameterClient, seconds: float) -> Exchange[None]:

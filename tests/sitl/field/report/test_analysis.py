@@ -9,14 +9,16 @@ import scipy.signal
 from scipy.signal import butter, group_delay
 
 import mimopilot as mp
+from mimopilot.common.figures import SpanMark
 from mimopilot.sitl.field.report.analysis.filters_advice import (
     behind,
     filter_changes,
     least_phase,
+    of_both_axes,
     torque_noise,
     with_derivative_filter,
 )
-from mimopilot.sitl.field.report.analysis.flight_data import PHASES
+from mimopilot.sitl.field.report.analysis.flight_data import PHASES, gain_cases
 from mimopilot.sitl.field.report.analysis.loop_filters import (
     DERIVATIVE,
     FIRST_ORDER,
@@ -29,15 +31,20 @@ from mimopilot.sitl.field.report.analysis.loop_filters import (
 from mimopilot.sitl.field.report.analysis.predicted_motion import doublet_setpoint, predicted_motion
 from mimopilot.sitl.field.report.analysis.step_response import WIDEST, estimate_step
 from mimopilot.sitl.field.report.analysis.vibration import Tone, air_spectrum, find_tones, spectrogram
+from mimopilot.sitl.field.report.analysis.weak_coherence import coherence_note, deciding_range, weak_ranges
 from mimopilot.sitl.field.report.flight_report import make_report
+from mimopilot.sitl.field.report.headline import headline
 from mimopilot.sitl.field.report.sections.compare import _set_figures
 from mimopilot.sitl.field.report.sections.frequency import coherence_band
-from mimopilot.sitl.field.report.sections.tracking import tracking_error
+from mimopilot.sitl.field.report.sections.spectra import _change_table
+from mimopilot.sitl.field.report.sections.stability import crossover, loops_of, margin_table
+from mimopilot.sitl.field.report.sections.tracking import busiest, tracking_error
 from mimopilot.tuning.axes import law_of
 from mimopilot.tuning.certificate import Thresholds
-from mimopilot.tuning.law_terms import StockFilters
+from mimopilot.tuning.law_filters import StockFilters
 from mimopilot.tuning.logs.resample import Series
 from mimopilot.tuning.reference_model import second_order
+from mimopilot.tuning.spec import TuningSpec
 from tests.tuning.logs.flights import make_flight, px4_topics, table, write_csv, write_ulog
 
 
@@ -188,7 +195,8 @@ def test_predicted_doublets_and_steps_of_torque_end_at_rest_with_the_figures_of_
     assert abs(pushed[-1]) < 0.7 * pushed.max()
 
 
-def test_the_predicted_doublet_and_step_of_torque_of_yaw_are_those_of_the_closed_form(bench):
+@pytest.mark.parametrize("integral", [10.0, 0.5, 0.0], ids=["fast", "slower than the response", "none"])
+def test_the_predicted_doublet_and_step_of_torque_of_yaw_are_those_of_the_closed_form(bench, integral):
     _, gains, report = bench
     measured, b = report.flights[0].wide_yaw, 40.0
     s = 1j * measured.omega[:, None, None]
@@ -196,14 +204,15 @@ def test_the_predicted_doublet_and_step_of_torque_of_yaw_are_those_of_the_closed
     plant = replace(
         measured, G_i=b / s, G_o=b / s**2, body=body, error_i=0 * measured.error_i, error_o=0 * measured.error_o
     )
-    p, i, attitude = 12 / b, 10 / b, 2.0
+    p, i, attitude = 12 / b, integral / b, 2.0
     yaw = replace(gains.yaw, Kp_o=attitude, Kp_i=p, Ki_i=i, Kd_i=0.0, Kff_i=0.0)
     motion = predicted_motion(law_of(replace(gains, yaw=yaw), 1), plant)
     # u = (p + i / s) (attitude (r - y) - rate), rate = b u / s; the loop is delayed by half of the hold and the sum.
     below = [1.0, p * b, (attitude * p + i) * b, attitude * i * b]
     time = np.linspace(0.0, motion.time[-1], 4000)
-    _, step = scipy.signal.step(([attitude * p * b, attitude * i * b], below), T=time)
-    _, pushed = scipy.signal.step(([0.5, 0.0], below), T=time)
+    above = [attitude * p * b, attitude * i * b]
+    _, step = scipy.signal.step((above, below) if integral else (above[:-1], below[:-1]), T=time)
+    _, pushed = scipy.signal.step(([0.5, 0.0], below) if integral else ([0.5], below[:-1]), T=time)
     halves = [np.interp(motion.time - at, time, step, left=0.0) for at in (0.0, 1.75, 3.5)]
     doublet = 10.0 * (halves[0] - 2 * halves[1] + halves[2])
     assert motion.setpoint == pytest.approx(doublet_setpoint(motion.time, 3.5))
@@ -255,7 +264,10 @@ def test_a_filter_costs_the_phase_that_it_takes_at_the_crossover(bench):
     assert np.array_equal(changed.G_o, response.G_o)
     assert behind(changed, notch, None).G_i == pytest.approx(response.G_i)
     torque = air_spectrum(case.flight.signal("u"), case.flight.airborne)
+    case = of_both_axes(case, Thresholds())
     found = filter_changes(case, [], [Tone(45.0, 20.0, 0)], torque, Thresholds())
+    rows = _change_table(found, case).rows
+    assert float(rows[1][3]) - float(rows[0][3]) == pytest.approx(float(rows[1][4]), abs=0.11)
     crossing = 20.0  # rad/s, about: of the sensitivity's rise
     assert [change.text for change in found] == ["add a notch: IMU_GYRO_NF0_FRQ 45, IMU_GYRO_NF0_BW 10"]
     narrow = LoopFilter("notch", NOTCH, 45.0, width_hz=10.0)
@@ -265,16 +277,71 @@ def test_a_filter_costs_the_phase_that_it_takes_at_the_crossover(bench):
 
 
 def test_advice_rests_on_the_torque_and_the_certificate_not_on_the_tone_alone(bench):
-    case = next(case for case in bench[2].cases if case.label == "my")
+    case = of_both_axes(next(case for case in bench[2].cases if case.label == "my"), Thresholds())
     flight = case.flight
     torque = flight.signal("u")
-    loud = Series(torque.time, torque.values + 0.05 * np.sin(2 * np.pi * 70 * torque.time)[:, None], "u")
-    for series, advised in ((torque, False), (loud, True)):
+    hum = np.sin(2 * np.pi * 70 * torque.time)[:, None]
+    quiet = Series(torque.time, 0.05 * torque.values + 0.005 * hum, "u")
+    loud = Series(torque.time, torque.values + 0.05 * hum, "u")
+    for series, advised, why in ((torque, False, "not worth"), (quiet, False, "which is quiet"), (loud, True, "power")):
         spectrum = air_spectrum(series, flight.airborne)
         change = filter_changes(case, [], [Tone(70.0, 20.0, 0)], spectrum, Thresholds())[0]
         assert change.advised is advised, change.why
+        assert why in change.why
     strict = Thresholds(Ms=1.05, thin_Ms=1.1)
     assert not filter_changes(case, [], [Tone(70.0, 20.0, 0)], spectrum, strict)[0].advised
+
+
+def test_weak_coherence_in_the_known_band_is_told_with_what_it_means_for_the_margins(bench):
+    case = bench[2].cases[0]
+    response, loops = case.flight.measured.response, loops_of(case)
+    run = response.known_run()
+    omega = response.omega[run]
+    low, high = deciding_range(loops.axis_loops[0], loops.omega)
+    assert low < crossover(loops.axis_loops[0], loops.omega) < high
+    for begin, end, decides in ((low, high, True), (3 * high, 5 * high, False)):
+        hit = (response.omega >= begin) & (response.omega <= end)
+        coherence = np.where(hit[:, None], [0.5, 0.9], np.where(response.omega <= omega[-1], 0.9, 0.1)[:, None])
+        weak = replace(response, coherence=coherence)
+        first, last = response.omega[hit][[0, -1]]
+        assert weak_ranges(weak) == [(first, last)]
+        note = coherence_note(weak, loops.axis_loops, loops.omega)
+        assert f"below 0.7 at {first:.3g} to {last:.3g} rad/s, inside the known band" in note
+        assert ("fly the experiment again" in note) is decides
+        assert ("nothing to do" in note) is not decides
+    strong = replace(response, coherence=np.ones_like(response.coherence))
+    assert coherence_note(strong, loops.axis_loops, loops.omega) == ""
+
+
+def test_gains_whose_crossover_the_flight_does_not_show_get_bounds_and_another_experiment(bench):
+    _, gains, report = bench
+    fast = gains.with_elements({"RD_RR": 0.04, "RD_PP": 0.04})
+    cases = gain_cases(report.flights, [("fast", fast)], TuningSpec())
+    assert cases[-1].unknown.startswith("excitation ends at")
+    told = headline(report.flights, cases)
+    assert told.sentence.startswith("The gains 'fast' cannot be judged from this flight: excitation ends at")
+    assert told.tone == "doubt"
+    assert told.steps[0].startswith("Fly the experiment again with other frequencies")
+    assert not any("tune" in step for step in told.steps)
+    rows = {row[0]: row[-1] for row in margin_table(cases).rows}
+    assert rows["Ms"].startswith("at least ")
+    assert rows["disk margin"].startswith("at most ")
+    assert rows["phase margin, roll"] == rows["delay margin, roll"] == "not known"
+    assert of_both_axes(cases[-1], Thresholds()) is None
+    assert "Ms" not in _set_figures(*cases)
+    wrong = replace(gains, moment_scale=tuple(2 * one for one in gains.moment_scale))
+    refused = headline(report.flights, gain_cases(report.flights, [("other", wrong)], TuningSpec()))
+    assert refused.sentence.startswith("No certificate for 'other': ")
+    assert "mimopilot convert" in refused.sentence
+
+
+def test_the_band_of_yaw_is_shaded_in_its_sensitivity(bench):
+    report = bench[2]
+    chart = next(one for one in report.charts if one.name == "stability-yaw")
+    spans = [(mark.begin, mark.end) for mark in chart.panels[0].marks if isinstance(mark, SpanMark)]
+    band = report.cases[-1].gains.certificate.figures["yaw"]["band"]
+    assert spans == [pytest.approx(tuple(band))]
+    assert tuple(band) != report.cases[-1].gains.certificate.band
 
 
 def test_a_lower_derivative_filter_quiets_the_predicted_torque(bench):
@@ -312,6 +379,20 @@ def test_phases_of_a_flight_are_told_apart(tmp_path):
     assert phases["air"][0] == pytest.approx((2.0, 11.0), abs=0.01)
     assert not phases["crash"] and not phases["gaps"]
     assert report.sections[0].heading == "Timeline"
+
+
+def test_the_detail_of_a_flight_is_where_it_is_excited_even_if_a_setpoint_moves_a_little_elsewhere(bench):
+    flight = bench[2].flights[0]
+    t = np.arange(0.0, 24.0, 0.01)
+    nudge = np.where((t > 20) & (t < 21), math.radians(0.5), 0.0)[:, None] * np.ones(2)
+    injected = np.where((t > 4) & (t < 8), math.radians(8) * np.sin(6 * t), 0.0)[:, None] * np.ones(2)
+    signals = {"r_o": Series(t, nudge, "r"), "y_o": Series(t, nudge + injected, "y")}
+    recording = replace(flight.recording, signals=signals)
+    begin, end = busiest(replace(flight, found=replace(flight.found, recording=recording)), (0.0, 24.0))
+    assert begin == pytest.approx(4.0)
+    assert end == pytest.approx(8.0)
+    signals["r_o"] = Series(t, nudge + injected, "r")
+    assert busiest(replace(flight, found=replace(flight.found, recording=recording)), (0.0, 24.0)) == (begin, end)
 
 
 def test_the_tracking_error_is_that_of_the_signals_in_the_air():

@@ -1,5 +1,6 @@
 """The page of a report in a real browser, its images, and the commands that write it."""
 
+import base64
 import json
 import re
 from pathlib import Path
@@ -9,12 +10,14 @@ import pytest
 
 import mimopilot as mp
 from mimopilot.common.charts import AXIS_COLOURS, FLOWN, INJECTED, NEW, SISO, STYLES
+from mimopilot.common.errors import Error
 from mimopilot.common.figure_images import chart_figure
-from mimopilot.common.figures import thinned
-from mimopilot.common.plotly_page import charts_json
+from mimopilot.common.figures import Chart, HeatMap, Line, Panel, Spread, thinned
+from mimopilot.common.html_report import Section, write_report
+from mimopilot.common.plotly_page import charts_json, plotly_script
 from mimopilot.sitl.field.report.analysis.flight_data import PHASES, ReportedFlight
 from mimopilot.sitl.field.report.analysis.further_signals import FurtherSignals
-from mimopilot.sitl.field.report.flight_report import MOST_LOGS, make_report
+from mimopilot.sitl.field.report.flight_report import LARGEST_PAGE, MOST_LOGS, check_count, make_report
 from mimopilot.sitl.field.report.sections.timeline import contents_section, timeline_section
 from mimopilot.sitl.studies.reproduce import reproduce
 from mimopilot.tuning.logs.inspection import Inspection
@@ -37,8 +40,6 @@ HEADINGS = (
     "Filters",
     "What the log holds",
 )
-#: Bytes of a page, at most.
-LARGEST_PAGE = 6_000_000
 
 
 @pytest.fixture(scope="module")
@@ -116,6 +117,41 @@ def test_the_same_log_gives_the_same_bytes_within_the_size_of_a_page(folder, tmp
         assert (folder / f"{name}.html").stat().st_size < LARGEST_PAGE
 
 
+def test_a_page_with_too_many_samples_is_drawn_with_fewer_until_it_fits(tmp_path):
+    x = np.arange(1600.0)
+    wave, curve = np.sin(x), np.exp(0.01j * x)
+    lines = [
+        Line(x, np.where(x == 700, 9.0, wave)),
+        Line(curve.real, curve.imag, text=[f"{one:g} rad/s" for one in x]),
+        Spread(x, wave, wave + 1),
+        HeatMap(np.arange(256.0), np.arange(128.0), np.arange(128.0)[:, None] * np.ones(256), "dB"),
+    ]
+    sections = [Section("Many", charts=[Chart(f"chart-{k}", "", [Panel("x", "", "", lines)]) for k in range(2)])]
+    page, largest = tmp_path / "page.html", len(plotly_script().encode()) + 60_000
+    write_report(page, "Many", "", sections, largest=largest)
+    text = page.read_text()
+    assert largest - 30_000 < len(text.encode()) <= largest < LARGEST_PAGE
+    shown = json.loads(text.split('id="panels">')[1].split("</script>")[0])[0]["data"]
+    samples = [np.frombuffer(base64.b64decode(one["y"]["bdata"]), "<f4") for one in shown]
+    assert samples[0].max() == 9.0
+    assert len(samples[1]) == len(shown[1]["hovertext"])
+    assert all(100 <= len(one) <= 1600 for one in samples[:2])
+    with pytest.raises(Error, match="name fewer logs or gain sets"):
+        write_report(page, "Many", "", sections, largest=largest - 50_000)
+    assert page.read_text() == text
+
+
+def test_a_log_given_twice_is_refused_and_logs_of_one_name_are_told_apart(folder, tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "slow.csv").write_bytes((folder / "slow.csv").read_bytes())
+    (tmp_path / "slow.csv").symlink_to(folder / "slow.csv")
+    with pytest.raises(Error, match=r"slow\.csv: given twice"):
+        make_report([folder / "slow.csv", tmp_path / "slow.csv"])
+    monkeypatch.chdir(tmp_path / "a")
+    report = make_report([Path("slow.csv"), folder / "slow.csv"])
+    assert [flight.label for flight in report.flights] == ["a/slow.csv", f"{folder.name}/slow.csv"]
+
+
 def test_the_images_are_those_of_the_page(folder):
     names = re.findall(r'id="([a-z0-9-]+)-0" style', (folder / "slow.html").read_text())
     assert {path.stem for path in (folder / "pictures").glob("*.png")} == set(names)
@@ -176,6 +212,17 @@ def test_a_log_that_cannot_be_tuned_from_says_why_and_shows_the_rest(folder):
         assert section.charts or section.tables or section.text, section.heading
 
 
+def test_a_line_is_interrupted_where_the_log_has_a_gap(tmp_path):
+    columns = table(make_flight(seconds=12.0, Ts=0.02))
+    kept = (columns["t"] < 14.0) | (columns["t"] > 16.0)
+    report = make_report([write_csv(tmp_path / "gap.csv", {name: one[kept] for name, one in columns.items()})])
+    for name, title in (("timeline-1", "Angles"), ("tracking-1", "roll rate")):
+        chart = next(one for one in report.charts if one.name == name)
+        for line in next(panel for panel in chart.panels if panel.title == title).lines:
+            (gap,) = np.flatnonzero(np.isnan(line.y))
+            assert (line.x[gap - 1], line.x[gap + 1]) == pytest.approx((4.0, 6.0), abs=0.03)
+
+
 def test_a_crash_is_in_the_headline_and_in_the_timeline(tmp_path):
     columns = table(make_flight(seconds=20.0))
     fallen = columns["t"] > 26.0
@@ -220,6 +267,8 @@ def test_commands_write_the_page_and_refuse_what_is_no_log(folder, mimopilot, tm
     assert_one_clear_line(mimopilot("report", "no.txt", "--out", "page.html"), "no.txt", "not a flight log")
     too_many = mimopilot("report", *[folder / "slow.csv"] * (MOST_LOGS + 1), "--out", "page.html")
     assert_one_clear_line(too_many, f"{MOST_LOGS + 1} logs")
+    with pytest.raises(Error, match="2 logs and 4 gain sets: a report has colours for 5 together"):
+        check_count(2, 4)
 
 
 def test_thinning_keeps_extremes_gaps_and_equal_steps():

@@ -8,7 +8,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import SendCommand, StatusText
 from mimopilot.sitl.mavlink.ground_station.experiments.experiment_profile import ExcitationOptions
 from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name import experiment_profile
-from mimopilot.sitl.mavlink.ground_station.experiments.flight_monitor import FlightMonitor
+from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.profiles import make_restore_plan
 from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import VehicleLinkState
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
