@@ -21,7 +21,6 @@ struct Obstacle {
 Obstacle wrong_vehicle();
 Obstacle wrong_gyro_rate();
 Obstacle wrong_parameter();
-Obstacle other_firmware();
 Obstacle autotune_enabled();
 
 class ArmingCheck

@@ -54,21 +54,11 @@ Obstacle wrong_parameter()
 {
 	/* EVENT
 	 * @description
-	 * The console names the parameter.
+	 * The console names the parameter: a gain out of its range, or <param>MIMO_SET_ID</param>, which is not
+	 * 972901: the stored gains were written for another firmware. Upload gains.
 	 */
 	return reporter.armingCheckFailureExt(events::ID("mimo_parameter"), events::Log::Error,
-					      "MIMO: a gain is out of its range");
-}
-
-Obstacle other_firmware()
-{
-	/* EVENT
-	 * @description
-	 * The stored parameters were written for another firmware. Upload gains, or reset the parameters of the group, or, if
-	 * they are right for this firmware, set <param>MIMO_SET_ID</param> to 972901.
-	 */
-	return reporter.armingCheckFailureExt(events::ID("mimo_firmware"), events::Log::Error,
-					      "MIMO: MIMO_SET_ID is not 972901");
+					      "MIMO: a gain or MIMO_SET_ID is wrong");
 }
 
 void ArmingCheck::ask(uint64_t now)

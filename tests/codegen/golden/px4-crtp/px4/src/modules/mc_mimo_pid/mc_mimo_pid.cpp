@@ -51,18 +51,12 @@ void McMimoPid::update_parameters()
 {
 	Gains gains;
 	_wrong_gain = _parameters.read(gains);
-	_foreign_set = _wrong_gain == nullptr && !_parameters.for_this_firmware(gains);
 
-	if (_foreign_set) {
-		PX4_ERR("MIMO_SET_ID is not 972901: no gain changed");
-
-	} else if (_wrong_gain != nullptr) {
-		PX4_ERR("%s is out of its range: no gain changed", _wrong_gain);
-
-	} else if (memcmp(&gains, &_state.gains, sizeof(gains)) != 0 && !set_gains(_state, gains)) {
-		_wrong_gain = "MIMO_SP_SLEW or MIMO_M_OMEGA";  // times the period
-		PX4_ERR("%s is too large for the gyro rate: no gain changed", _wrong_gain);
+	if (_wrong_gain == nullptr && memcmp(&gains, &_state.gains, sizeof(gains)) != 0 && !set_gains(_state, gains)) {
+		_wrong_gain = "MIMO_SP_SLEW or MIMO_M_OMEGA";  // too large for the period
 	}
+
+	if (_wrong_gain != nullptr) { PX4_ERR("%s is wrong: no gain changed", _wrong_gain); }
 
 	_excitation.configure(_parameters.excitation());
 	read(_settings);
@@ -138,8 +132,6 @@ Obstacle McMimoPid::obstacle() const
 	if (_settings.autotune > 0.5F) { return autotune_enabled(); }
 
 	if (_clock.rate() == SampleClock::Rate::Wrong) { return wrong_gyro_rate(); }
-
-	if (_foreign_set) { return other_firmware(); }
 
 	return _wrong_gain != nullptr ? wrong_parameter() : Obstacle{};
 }

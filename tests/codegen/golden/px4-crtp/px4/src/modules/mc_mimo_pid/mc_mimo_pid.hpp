@@ -141,7 +141,6 @@ private:
 	float _excited[3] {};
 	const char *_obstacle{nullptr};
 	const char *_wrong_gain{nullptr};
-	bool _foreign_set{false};  // the stored gains are for another firmware
 	int _unlogged{0};                // samples
 	bool _excitation_logged{false};
 	bool _wanted{false};

@@ -111,10 +111,9 @@ const char *Parameters::read(Gains &gains)
 
 	for (int i = 0; i < kSettingCount; i++) { _settings[i] = parameter_value(kNames[kGainCount + i]); }
 
-	return wrong;
+	// PX4 stores values longer than a firmware.
+	return wrong != nullptr || for_this_firmware(gains, _settings[MIMO_SET_ID]) ? wrong : "MIMO_SET_ID";
 }
-
-bool Parameters::for_this_firmware(const Gains &gains) const { return mimopilot::for_this_firmware(gains, _settings[MIMO_SET_ID]); }
 
 ExcitationSettings Parameters::excitation() const
 {

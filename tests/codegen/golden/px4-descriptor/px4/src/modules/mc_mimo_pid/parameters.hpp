@@ -14,12 +14,10 @@ public:
 	// Marks all as in use: a log keeps no others.
 	Parameters();
 
-	// Reads all. Returns null, or the name of the first gain out of its range, because PX4 stores any value; `gains` is
-	// then of no use. What is fixed in the firmware stays so.
+	// Reads all. Returns null, or the name of the first gain out of its range, because PX4 stores any value, or
+	// MIMO_SET_ID if the gains were stored for another firmware; `gains` is then of no use. What is fixed in the firmware
+	// stays so.
 	const char *read(Gains &gains);
-
-	// Whether the gains that were read are for this firmware: PX4 stores values longer than a firmware.
-	bool for_this_firmware(const Gains &gains) const;
 
 	// The gains in the firmware.
 	static const Gains &programmed();
