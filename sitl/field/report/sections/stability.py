@@ -32,7 +32,7 @@ NYQUIST = 3.0
 #: Loops of drawn plants that are shown in the determinant's plot, of all sets together.
 SHOWN_DRAWS = 8
 #: Instead of a margin, for a loop whose gain is never 1.
-NEVER = "gain below 1"
+NEVER = "no crossover"
 #: Of a margin that the flight does not show.
 UNKNOWN = "not known"
 #: Points of a circle.
