@@ -158,7 +158,9 @@ class ReportedFlight:
         if self.found.experiment is None or self.found.reason:
             return ()
         yaw = self._excited((self.recording.yaw,)) if self.yaw_response is not None else ()
-        return bridged(tuple(sorted((*self.found.parts, *intersection(yaw, self.airborne)))), BRIDGE)
+        used = bridged(tuple(sorted((*self.found.parts, *intersection(yaw, self.airborne)))), BRIDGE)
+        edges = [0.0, *(edge for gap in self._gaps() for edge in gap), self.span[1] - self.span[0]]
+        return intersection(used, tuple(zip(edges[::2], edges[1::2], strict=True)))
 
     def _excited(self, sources: Sequence[Mapping[str, Series]]) -> tuple[Interval, ...]:
         parts: tuple[Interval, ...] = ()

@@ -113,9 +113,9 @@ def _phase(flights: Measured, axis: int, band: Band) -> Panel:
         G, deviation, good = _element(plant, axis, axis)
         if not good.any():
             continue
-        # Across a gap the turn of the phase is not known: the longest stretch without one is drawn.
+        # Across a gap the turn of the phase is not known: the widest stretch without one, in octaves, is drawn.
         parts = np.split(np.flatnonzero(good), np.flatnonzero(np.diff(np.flatnonzero(good)) > 1) + 1)
-        good = np.isin(np.arange(len(G)), max(parts, key=len))
+        good = np.isin(np.arange(len(G)), max(parts, key=lambda part: plant.omega[part[-1]] / plant.omega[part[0]]))
         phase = np.full(len(G), np.nan)
         phase[good] = np.degrees(np.unwrap(np.angle(G[good])))
         # A vehicle's response begins between -90 and 0 degrees: the turn in which its phase is counted.

@@ -364,6 +364,14 @@ def test_the_derivative_filter_of_a_stock_set_is_its_own(gains):
     assert with_derivative_filter(gains, 20.0).derivative_cutoff_hz == 20.0
 
 
+def test_what_is_used_leaves_the_gaps_out(bench):
+    flight = replace(bench[2].flights[0])
+    flight.__dict__["_gaps"] = lambda: ((2.0, 3.0), (5.0, 5.5))
+    length = flight.span[1] - flight.span[0]
+    used = [pytest.approx(part, abs=0.01) for part in ((0.0, 2.0), (3.0, 5.0), (5.5, length))]
+    assert list(flight.phases["used"]) == used
+
+
 def test_phases_of_a_flight_are_told_apart(tmp_path):
     flight = make_flight(seconds=12.0, still=(2.0, 1.0))
     landed = ((flight.t < 12.0) | (flight.t > 21.0)).astype(np.uint8)
