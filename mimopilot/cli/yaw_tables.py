@@ -37,6 +37,8 @@ def yaw_cell(gains: Gains, name: str, deviations: Mapping[str, Any]) -> str:
 
 def print_yaw(gains: Gains) -> None:
     """Where the yaw gains come from: their predicted figures beside those of the flown ones, or why they are kept."""
+    from mimopilot.tuning.design.prediction_rows import softer
+
     details = gains.provenance.details.get("yaw")
     if details is None:
         return
@@ -49,6 +51,10 @@ def print_yaw(gains: Gains) -> None:
         model, signals = details["attitude_model"]["omega"], ", ".join(dict.fromkeys(details["excited_by"]))
         title = f"Predicted, yaw (excited by {signals}). RMS in doublets of 10 degrees, 1.2 to 6 s, to the model\n"
         print_table(f"{title}({model:g} rad/s); after a step of torque; of the torque at hover", PREDICTED_YAW, rows)
+        if details.get("better_than_flown"):
+            print_text("better than the yaw gains that flew")
+            for trade_off in softer(details["predicted"]):
+                print_text(trade_off)
     if "kept" in details:
         print_text(f"yaw: the gains are kept as they were: {details['kept']}")
     elif details["limited_by"]:
