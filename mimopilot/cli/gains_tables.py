@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from mimopilot.cli.yaw_tables import print_cross_terms, yaw_cell, yaw_margins
@@ -14,8 +15,9 @@ if TYPE_CHECKING:
 
 #: Title of the tables of predicted figures.
 PREDICTED_TITLE = (
-    "Predicted, roll / pitch. RMS in doublets of 10 degrees, 0.4 to 2 s: to the model\n"
-    "({model}) and of the other axis; after a step of torque; of the torque at hover"
+    "Predicted, roll / pitch. In doublets of 10 degrees, 0.4 to 2 s: RMS error to the\n"
+    "model ({model}), RMS off-axis angle; then RMS angle after a torque step,\n"
+    "and RMS torque at hover"
 )
 
 
@@ -41,9 +43,7 @@ def print_comparison(gains: Gains, logs: list[str]) -> None:
     model = f"{gains.provenance.outer_model[0].bandwidth:g} rad/s"
     print_table(PREDICTED_TITLE.format(model=model), PREDICTED, predicted_rows(gains, logs))
     if details.get("better_than_flown"):
-        print_text(
-            "better than the gains that flew: in following and on the other axis, within the limits of Ms and noise"
-        )
+        print_text("better than the gains that flew: tracking and off-axis motion, within the limits of Ms and noise")
         for trade_off in softer(details["predicted"]):
             print_text(trade_off)
     worth = details.get("worth_of_off_diagonals", {})
@@ -78,13 +78,9 @@ def print_certificate(gains: Gains) -> None:
         kind = figures["gain_margin"][axis]
         gain = "gain not known" if kind == "not known" else f"{figures['gain_margin_db'][axis]:.1f} dB"
         phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
-        rows.append(
-            [
-                axis,
-                f"{'at least ' if kind == 'at least' else ''}{gain}, {phase:.0f} +- {error:.0f} deg, "
-                f"{figures['delay_margin_ms'][axis]:.1f} ms",
-            ]
-        )
+        delay = figures["delay_margin_ms"][axis]
+        crossing = f"{phase:.0f} +- {error:.0f} deg, {delay:.1f} ms" if isfinite(phase) else "no crossover in this band"
+        rows.append([axis, f"{'at least ' if kind == 'at least' else ''}{gain}, {crossing}"])
     low, high = certificate.band
     rows += yaw_margins(figures)
     print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)
