@@ -11,7 +11,7 @@ from mimopilot.common.files import write_atomically
 from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
-from mimopilot.sitl.mavlink.ground_station.profiles import make_plan, module_parameters
+from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, make_plan, module_parameters
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
@@ -87,8 +87,7 @@ def export(
             text = _generated(gains, form)
         else:
             plan = make_plan(gains, profile or gains.controller)
-            unit = dict(zip(plan.scale, gains.moment_scale or (), strict=False))
-            text = parameter_text(form, plan.values, built_with={**plan.requires, **plan.fixed, **unit})
+            text = parameter_text(form, plan.values, comments=_comments(plan, gains))
         if warning:
             warn(file, [warning])
     elif not options.connect:
@@ -104,6 +103,16 @@ def export(
     else:
         write_atomically(out, text)
         print(f"{out}: {len(text.splitlines())} lines")
+
+
+def _comments(plan: UploadPlan, gains: Gains) -> list[str]:
+    """What whoever loads a parameter file has to check and to do, which `upload` does by itself."""
+    unit = dict(zip(plan.scale, gains.moment_scale or (), strict=False))
+    held = ", ".join(f"{name} {shortest(value)}" for name, value in {**plan.requires, **plan.fixed, **unit}.items())
+    comments = [f"load only into a vehicle that holds {held}"] if held else []
+    if plan.binding:
+        comments.append(f"then set {plan.binding.stored} to what the vehicle has as {plan.binding.firmware}")
+    return comments
 
 
 def _generated(gains: Gains, form: str) -> str:

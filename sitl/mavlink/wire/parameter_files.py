@@ -6,7 +6,7 @@ truncated file, with half a gain matrix, is detected. The next one, if any, says
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from mimopilot.common.files import sha256
@@ -43,7 +43,7 @@ def parameter_text(
     component: int = COMPONENT,
     checksum: bool = True,
     integers: Collection[str] = (),
-    built_with: Mapping[str, float] | None = None,
+    comments: Sequence[str] = (),
 ) -> str:
     """Text of a parameter file.
 
@@ -59,13 +59,10 @@ def parameter_text(
         Begin with the checksum line; False for a file that is meant to be edited.
     integers : collection of str
         Names of INT32 parameters; only QGroundControl's files hold the type.
-    built_with : mapping, optional
-        Name -> value that the vehicle must hold already, for a comment.
+    comments : sequence of str
+        Lines before the parameters.
     """
-    body = FORMATS[form](values, system, component, integers)
-    if built_with:
-        held = ", ".join(f"{name} {shortest(value)}" for name, value in built_with.items())
-        body = f"# load only into a vehicle that holds {held}\n{body}"
+    body = "".join(f"# {comment}\n" for comment in comments) + FORMATS[form](values, system, component, integers)
     first = f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n" if checksum else ""
     return first + body
 

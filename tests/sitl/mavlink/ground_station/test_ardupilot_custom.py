@@ -109,6 +109,7 @@ def test_a_parameter_file_holds_what_an_upload_writes(mimopilot, certified, gain
     text = (tmp_path / "mavproxy.parm").read_text()
     scale = ", ".join(f"CC3_SCALE_{axis} {value:g}" for axis, value in zip("RPY", gains.moment_scale, strict=True))
     assert f"# load only into a vehicle that holds CC_TYPE 3.0, CC3_TS 0.004, {scale}\n" in text
+    assert "# then set CC3_SET_ID to what the vehicle has as CC3_FW_ID\n" in text
     vehicle = CustomVehicle(old)
     with UdpVehicle(vehicle) as link:
         differ = mimopilot(*arguments, "--connect", link.url)
