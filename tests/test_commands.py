@@ -145,7 +145,7 @@ def test_models_window_and_specification_are_taken(mimopilot, log, tmp_path):
         (("tune", "cut.ulg", "--out", "x.toml"), ("cut.ulg",)),
         (("tune", "LOG", "--inner", "20", "--out", "x.toml"), ("expected OMEGA,ZETA,DELAY",)),
         (("tune", "LOG", "--inner", "20,-1,0", "--out", "x.toml"), ("inner", "damping -1")),
-        (("tune", "LOG", "--method", "magic", "--out", "x.toml"), ("method", "'mimo' or 'siso'")),
+        (("tune", "LOG", "--method", "magic", "--out", "x.toml"), ("--method: got 'magic', expected mimo or siso",)),
         (("tune", "LOG", "--outer", "0.5,0.7,0", "--out", "x.toml"), ("too short",)),
         (("generate", "bad.toml", "--out", "cpp"), ("bad.toml", "schema")),
         (("experiment", "adam0", "--axis", "up", "--out", "x.ulg"), ("axis: got 'up'",)),

@@ -47,14 +47,11 @@ def autotune(
     Exit code 0: the new gains are kept; 1: the old ones are back, or a step failed.
     """
     from mimopilot.common.console import print_json
-    from mimopilot.sitl.errors import SitlError
     from mimopilot.sitl.field.autotune_console import AutotuneTerminal
     from mimopilot.sitl.field.autotune_run import AutotuneOptions
     from mimopilot.sitl.field.workflow import autotune as run
 
     terminal = AutotuneTerminal(as_json)
-    if not yes and not terminal.interactive:
-        raise SitlError("no terminal to ask: give --yes, and with --take-off --arm")
     options = AutotuneOptions(
         connect,
         out,

@@ -24,7 +24,7 @@ from mimopilot.cli import (
     tuning,
     vehicle,
 )
-from mimopilot.cli.command import use_command
+from mimopilot.cli.checked_command import use_command
 from mimopilot.common.errors import Error
 from mimopilot.common.verbosity import Verbosity, set_verbosity
 

@@ -96,6 +96,8 @@ def autotune(options: AutotuneOptions, dialogue: AutotuneDialogue) -> Decisions:
     if options.take_off is not None and not TAKE_OFF_M[0] <= options.take_off <= TAKE_OFF_M[1]:
         raise SitlError(f"--take-off: got {options.take_off:g}, expected {TAKE_OFF_M[0]:g} to {TAKE_OFF_M[1]:g} m")
     experiment_profile(options.profile, excitation_of(options), lambda values: None)  # refuses impossible options
+    if not (options.yes or dialogue.interactive):
+        raise SitlError("no terminal to ask: give --yes, and with --take-off --arm")
     run = AutotuneRun(options, load_decisions(options.folder, options.profile), dialogue)
     if run.decisions.result == "old":
         raise SitlError(

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.analysis.closed_loop import doublet_spectrum
-from mimopilot.tuning.law import Filters, shaping_response
+from mimopilot.tuning.law import shaping_response
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.plant.rigid_body_fit import LOWEST
 from mimopilot.tuning.plant.wide_response import WideResponse, hat_weights
 from mimopilot.tuning.reference_model import ReferenceModel

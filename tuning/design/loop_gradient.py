@@ -22,15 +22,13 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.design.free_gains import ACCELERATION, FreeGains
 from mimopilot.tuning.law import (
-    ATTITUDE,
-    ATTITUDE_FEEDFORWARD,
-    LOOP_TERMS,
     attitude_response,
     fixed_matrices,
     model_response,
     rate_response,
     setpoint_rate_response,
 )
+from mimopilot.tuning.law_terms import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.small_matrices import inverse
 

@@ -30,7 +30,8 @@ from mimopilot.tuning.design.prediction import FAST
 from mimopilot.tuning.design.rate_loop_gain import gain_above_band, structural_modes
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Limits
-from mimopilot.tuning.law import ATTITUDE, TERMS, Filters
+from mimopilot.tuning.law_filters import Filters
+from mimopilot.tuning.law_terms import ATTITUDE, TERMS
 from mimopilot.tuning.motors import Motors
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.spec import DesignLimits

@@ -47,7 +47,6 @@ def open_serial(option: str, url: str, device: str, baud: int, write_timeout: fl
     try:
         return serial.Serial(device, baud, timeout=0, write_timeout=write_timeout, exclusive=exclusive or None)
     except (OSError, ValueError) as error:  # a SerialException is an OSError, without a number when termios refused
-        code = getattr(error, "errno", None) or next(iter(getattr(error.__context__, "args", ())), None)
-        raise SitlError(
-            f"{option} {url}: cannot be opened: {REASONS.get(code or 0, str(error))}", exit_code=1
-        ) from error
+        codes = (getattr(error, "errno", None), *getattr(error.__context__, "args", ()))
+        reason = next((REASONS[code] for code in codes if code in REASONS), str(error))
+        raise SitlError(f"{option} {url}: cannot be opened: {reason}", exit_code=1) from error

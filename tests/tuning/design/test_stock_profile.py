@@ -22,8 +22,7 @@ from mimopilot.tuning.design.stock_profile import in_digits
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
-from mimopilot.tuning.law import Filters
-from mimopilot.tuning.law_filters import StockFilters
+from mimopilot.tuning.law_filters import Filters, StockFilters
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import second_order
 from mimopilot.tuning.spec import TuningSpec, load_spec

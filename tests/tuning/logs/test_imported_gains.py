@@ -191,7 +191,7 @@ def test_named_defaults_fill_what_is_missing_and_are_listed(tmp_path):
         (PX4_VALUES | {"IMU_GYRO_RATEMAX": 0.0}, {}, "IMU_GYRO_RATEMAX: got 0 Hz, expected more than 0"),
         (PX4_VALUES, {"rate": -3.0}, "--rate: got -3 Hz"),
         (PX4_VALUES, {"rate": 1e6}, "cannot run at this control rate"),
-        (PX4_VALUES, {"defaults": "px4-v1.15"}, "--defaults: got 'px4-v1.15', expected px4-v1.16"),
+        (PX4_VALUES, {"defaults": "px4-v1.15"}, "--defaults: got 'px4-v1.15', expected one of px4-v1.16"),
         (ARDUPILOT_VALUES, {"defaults": "px4-v1.16"}, "is of ArduPilot; leave it out"),
     ],
 )

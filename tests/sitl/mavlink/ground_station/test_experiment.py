@@ -167,7 +167,7 @@ def test_the_injection_is_not_started_if_a_setting_is_refused():
         ({"yaw_amplitude": 0.6}, "MIMO_EX_AMPY: got 0.6"),
         ({"mode": "acro"}, "--mode: got 'acro'"),
         ({"amplitude": 0.6}, "MIMO_EX_AMP: got 0.6"),
-        ({"amplitude": float("nan")}, "finite"),
+        ({"amplitude": float("nan")}, "MIMO_EX_AMP: got nan"),
         ({"seconds_per_axis": 1000.0}, "MIMO_EX_DUR"),
         ({"tilt_deg": 80.0}, "MIMO_EX_TILT"),
     ],

@@ -17,7 +17,7 @@ RESULTS = ("out", "report", "figures", "snapshot")
 WRITE_BACK = ("certify", "convert")
 
 
-class Command(TyperCommand):
+class CheckedCommand(TyperCommand):
     """A command that refuses, before it works for a minute, results that could not be kept."""
 
     def invoke(self, ctx: Any) -> Any:
@@ -39,9 +39,9 @@ class Command(TyperCommand):
 
 
 def use_command(app: typer.Typer) -> None:
-    """Make every command of an application a `Command`."""
+    """Make every command of an application a `CheckedCommand`."""
     for info in app.registered_commands:
-        info.cls = Command
+        info.cls = CheckedCommand
 
 
 def _files(values: Iterable[Any]) -> Iterator[Path]:
