@@ -17,5 +17,5 @@ from mimopilot.tuning.design.prediction_rows import softer
 )
 def test_a_set_that_gives_way_more_to_a_torque_on_any_axis_is_told_beside_its_merits(after, before, told):
     texts = softer({"tuned": [{"disturbance_deg": after}], "flown": [{"disturbance_deg": before, "Ms": 3.28}]})
-    assert texts == ([f"but a step of torque moves it farther ({told}, at Ms 3.28)"] if told else [])
+    assert texts == ([f"a step of torque moves it farther ({told}, at Ms 3.28)"] if told else [])
     assert softer({"tuned": [{"disturbance_deg": after}]}) == []
