@@ -11,7 +11,7 @@ from mimopilot.tuning.design.prediction import giving_way
 from mimopilot.tuning.gains import Gains
 
 #: Columns of `predicted_rows`; without the first one, those of `prediction_cells`.
-PREDICTED = ("", "follows [deg]", "other axis [deg]", "after torque [deg]", "noise of u", "Ms")
+PREDICTED = ("", "tracking [deg]", "off-axis [deg]", "disturbance [deg]", "torque noise", "Ms")
 #: Gain set of a design -> its name in the table.
 SETS = {"flown": "flown", "siso": "SISO", "tuned": "tuned", "module": "our module"}
 
