@@ -7,14 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.codegen.literals import float_literal
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameter_row import Parameter
 from mimopilot.tuning.parameters import (
     ARDUPILOT_EXCITATION,
     ARDUPILOT_PREFIX,
+    FIRMWARE_NUMBER,
     IDENTITY,
     PARAMETERS,
+    SET_NUMBER,
     Setting,
     ardupilot_name,
 )
@@ -29,7 +32,7 @@ ORDER = (
     *("RA_RR", "RA_RP", "RA_PR", "RA_PP", "AP_YY", "RP_YY", "RI_YY", "RD_YY", "RF_YY", "RMAX_R", "RMAX_P", "RMAX_Y"),
     *("UMAX_R", "UMAX_P", "UMAX_Y", "IMAX_R", "IMAX_P", "IMAX_Y", "YAW_W", "SP_SLEW", "D_POLE", "TS", "M_DAMP"),
     *("M_OMEGA", "SCALE_R", "SCALE_P", "SCALE_Y", "EX_AX", "EX_AMP", "EX_AMPY", "EX_HMIN", "EX_HMAX", "EX_DUR"),
-    *("EX_SEED", "EX_MODE", "EX_TILT"),
+    *("EX_SEED", "EX_MODE", "EX_TILT", "FW_ID", "SET_ID"),
 )
 INDEX = {name: index for index, name in enumerate(ORDER, 1)}
 
@@ -67,7 +70,14 @@ def group(gains: Gains) -> list[GroupEntry]:
         If one has no index, or there are more than one group can have.
     """
     values: Mapping[str, float] = {p.name: gains.elements()[p.code] for p in PARAMETERS} | gains.identity()
-    table: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *ARDUPILOT_EXCITATION)
+    values = {**values, FIRMWARE_NUMBER.name: firmware_number(gains)}
+    table: tuple[Parameter | Setting, ...] = (
+        *PARAMETERS,
+        *IDENTITY,
+        FIRMWARE_NUMBER,
+        *ARDUPILOT_EXCITATION,
+        SET_NUMBER,
+    )
     if len(ORDER) > LARGEST_INDEX:
         raise CodegenError(f"{len(ORDER)} indices: a group of ArduPilot has at most {LARGEST_INDEX}; use two groups")
     for source in table:
@@ -106,7 +116,7 @@ def context(gains: Gains) -> dict[str, Any]:
         "prefix": ARDUPILOT_PREFIX,
         "entries": entries,
         "places": [entry.name for entry in entries[len(PARAMETERS) :]],
-        "published": entries[len(PARAMETERS) : -len(ARDUPILOT_EXCITATION)],
+        "published": entries[len(PARAMETERS) : -len(ARDUPILOT_EXCITATION) - 1],
         "settings": ARDUPILOT_EXCITATION,
         "indices": len(ORDER),
         "largest_index": LARGEST_INDEX,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.codegen.literals import float_literal
 from mimopilot.tuning.crazyflie_names import (
     CRAZYFLIE_ENABLE,
@@ -19,7 +20,7 @@ from mimopilot.tuning.crazyflie_names import (
 )
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameter_row import Parameter
-from mimopilot.tuning.parameters import IDENTITY, Setting
+from mimopilot.tuning.parameters import FIRMWARE_NUMBER, IDENTITY, SET_NUMBER, Setting
 
 
 @dataclass(frozen=True)
@@ -58,11 +59,12 @@ def context(gains: Gains) -> dict[str, Any]:
             "--spec FILE, where FILE says moment_scale = [...]: the N m of u = 1 on roll, pitch and yaw"
         )
     values = gains.elements() | {p.code: gains.identity()[p.name] for p in IDENTITY}
+    values |= {FIRMWARE_NUMBER.code: firmware_number(gains)}
     return {
         "crazyflie_group": GROUP,
         "crazyflie_parameters": [_member(one, values) for one in crazyflie_parameters()],
         "crazyflie_excitation": [
-            replace(one, name=crazyflie_name(one.name)) for one in SETTINGS if one != CRAZYFLIE_ENABLE
+            replace(one, name=crazyflie_name(one.name)) for one in SETTINGS if one not in (SET_NUMBER, CRAZYFLIE_ENABLE)
         ],
         "crazyflie_states": list(ControllerState),
         "log_variables": LOG_VARIABLES,

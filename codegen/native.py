@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.firmware_number import interface_hash
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, gains_array, input_rows, to_array
-from mimopilot.codegen.render import interface_hash, render, write_tree
+from mimopilot.codegen.render import render, write_tree
 from mimopilot.codegen.targets import TEMPLATES
 from mimopilot.codegen.toolchain import CXX_FLAGS, compile_shared, find_compiler
 from mimopilot.common.cache import cache_folder

@@ -8,9 +8,18 @@ from typing import Any
 
 import numpy as np
 
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.parameter_row import Parameter
-from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Setting
+from mimopilot.tuning.parameters import (
+    ENABLE,
+    EXCITATION,
+    FIRMWARE_NUMBER,
+    IDENTITY,
+    PARAMETERS,
+    SET_NUMBER,
+    Setting,
+)
 
 #: Our unit -> PX4's; PX4 does not list our other units.
 _UNITS = {"s": "s", "rad": "rad", "rad/s": "rad/s", "norm": "norm", "N m": "Nm"}
@@ -55,7 +64,8 @@ def entries(gains: Gains) -> list[YamlEntry]:
     return [
         *(_of_parameter(parameter, values[parameter.code]) for parameter in PARAMETERS),
         *(_of_parameter(parameter, scales[parameter.name]) for parameter in IDENTITY if parameter.name in scales),
-        *(_of_setting(setting) for setting in (*EXCITATION, ENABLE)),
+        _of_parameter(FIRMWARE_NUMBER, firmware_number(gains)),
+        *(_of_setting(setting) for setting in (*EXCITATION, SET_NUMBER, ENABLE)),
     ]
 
 

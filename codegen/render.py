@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -17,6 +16,7 @@ import numpy as np
 
 from mimopilot.codegen import ardupilot, crazyflie, px4
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.firmware_number import firmware_number, interface_hash
 from mimopilot.codegen.layout import GAINS, INPUT, OUTPUT, STATE, offset
 from mimopilot.codegen.literals import float_literal
 from mimopilot.codegen.targets import DESCRIPTION, TEMPLATES, Target, find_target
@@ -26,10 +26,16 @@ from mimopilot.common.files import inside, read_text, sha256, write_atomically
 from mimopilot.tuning.acceptance import check_ranges
 from mimopilot.tuning.gains import Gains, gains_to_toml
 from mimopilot.tuning.parameter_row import Row, Shape
-from mimopilot.tuning.parameters import ENABLE, EXCITATION, PARAMETERS, ROWS, check_names
+from mimopilot.tuning.parameters import (
+    ENABLE,
+    EXCITATION,
+    FIRMWARE_NUMBER,
+    PARAMETERS,
+    ROWS,
+    SET_NUMBER,
+    check_names,
+)
 
-#: These and the parameter table define the C interface.
-INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
 MANIFEST = "manifest.json"
 MANIFEST_SCHEMA = 1
 #: Folder of templates -> what only its templates use.
@@ -46,13 +52,6 @@ def generator_version() -> str:
         return version("mimopilot")
     except PackageNotFoundError:
         return "unknown"
-
-
-def interface_hash() -> int:
-    """First 32 bits of the SHA-256 of the C interface: two headers and the members of the gains."""
-    members = "".join(f"{row.member}{row.dimensions};" for row in ROWS).encode()
-    digest = hashlib.sha256(b"".join((TEMPLATES / name).read_bytes() for name in INTERFACE) + members)
-    return int.from_bytes(digest.digest()[:4], "big")
 
 
 def render(gains: Gains, target: str = "native", **options: str) -> dict[str, str]:
@@ -129,9 +128,12 @@ def _context(gains: Gains, target: Target) -> dict[str, Any]:
         "gains": gains,
         "target_rate": f"{target.rate(gains):g}",
         "parameters": PARAMETERS,
-        "identity": list(gains.identity()),
+        "identity": [*gains.identity(), FIRMWARE_NUMBER.name],
+        "torque_published": bool(gains.identity()),
+        "firmware_number": firmware_number(gains),
+        "set_number": SET_NUMBER.name,
         "excitation_settings": EXCITATION,
-        "settings": (*EXCITATION, ENABLE),
+        "settings": (*EXCITATION, SET_NUMBER, ENABLE),
         "literal": literal,
         "rows": ROWS,
         "offset": offset,

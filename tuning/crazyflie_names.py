@@ -1,8 +1,8 @@
 """Names of the controller's parameters and log variables on a Crazyflie: one group, for the firmware and its readers.
 
-All parameters are floats, those that are fixed in the firmware (``mimo.TS``, ``mimo.SCALE_*``) are read-only, and
-the others persistent. A Crazyflie flies only a set that it has taken as a whole: it reads them when it starts, and each
-time ``mimo.EN`` goes from 0 to 1 on the ground (`ControllerState`).
+All parameters are floats, those that are fixed in the firmware (``mimo.TS``, ``mimo.SCALE_*``, ``mimo.FW_ID``) are
+read-only, and the others persistent. A Crazyflie flies only a set that it has taken as a whole: it reads them when it
+starts, and each time ``mimo.EN`` goes from 0 to 1 on the ground (`ControllerState`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,15 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 
 from mimopilot.tuning.parameter_row import PREFIX, Parameter
-from mimopilot.tuning.parameters import ENABLE, EXCITATION, IDENTITY, PARAMETERS, Setting
+from mimopilot.tuning.parameters import (
+    ENABLE,
+    EXCITATION,
+    FIRMWARE_NUMBER,
+    IDENTITY,
+    PARAMETERS,
+    SET_NUMBER,
+    Setting,
+)
 
 #: Group of our parameters and of our log variables.
 GROUP = "mimo"
@@ -24,7 +32,7 @@ _WITHOUT = "MIMO_EX_MODE"
 CRAZYFLIE_ENABLE = replace(
     ENABLE, maximum=1, description="1: this controller flies; 0: the stock PID; taken on the ground"
 )
-SETTINGS: tuple[Setting, ...] = (*(one for one in EXCITATION if one.name != _WITHOUT), CRAZYFLIE_ENABLE)
+SETTINGS: tuple[Setting, ...] = (*(one for one in EXCITATION if one.name != _WITHOUT), SET_NUMBER, CRAZYFLIE_ENABLE)
 #: Read-only parameter with the `ControllerState`, as an integer of one byte.
 STATE = f"{GROUP}.STATE"
 
@@ -38,6 +46,7 @@ class ControllerState(IntEnum):
     REFUSED = 3  # the set of parameters is not valid: the one taken before flies
     WAITING = 4  # EN has changed in the air: it counts on the ground
     WRONG_PERIOD = 5  # the gains are for another rate: no torque, at all
+    OTHER_FIRMWARE = 6  # the stored parameters are not for this firmware: the stock PID flies
 
 
 def crazyflie_name(name: str) -> str:
@@ -55,6 +64,7 @@ def crazyflie_parameters() -> Iterator[Parameter | Setting]:
     """All floats of the group, in the firmware's order."""
     yield from PARAMETERS
     yield from IDENTITY
+    yield FIRMWARE_NUMBER
     yield from SETTINGS
 
 
@@ -88,7 +98,10 @@ LOG_VARIABLES: tuple[LogVariable, ...] = (
     *(LogVariable(name, "float", "rad/s", "body rate") for name in "pqr"),
     *(LogVariable(f"{name}Sp", "float", "rad/s", "body rate setpoint that is flown") for name in "pqr"),
     *(LogVariable(name, "float", "rad", "attitude") for name in ("roll", "pitch", "yaw")),
-    *(LogVariable(f"{name}Sp", "float", "rad", "attitude setpoint that is flown") for name in ("roll", "pitch", "yaw")),
+    *(
+        LogVariable(f"{name}Sp", "float", "rad", "attitude setpoint; NaN: rates are flown")
+        for name in ("roll", "pitch", "yaw")
+    ),
     LogVariable("phase", "int8_t", "", "excitation: -2 waits, -1 off, 0 roll, 1 pitch, 2 pause, 3 yaw"),
     LogVariable("end", "uint8_t", "", "how the last excitation ended"),
     LogVariable("state", "uint8_t", "", "what flies, see STATE"),

@@ -279,6 +279,23 @@ EXCITATION: tuple[Setting, ...] = (
     Setting("MIMO_EX_TILT", "rad", 0.5, 0.05, 1.0, False, "excitation: stop above this tilt"),
 )
 
+#: A vehicle's firmware has a number (`codegen.firmware_number`): of its gains, their unit of torque, and the names of
+#: its parameters. Single precision holds six digits exactly, and ground stations show them.
+LARGEST_NUMBER = 999_999
+FIRMWARE_NUMBER = Parameter(
+    name=f"{PREFIX}FW_ID",
+    code="FW_ID",
+    unit="",
+    minimum=1.0,
+    maximum=LARGEST_NUMBER,
+    writable=False,
+    description="number of the firmware's gains",
+)
+#: Stored parameters outlive a new firmware. They fly only if they were written for it, or are its own gains.
+SET_NUMBER = Setting(
+    "MIMO_SET_ID", "", 0, 0, LARGEST_NUMBER, False, "FW_ID of the firmware that the stored parameters are for; 0: none"
+)
+
 #: Which controller flies: this one or that of the flight stack; from 2 on, a switch chooses in flight.
 ENABLE = Setting("MIMO_EN", "", 0, 0, 7, True, "1: this controller flies; 0: the stock one; 2-7: RC AUX1-6 chooses")
 
@@ -312,7 +329,14 @@ def check_names() -> None:
     TuningError
         When a name is too long, has other characters than A-Z, 0-9 and _, or occurs twice.
     """
-    table: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
+    table: tuple[Parameter | Setting, ...] = (
+        *PARAMETERS,
+        *IDENTITY,
+        FIRMWARE_NUMBER,
+        *EXCITATION,
+        SET_NUMBER,
+        ENABLE,
+    )
     seen: set[str] = set()
     for parameter in table:
         name = parameter.name

@@ -33,6 +33,7 @@ extern const struct table_row param_table[];
 extern const struct log_row log_table[];
 const char *param_group(void);
 const char *log_group(void);
+void run_app(int allowed);
 """
 
 
@@ -105,10 +106,11 @@ class Host:
         return table
 
     def start(self, **parameters: float) -> None:
-        """Switch the vehicle on: with these parameters from its storage, else the built-in ones."""
-        for name, value in (self.defaults | parameters).items():
+        """Switch the vehicle on: with these parameters, as an upload has stored them, else the built-in ones."""
+        number = {"SET_ID": self.defaults["FW_ID"]} if parameters.keys() - {"EN", "EX_AX"} else {}
+        for name, value in (self.defaults | number | parameters).items():
             self.parameters[name][1][0] = int(value) if name == "STATE" else value
-        for name in ("flying", "pid_inits", "pid_calls", "position_calls", "position_resets", "thrust"):
+        for name in ("flying", "pid_inits", "pid_calls", "position_calls", "position_resets", "thrust", "idle_thrust"):
             setattr(self.firmware, name, 0)
         self.firmware.pid_passes = True
         self.control, self.setpoint = self.ffi.new("control_t *"), self.ffi.new("setpoint_t *")
@@ -139,6 +141,12 @@ class Host:
         """Write parameters, as the firmware's parameter task does."""
         for name, value in parameters.items():
             self.parameters[name][1][0] = value
+
+    @property
+    def console(self) -> str:
+        """What the app tells on the console within a second."""
+        self.lib.run_app(2)
+        return str(self.ffi.string(self.firmware.console).decode())
 
     def log(self, name: str) -> float:
         """A log variable now."""

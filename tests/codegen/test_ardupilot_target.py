@@ -13,6 +13,7 @@ import pytest
 from mimopilot.codegen import ardupilot
 from mimopilot.codegen.ardupilot import LARGEST_INDEX, group
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.codegen.layout import INPUT
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.codegen.render import render
@@ -20,9 +21,11 @@ from mimopilot.codegen.targets import TEMPLATES
 from mimopilot.tuning.parameters import (
     ARDUPILOT_EXCITATION,
     ARDUPILOT_PREFIX,
+    FIRMWARE_NUMBER,
     IDENTITY,
     NAME_LENGTH,
     PARAMETERS,
+    SET_NUMBER,
     ardupilot_name,
 )
 from tests.codegen.ardupilot_host import (
@@ -216,7 +219,7 @@ def test_what_pip_compiles_of_the_script_is_not_emitted(gains, tmp_path, monkeyp
 
 
 def test_the_group_has_every_parameter_within_ardupilots_limits(gains):
-    table = (*PARAMETERS, *IDENTITY, *ARDUPILOT_EXCITATION)
+    table = (*PARAMETERS, *IDENTITY, FIRMWARE_NUMBER, *ARDUPILOT_EXCITATION, SET_NUMBER)
     entries = group(gains)
     assert [ARDUPILOT_PREFIX + entry.name for entry in entries] == [ardupilot_name(p.name) for p in table]
     assert all(len(ardupilot_name(p.name)) <= NAME_LENGTH for p in table)
@@ -232,6 +235,7 @@ EMITTED = (
     *("RI_YY", "RD_YY", "RF_YY", "RMAX_R", "RMAX_P", "RMAX_Y", "UMAX_R", "UMAX_P", "UMAX_Y", "IMAX_R"),
     *("IMAX_P", "IMAX_Y", "YAW_W", "SP_SLEW", "D_POLE", "TS", "M_DAMP", "M_OMEGA", "SCALE_R", "SCALE_P"),
     *("SCALE_Y", "EX_AX", "EX_AMP", "EX_AMPY", "EX_HMIN", "EX_HMAX", "EX_DUR", "EX_SEED", "EX_MODE", "EX_TILT"),
+    *("FW_ID", "SET_ID"),
 )
 
 
@@ -335,6 +339,7 @@ def test_acro_without_an_attitude_loop_flies_the_rates(program):
         ("other FSTRATE_ENABLE 1", "FSTRATE_ENABLE is not 0"),
         ("param RP_RR 9", "parameter out of range"),
         ("param TS 0.004", "parameter out of range"),
+        ("param RP_RR 0.3", "SET_ID is not the firmware's"),
     ],
 )
 def test_what_it_must_not_fly_the_main_controller_flies_with_its_integrators(line, text, program):
@@ -396,14 +401,21 @@ def test_integrators_are_zero_with_idle_motors_and_held_on_the_ground(program):
 
 def test_new_gains_act_within_a_second_and_wrong_ones_are_refused_as_a_whole(program):
     # In hover the rate error alone makes torque: Kp_i and the integral.
-    rows, texts = fly(program, "gyro -0.1 0 0", "switch 1", "step 10", "param RI_RR 5", "step 500")
+    from tests.conftest import coupled_gains
+
+    lines = ("gyro -0.1 0 0", "switch 1", "step 10")
+    number = firmware_number(at_400_hz(coupled_gains()))
+    rows, texts = fly(program, *lines, f"param SET_ID {number}", "param RI_RR 5", "step 500")
     slope = np.diff(rows[:, 0])
     assert not texts and slope[-1] == pytest.approx(5 * 0.1 * 0.0025, rel=0.01)
-    lines = ("gyro -0.1 0 0", "switch 1", "step 10", "param RI_RR 5", "param RP_PP -1", "step 500")
-    rows, texts = fly(program, *lines)
+    rows, texts = fly(program, *lines, "param RI_RR 5", "param RP_PP -1", "step 500")
     assert texts == ["MIMO: RP_PP out of range, no gain changed"]
     slope = np.diff(rows[:, 0])
     assert slope[-1] == pytest.approx(0.25 * 0.1 * 0.0025, rel=0.02)
+    # Values that were stored for another firmware.
+    rows, texts = fly(program, *lines, "param SET_ID 1", "param RI_RR 5", "step 500")
+    assert texts == [f"MIMO: CC3_SET_ID is not {number}, no gain changed"]
+    assert np.diff(rows[:, 0])[-1] == pytest.approx(0.25 * 0.1 * 0.0025, rel=0.02)
 
 
 def test_the_injector_excites_one_axis_after_the_other_and_is_logged(program):

@@ -119,6 +119,15 @@ def test_rate_setpoints_are_in_the_older_frame_and_flown_without_the_attitude(ho
     assert logged(host, RATE_SETPOINTS) == pytest.approx([math.pi / 2 * sign for sign in expected])
 
 
+def test_while_rates_are_flown_the_log_has_no_attitude_setpoint(host):
+    host.setpoint.attitude.roll = 20.0
+    host.run()
+    assert host.log("rollSp") == pytest.approx(20 * DEGREE, rel=1e-5)
+    host.setpoint.mode.roll = host.setpoint.mode.pitch = 2
+    host.run()
+    assert all(math.isnan(one) for one in logged(host, SETPOINTS)) and host.log("rSp") == 0
+
+
 def test_thrust_of_a_quarter_is_a_quarter_of_what_the_motors_can_in_newton(host):
     host.setpoint.thrust = 65535 / 4
     assert host.run().thrustSi == pytest.approx(0.125)  # 4 motors of 0.125 N
@@ -256,6 +265,25 @@ def test_torque_that_the_motors_cannot_give_is_noticed_and_does_not_wind_up(host
     assert abs(host.log(name)) > abs(held) + 0.001
 
 
+@pytest.mark.parametrize("turned", [1, -1])
+def test_torque_that_idling_motors_cannot_give_is_noticed_in_both_directions(host, turned):
+    # Each motor gives 12.5 mN. Of a roll torque t it gives t / 4 / (0.05 m sin 45 degrees) less or more.
+    lever = 4 * 0.05 * math.sqrt(0.5)
+    idle, hover = 0.05 * 0.125, 0.0125
+    for least in (0, 3277):  # 0.05 of 65535
+        host.take_off()
+        host.firmware.idle_thrust = least
+        host.setpoint.thrust = 6553.5
+        host.sensors.gyro.x = turned * 45.0
+        host.run(60)
+        first = host.torque[0]
+        host.run(100)
+        assert first * turned < 0 and lever * (hover - idle) < abs(first) < lever * hover
+        assert int(host.log("saturated")) & 1 == (least > 0)
+        # The integrator goes on unless the torque is not given.
+        assert (host.torque[0] == pytest.approx(first, rel=1e-3)) == (least > 0)
+
+
 # Which set of parameters flies.
 
 
@@ -280,7 +308,7 @@ def test_the_firmwares_pid_flies_while_the_controller_is_off(host):
 
 def test_a_set_written_while_it_flies_is_taken_as_a_whole_only_by_switching_it_off_and_on_on_the_ground(host):
     before = torque_against_a_roll_rate(host)
-    host.write(RP_RR=0.3)
+    host.write(RP_RR=0.3, SET_ID=host.defaults["FW_ID"])
     assert (host.run(), state(host))[1] is ControllerState.CHANGED
     host.write(EN=0.0)
     assert (host.run(), state(host))[1] is ControllerState.WAITING and host.firmware.pid_calls == 0
@@ -309,6 +337,34 @@ def test_a_stored_set_flies_from_the_start(host):
     assert (
         torque_against_a_roll_rate(host) == pytest.approx(2 * before, rel=0.2) and state(host) is ControllerState.FLIES
     )
+
+
+def test_parameters_stored_for_another_firmware_do_not_fly_and_the_console_says_why(host):
+    number = host.defaults["FW_ID"]
+    for stored in (0.0, number + 1):
+        host.take_off(RP_RR=0.3, SET_ID=stored)
+        assert state(host) is ControllerState.OTHER_FIRMWARE and host.firmware.pid_calls == 4
+        assert host.console == f"mimo.SET_ID is not {number:.0f}: stored for another firmware, stock PID flies\n"
+    host.write(SET_ID=number)  # does not count in the air
+    assert (host.run(), state(host))[1] is ControllerState.OTHER_FIRMWARE
+    host.firmware.flying = False
+    host.write(EN=0.0)
+    assert (host.run(), state(host))[1] is ControllerState.STOCK
+    host.write(EN=1.0)
+    assert (host.run(), state(host))[1] is ControllerState.FLIES and not host.console
+
+
+def test_the_gains_of_the_firmware_fly_whatever_was_stored_with_others(host):
+    host.take_off(SET_ID=1.0)
+    assert state(host) is ControllerState.FLIES
+
+
+def test_a_set_that_flew_is_followed_by_the_stock_pid_if_the_next_is_for_another_firmware(host):
+    host.firmware.flying = False
+    host.write(EN=0.0)
+    host.run()
+    host.write(EN=1.0, RP_RR=0.3)
+    assert (host.run(), state(host))[1] is ControllerState.OTHER_FIRMWARE and host.control.controlMode == 0
 
 
 def test_gains_for_another_period_are_refused_without_any_torque(built, tmp_path):

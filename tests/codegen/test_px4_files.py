@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mimopilot.codegen.errors import CodegenError
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.codegen.px4 import yaml_number
 from mimopilot.codegen.render import render
 from mimopilot.codegen.targets import TEMPLATES, targets
 from mimopilot.codegen.toolchain import find_compiler
-from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
+from mimopilot.tuning.parameters import ENABLE, EXCITATION, FIRMWARE_NUMBER, IDENTITY, PARAMETERS, SET_NUMBER
 from tests.codegen.golden_files import check_golden
 from tests.codegen.px4_host import PX4_FLAGS, definitions
 
@@ -35,7 +36,9 @@ def test_the_yaml_has_every_parameter_with_the_gains_as_defaults(gains):
     for setting in EXCITATION:
         assert entries[setting.name]["default"] == pytest.approx(setting.default)
         assert entries[setting.name]["type"] == ("int32" if setting.integer else "float")
-    assert set(entries) == {p.name for p in (*PARAMETERS, *IDENTITY, *EXCITATION)} | {"MIMO_EN"}
+    table = (*PARAMETERS, *IDENTITY, FIRMWARE_NUMBER, *EXCITATION, SET_NUMBER, ENABLE)
+    assert set(entries) == {p.name for p in table}
+    assert np.float32(entries["MIMO_FW_ID"]["default"]) == firmware_number(gains)
 
 
 def test_the_yaml_keeps_px4s_rules_even_those_its_validator_does_not_check(gains):

@@ -6,11 +6,14 @@ The host program fails as soon as two modules publish torque (see `drive`).
 import numpy as np
 import pytest
 
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.codegen.native import NativeController, load_native
 from tests.codegen.px4_host import drive
 from tests.codegen.test_px4_module import AIRBORNE, HOLD_MODE, STEP, STOCK, level_inputs, quaternion, text
 from tests.conftest import coupled_gains
 
+#: Of the firmware: parameters with it may differ from the gains compiled in.
+NUMBER = firmware_number(coupled_gains())
 SECOND = [STEP] * 250
 HOLD = 25  # samples that the controller holds an invalid value, and that a topic may be silent
 STOPPED = [f"stock {name} stop" for name in reversed(STOCK)]
@@ -54,7 +57,8 @@ def test_a_gyro_rate_that_changes_in_the_air_is_told_and_flown(program):
         ("vehicle 1 1", "no VTOL"),
         ("vehicle 2 0", "multicopters only"),
         ("param MC_AT_EN 1", "MC_AT_EN"),
-        ("param MIMO_RP_RR 99", "a gain is out of its range"),
+        ("param MIMO_RP_RR 99", "a gain or MIMO_SET_ID is wrong"),
+        ("param MIMO_RP_RR 0.2", "a gain or MIMO_SET_ID is wrong"),
     ],
 )
 def test_what_it_cannot_fly_fails_the_arming_check(program, event, message):
@@ -155,7 +159,7 @@ def test_from_stock_the_torque_does_not_jump_and_what_is_missing_fades(program):
 
 
 def test_an_integrator_without_gain_starts_at_zero(program):
-    none = [f"param MIMO_RI_{element} 0" for element in ("RR", "RP", "PR", "PP")]
+    none = [f"param MIMO_SET_ID {NUMBER}", *(f"param MIMO_RI_{element} 0" for element in ("RR", "RP", "PR", "PP"))]
     out = drive(program, [*none, f"stock {text(0.05, 0.05, 0.05, 0.2, 0.2, 0.2)}", *AIRBORNE, STEP, STEP]).out
     assert (out["integral"][0, :2] == 0).all() and out["integral"][0, 2] == np.float32(0.2)
     np.testing.assert_allclose(out["torque"][0, :2], 0.05, atol=1e-6)

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import ks_2samp
 
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.codegen.layout import INPUT
 from mimopilot.codegen.native import NativeController, load_native
 from mimopilot.tuning.excitation import prbs
@@ -59,6 +60,7 @@ def test_a_random_flight_gives_the_same_bits_as_the_native_library(program, flow
     rng, gains = np.random.default_rng(7), flown()
     programmed, elements = coupled_gains().elements(), gains.elements()
     changed = [f"param MIMO_{code} {text(value)}" for code, value in elements.items() if value != programmed[code]]
+    changed.append(f"param MIMO_SET_ID {firmware_number(coupled_gains())}")
     commands, rows = [*changed, *AIRBORNE, STEP], []
     row = np.zeros(1, INPUT)[0]
     row["armed"] = 1
@@ -162,7 +164,8 @@ def test_new_gains_take_effect_within_a_second_without_a_jump(program, gains):
     commands = [*AIRBORNE, STEP]
     for k in range(400):
         if k == 100:
-            commands += ["param MIMO_RP_RR 0.25", "param MIMO_AP_PP 3.0"]
+            number = f"param MIMO_SET_ID {firmware_number(gains)}"
+            commands += [number, "param MIMO_RP_RR 0.25", "param MIMO_AP_PP 3.0"]
         rates.append(rng.normal(size=3) * 0.05)
         commands.append(f"gyro 4000 {text(*rates[-1])}")
     out = drive(program, commands).out
@@ -182,7 +185,7 @@ def test_gains_out_of_range_are_refused_by_name_and_the_old_ones_stay(program, g
     result = drive(program, [*AIRBORNE, STEP, *wrong, *["gyro 4000 0.1 0.1 0.1"] * 300])
     inputs = level_inputs(300, rates=0.1)
     assert_same_bits(result.out["torque"], native_outputs(gains, inputs)["moment"])
-    assert any("MIMO_RP_RR is out of its range" in line for line in result.log)
+    assert any("MIMO_RP_RR is wrong: no gain changed" in line for line in result.log)
 
 
 def test_a_heading_reset_rotates_the_setpoint(program):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.blackbox_excitation import chirp, sticks
-from mimopilot.tuning.logs.blackbox_file import BlackboxTable, read_blackbox
+from mimopilot.tuning.logs.blackbox_file import ONE_LOG, BlackboxTable, read_blackbox
 from mimopilot.tuning.logs.blackbox_settings import differences, parameters
 from mimopilot.tuning.logs.columns import TIME_UNITS
 from mimopilot.tuning.logs.recording import Recording
@@ -75,6 +75,7 @@ def record_blackbox(path: Path) -> Recording:
     log = read_blackbox(path, WANTED)
     indi = "u[0]" in log.columns and "quat[0]" in log.columns
     time = _time(log)
+    _check_one_log(path, time)
     Ts = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if Ts <= 0:
         raise TuningError(f"{path}: the time does not increase; decode the log again")
@@ -119,6 +120,16 @@ def _time(log: BlackboxTable) -> Signal:
         if name in log.columns and unit in TIME_UNITS:
             return log.columns[name] * TIME_UNITS[unit]
     raise TuningError(f"{log.path}: no column 'time' in s, ms or us; decode the log again")
+
+
+def _check_one_log(path: Path, time: Signal) -> None:
+    """Refuse a table in which the time begins again; a few wrong time stamps are not that."""
+    few = 10
+    for i in np.flatnonzero(np.diff(time) < 0) + 1:
+        if min(i, len(time) - i) >= few and np.min(time[i - few : i]) > np.max(time[i : i + few]):
+            raise TuningError(
+                f"{path}: the time begins again at row {i + 1} below the column names: another log; {ONE_LOG}"
+            )
 
 
 def _rates(log: BlackboxTable, name: str, resolution: float) -> tuple[Signal | None, str]:
@@ -208,7 +219,7 @@ def _excited(
 ) -> list[str]:
     """Add what excited the flight to the signals; what to tell about it."""
     if setpoint is None:
-        return []
+        return ["no setpoint[0] to setpoint[2], so no excitation is found (blackbox_disable_setpoint = OFF)"]
     own = setpoint * FLU / DEGREE
     injected = chirp(log, own, Ts)
     if injected is not None and injected[:, :2].any(axis=0).all():

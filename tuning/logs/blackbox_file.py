@@ -25,6 +25,7 @@ FIRST = "loopIteration"
 BESIDE = ".headers.csv"
 #: Lines of settings that Blackbox Explorer writes above the table: about 200 with Betaflight 2025.12.
 MAX_SETTINGS = 2000
+ONE_LOG = "give each log in a file of its own, as blackbox_decode writes it (NAME.01.csv, NAME.02.csv)"
 #: Name and unit in a cell of the header line.
 _NAME = re.compile(r"\s*(?P<name>[^()]*?)\s*(?:\((?P<unit>[^()]*)\))?\s*$")
 
@@ -90,9 +91,13 @@ def read_blackbox(path: Path, wanted: re.Pattern[str]) -> BlackboxTable:
         beside = f"it holds the settings of {path.name.removesuffix(BESIDE)}.csv; give that file"
         cause = beside if path.name.endswith(BESIDE) else "decode the log again"
         raise TuningError(f"{path}: no line with the column names ({FIRST}, ...); {cause}")
+    _check_separator(path, lines[start])
     names, units = _header(lines[start])
     settings = _settings(lines[:start]) or _settings_beside(path)
     rows = [line for line in lines[start + 1 :] if line.strip()]
+    again = next((i for i, line in enumerate(lines[start + 1 :], start + 2) if FIRST in line), None)
+    if again is not None:
+        raise TuningError(f"{path}: another log begins at line {again}; {ONE_LOG}")
     warnings = []
     if rows and rows[-1].count(",") < len(names) - 1:
         rows.pop()
@@ -103,6 +108,17 @@ def read_blackbox(path: Path, wanted: re.Pattern[str]) -> BlackboxTable:
     values = _numbers(path, rows, places)
     columns = {names[place]: values[:, i] for i, place in enumerate(places)}
     return BlackboxTable(path, settings, dict(zip(names, units, strict=True)), columns, tuple(warnings))
+
+
+def _check_separator(path: Path, line: str) -> None:
+    """Refuse a table that a spreadsheet has written with other marks between its cells."""
+    mark = max(",;\t", key=line.count)
+    if mark != ",":
+        name = "tabs" if mark == "\t" else "semicolons"
+        raise TuningError(
+            f"{path}: its cells are separated by {name}, so a spreadsheet has written it; give the file that "
+            "blackbox_decode or Blackbox Explorer wrote"
+        )
 
 
 def _header(line: str) -> tuple[list[str], list[str]]:

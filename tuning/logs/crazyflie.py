@@ -91,11 +91,19 @@ STOCK_NOTE = (
     "firmware compensates the battery"
 )
 RADIO_NOTE = "each log block over the radio is a sample at 100 Hz or less of a loop at 500 Hz, without a filter before"
+#: States in which the stock PID flies.
+STOCK_FLIES = (ControllerState.STOCK, ControllerState.OTHER_FIRMWARE)
+#: Our controller's setpoint of roll, NaN while rates are flown, and its rate, which is not.
+SETPOINT, RATE = f"{GROUP}.rollSp", f"{GROUP}.p"
 #: What flies, as our controller logs it; and the whole log.
 STATUS, ALWAYS = f"{GROUP}.state", ((-math.inf, math.inf),)
 STOCK_FLEW = (
     f"according to {STATUS} the stock PID flew, our controller gave no torque; set {GROUP}.EN to 1 on the ground, "
     f"and see that {STATUS} is {ControllerState.FLIES.value} before the take-off"
+)
+UNKNOWN_FLEW = (
+    f"{STATUS} is {ControllerState.WAITING.value} from the begin of the log on, so it does not tell whether our "
+    "controller flew; start logging (usd.logging 1) on the ground"
 )
 ANOTHER_SET = {
     ControllerState.CHANGED: "a parameter had changed since",
@@ -168,6 +176,9 @@ def _record(
     if flown and flown != ALWAYS:
         airborne = flown if airborne is None else intersection(airborne, flown)
         evidence = f"{evidence} and {STATUS}".removeprefix(" and ")
+    if ours:
+        parts = [_attitude_flown(block) for block in blocks]
+        blocks, warned = [block for block, _ in parts], [*warned, *(one for _, some in parts for one in some)]
     signals, yaw = _signals(blocks, LAYOUTS, ours), _signals(blocks, YAW_LAYOUTS, ours)
     wanted = {
         signal: " or ".join(" and ".join(name for name, _ in layout) for layout in _allowed(signal, layouts, ours))
@@ -228,16 +239,21 @@ def _what_flew(
     state = block.variables[STATUS]
     if (state == ControllerState.WRONG_PERIOD).any():
         return [NO_TORQUE], [], ALWAYS
-    # While a switch of EN waits for the ground, what flew before still flies.
+    # While a switch of EN waits for the ground, what flew before still flies; what flew before the log is not known.
     told = np.maximum.accumulate(np.where(state != ControllerState.WAITING, np.arange(len(state)), 0))
     state = state[told]
+    unknown = state == ControllerState.WAITING
     used = np.any([(a <= block.time) & (block.time <= b) for a, b in airborne or ALWAYS], axis=0)
     if not used.any():
         return [], [], ALWAYS
-    stock = state == ControllerState.STOCK
+    stock = np.isin(state, STOCK_FLIES)
     if stock[used].all():
         return [], [STOCK_FLEW], ()
+    if (stock | unknown)[used].all():
+        return [], [UNKNOWN_FLEW], ()
     warnings = []
+    if unknown[used].any():
+        warnings.append(f"{UNKNOWN_FLEW}, for {_share(unknown[used]):.0f} % of the flight: not used")
     if stock[used].any():
         share = _share(stock[used])
         warnings.append(f"according to {STATUS} the stock PID flew for {share:.0f} % of the flight: not used")
@@ -248,7 +264,20 @@ def _what_flew(
                 f"{STATUS} is {other.value} for {share:.0f} % of the flight: {why}, and the set that was taken before "
                 "flew; give that set's values in the --spec file"
             )
-    return [], warnings, intervals(block.time, ~stock) if stock.any() else ALWAYS
+    others = stock | unknown
+    return [], warnings, intervals(block.time, ~others) if others.any() else ALWAYS
+
+
+def _attitude_flown(block: LogBlock) -> tuple[LogBlock, list[str]]:
+    """The samples in which our controller flew an attitude setpoint, and a warning if it flew rates in others."""
+    rates = np.isnan(block.variables.get(SETPOINT, np.zeros(1))) & np.isfinite(block.variables.get(RATE, np.zeros(1)))
+    if not rates.any():
+        return block, []
+    warning = f"{SETPOINT} is NaN for {_share(rates):.0f} % of the log: rates were flown, without an attitude setpoint"
+    if rates.all():
+        return block, [warning]
+    kept = {name: values[~rates] for name, values in block.variables.items()}
+    return LogBlock(block.name, block.time[~rates], kept), [f"{warning}; not used"]
 
 
 def _share(flag: NDArray[np.bool_]) -> float:

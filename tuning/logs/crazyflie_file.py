@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.recording import INCOMPLETE
 
-#: Header line of cfclient (src/cfclient/utils/logdatawriter.py): "Timestamp", then the variables of the block.
-_CSV_HEADER = re.compile(rb"Timestamp(,\w+\.\w+)+\r?\n")
+#: Header line of cfclient (src/cfclient/utils/logdatawriter.py): "Timestamp", then the variables of the block. A
+#: spreadsheet that saves the file again may change the order, the marks between the cells, and the decimal point.
+_TIME, _CSV_NAME, _SEPARATORS = "Timestamp", re.compile(r"\w+\.\w+"), ",;\t"
 #: Time stamps over the radio are of 24 bits (crazyflie-firmware, src/modules/src/log.c): they begin again after 4.7 h.
 _WRAP_MS, _MINUTE_MS = 2.0**24, 60e3
 #: First byte of a uSD log (crazyflie-firmware, src/deck/drivers/src/usddeck.c and tools/usdlog/cfusdlog.py).
@@ -59,7 +60,15 @@ class LogBlock:
 
 def is_cfclient_csv(head: bytes) -> bool:
     """Whether a file begins as cfclient's CSV."""
-    return _CSV_HEADER.match(head) is not None
+    line, end, _ = head.partition(b"\n")
+    names = set(_cells(line.decode("utf-8-sig", "replace").strip())[0])
+    return bool(end and _TIME in names and len(names) > 1 and all(map(_CSV_NAME.fullmatch, names - {_TIME})))
+
+
+def _cells(line: str) -> tuple[list[str], str]:
+    """The cells of a line, and the mark between them."""
+    mark = max(_SEPARATORS, key=line.count)
+    return [cell.strip(' "') for cell in line.split(mark)], mark
 
 
 def is_usd_log(head: bytes) -> bool:
@@ -85,10 +94,10 @@ def read_cfclient_csv(path: Path) -> tuple[LogBlock, str]:
         When a line does not hold one number for each name of the header, but for the last line.
     """
     try:
-        header, *lines = path.read_text("ascii").splitlines()
+        header, *lines = path.read_text("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
         raise TuningError(f"{path}: not a text: byte {error.start + 1} is damaged; copy it again") from error
-    names = header.split(",")
+    names, mark = _cells(header)
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise TuningError(f"{path}: {', '.join(twice)} appears twice in the header; log each variable once")
@@ -97,13 +106,20 @@ def read_cfclient_csv(path: Path) -> tuple[LogBlock, str]:
         if not line.strip():
             continue
         try:
-            row = [float(cell) for cell in line.split(",")]
+            row = [float(cell.strip(' "').replace(",", ".")) for cell in line.split(mark)]
         except ValueError:
             row = []
         if len(row) == len(names):
             rows.append(row)
         elif number == len(lines) + 1:
             damage = INCOMPLETE
+        elif _TIME in line:
+            raise TuningError(f"{path}: another log begins at line {number}; give each log in a file of its own")
+        elif line.count(mark) >= 2 * len(names) - 2:
+            raise TuningError(
+                f"{path}, line {number}: its numbers have a decimal comma, the mark that separates them, too; give the "
+                "file that cfclient wrote"
+            )
         else:
             raise TuningError(
                 f"{path}, line {number}: expected {len(names)} numbers, one for each name of the header; the file is "
@@ -111,10 +127,11 @@ def read_cfclient_csv(path: Path) -> tuple[LogBlock, str]:
             )
     if not rows:
         raise TuningError(f"{path}: no samples below the header line; write the log block to a file while you fly")
-    table = np.array(rows).T
-    wraps = (table[0, :-1] > _WRAP_MS - _MINUTE_MS) & (table[0, 1:] < _MINUTE_MS)
-    table[0, 1:] += _WRAP_MS * np.cumsum(wraps)
-    return LogBlock(path.name, 1e-3 * table[0], dict(zip(names[1:], table[1:], strict=True))), damage
+    columns = dict(zip(names, np.array(rows).T, strict=True))
+    time = columns.pop(_TIME)
+    wraps = (time[:-1] > _WRAP_MS - _MINUTE_MS) & (time[1:] < _MINUTE_MS)
+    time[1:] += _WRAP_MS * np.cumsum(wraps)
+    return LogBlock(path.name, 1e-3 * time, columns), damage
 
 
 def read_usd_log(path: Path) -> tuple[LogBlock, ...]:
@@ -160,7 +177,9 @@ class _Event:
 
 def _text(data: bytes, start: int) -> tuple[str, int]:
     """A text that ends with a zero byte, and the place behind it."""
-    end = data.index(b"\0", start)
+    end = data.find(b"\0", start)
+    if end < 0:
+        raise ValueError("its header is cut")
     return data[start:end].decode("ascii"), end + 1
 
 
@@ -198,7 +217,10 @@ def _events(data: bytes, version: int, count: int) -> tuple[LogBlock, ...]:
         if table is not None:
             names = (event.layout.names or ())[2:]
             values = {name: table[name].astype(np.float64) for name in names}
-            blocks.append(LogBlock(event.name, unit * table["time"].astype(np.float64), values))
+            time = table["time"].astype(np.float64)
+            span = 2.0 ** (8 * table["time"].dtype.itemsize)  # after which the time stamps begin again
+            time[1:] += span * np.cumsum(np.diff(time) < -span / 2)
+            blocks.append(LogBlock(event.name, unit * time, values))
     if not blocks:
         raise ValueError("it holds no samples: start logging (usd.logging 1) before the flight")
     return tuple(blocks)

@@ -55,7 +55,8 @@ def _is_delimited_text(head: bytes) -> bool:
 
 def _is_blackbox_csv(head: bytes) -> bool:
     """Whether a text has the first column of a decoded blackbox log, or Blackbox Explorer's settings above it."""
-    return not head.startswith(b"H ") and any(mark in head for mark in (b"loopIteration", b"Blackbox flight data"))
+    # The log itself begins with such lines, too, perhaps behind bytes of erased memory.
+    return b"H Product:" not in head and any(mark in head for mark in (b"loopIteration", b"Blackbox flight data"))
 
 
 #: The first row that matches reads the file.
@@ -124,6 +125,8 @@ UNSUPPORTED = {
     b"\x89HDF\r\n\x1a\n": "a MATLAB 7.3 (HDF5) file; save it with save(..., '-v7')",
     b"FMT,": "an ArduPilot log as text; give the .bin file that it was made from",
     b"H Product:Blackbox": "a Betaflight log; make a CSV file with blackbox_decode --save-headers",
+    b"time (us), GPS_": "the positions of a blackbox log; give the CSV file of the same name without .gps",
+    b'{"name":"': "the events of a blackbox log; give the CSV file of the same name",
 }
 
 SUFFIXES = tuple(dict.fromkeys(suffix for row in FORMATS for suffix in row.suffixes))
@@ -144,7 +147,8 @@ def log_format(path: Path) -> tuple[LogFormat | None, bytes]:
     """
     with path.open("rb") as stream:
         head = stream.read(HEAD_BYTES)
+    written = head.lstrip(b"\xff")  # erased flash memory before a blackbox log
     for beginning, advice in UNSUPPORTED.items():
-        if head.startswith(beginning):
+        if written.startswith(beginning):
             raise TuningError(f"{path}: {advice}")
     return next((row for row in FORMATS if row.matches(head)), None), head

@@ -13,6 +13,7 @@
 
 #include "utility/attitude.hpp"
 #include "utility/gains.hpp"
+#include "utility/stored_set.hpp"
 
 using namespace mimopilot;
 
@@ -21,6 +22,7 @@ namespace
 
 constexpr float kPeriodTolerance = 0.05F;  // relative, as for the gyro of PX4
 constexpr int32_t kUpdateSamples = static_cast<int32_t>(1.0F / kGains.period + 0.5F);  // parameters: once a second
+constexpr int32_t kForeign = kLimited + 1;  // of the set: stored for another firmware
 constexpr float kAllAxes = 7.0F;       // CC_AXIS_MASK: roll, pitch and yaw
 constexpr const char *kWrongRate = "loop rate is not the gains'";
 constexpr uint8_t kAcro = 1;           // flight mode ACRO
@@ -106,7 +108,7 @@ void AC_CustomControl_MIMO::reset()
 	memset(_main_integral, 0, sizeof(_main_integral));
 	_wrong = -1;
 	_clock = SampleClock(kGains.period);
-	leave_to_main(initialise(_state, kGains) && update_parameters() ? obstacle() : "parameter out of range");
+	leave_to_main(initialise(_state, kGains) && update_parameters() ? obstacle() : refusal());
 }
 
 // Until it is switched on again; null: this controller flies.
@@ -118,6 +120,9 @@ void AC_CustomControl_MIMO::leave_to_main(const char *obstacle)
 		GCS_SEND_TEXT(MAV_SEVERITY_WARNING, "MIMO: %s: main flies", _obstacle);
 	}
 }
+
+// Why the parameters were refused.
+const char *AC_CustomControl_MIMO::refusal() const { return _wrong == kForeign ? "SET_ID is not the firmware's" : "parameter out of range"; }
 
 // Why this controller must not fly; null if it may.
 const char *AC_CustomControl_MIMO::obstacle()
@@ -150,11 +155,19 @@ bool AC_CustomControl_MIMO::update_parameters()
 		if (!allowed(i, value)) { _wrong = i; }
 	}
 
+	if (_wrong < 0 && !for_this_firmware(gains, setting(SET_ID))) { _wrong = kForeign; }
+
 	if (_wrong < 0 && memcmp(&gains, &_state.gains, sizeof(gains)) != 0 && !set_gains(_state, gains)) { _wrong = kLimited; }
 
 	if (_wrong >= 0 && _wrong != before) {
-		const char *const name = _wrong < kLimited ? var_info[_wrong].name : "SP_SLEW or M_OMEGA";
-		GCS_SEND_TEXT(MAV_SEVERITY_WARNING, "MIMO: %s out of range, no gain changed", name);
+		if (_wrong == kForeign) {
+			GCS_SEND_TEXT(MAV_SEVERITY_WARNING, "MIMO: CC3_SET_ID is not %d, no gain changed",
+				      static_cast<int>(kFirmwareNumber));
+
+		} else {
+			const char *const name = _wrong < kLimited ? var_info[_wrong].name : "SP_SLEW or M_OMEGA";
+			GCS_SEND_TEXT(MAV_SEVERITY_WARNING, "MIMO: %s out of range, no gain changed", name);
+		}
 	}
 
 	ExcitationSettings settings;

@@ -39,6 +39,7 @@ public:
 	static const AP_Param::GroupInfo var_info[];
 
 private:
+	const char *refusal() const;
 	const char *obstacle();
 	void leave_to_main(const char *obstacle);
 	void check_clock();
@@ -63,7 +64,8 @@ private:
 	float _excited[mimopilot::kAxes] {};
 	float _main_integral[mimopilot::kAxes] {};  // of the main controller, while it flies in our place
 	const char *_obstacle{nullptr};
-	int32_t _wrong{-1};        // place of the first parameter out of its range; kLimited: too large for the loop; -1: none
+	int32_t _wrong{-1};        // place of the first parameter out of its range; kLimited: too large for the loop;
+	                           // one more: for another firmware; -1: none
 	int32_t _until_update{0};  // samples until the parameters are read again
 	bool _taking_over{true};
 	bool _rate_loop_only{false};  // ACRO's option

@@ -100,7 +100,7 @@ void unallocated(float thrust, const float (&torque)[3], const Motors &motors, i
 	for (int j = 0; j < 3; j++) {
 		float given = 0.0F;
 
-		for (int i = 0; i < 4; i++) { given += kSigns[i][j] * fmaxf(force[i] - lower, 0.0F); }
+		for (int i = 0; i < 4; i++) { given += kSigns[i][j] * fmaxf(force[i] - lower, motors.least); }
 
 		const float missing = torque[j] - lever[j] * given;
 		const float small = 4.0F * kSmall * lever[j] * motors.largest;

@@ -37,10 +37,11 @@ struct Motors {
 	float arm;           // m, from the centre to a motor
 	float torque_ratio;  // m, torque over thrust
 	float largest;       // N, of one motor
+	float least;         // N, of one motor: it idles, and never stops
 };
 
 // Signs of the torque (N m, FLU) that the motors cannot give, as axes of FRD. The firmware lowers all motors alike until
-// none is above its limit, and stops those that would pull down.
+// none is above its limit, and raises those below their least thrust to it.
 void unallocated(float thrust, const float (&torque)[3], const Motors &motors, int32_t (&sign)[3]);
 
 }  // namespace mimopilot

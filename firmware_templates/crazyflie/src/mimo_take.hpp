@@ -10,7 +10,8 @@ namespace mimopilot
 {
 
 // Parameters arrive one by one, so the set is half written at times. It is read as a whole, and only on the ground: when
-// the vehicle starts, and each time EN goes from 0 to 1. A set with a value out of its range changes nothing.
+// the vehicle starts, and each time EN goes from 0 to 1. A set with a value out of its range changes nothing. With one
+// that was stored for another firmware, the firmware's PID controller flies.
 class Take
 {
 public:
@@ -31,6 +32,7 @@ private:
 
 	bool _asked{true};  // EN has been 0 since the last set was taken, or the vehicle has started
 	bool _flies{false};
+	bool _foreign{false};  // the last set is for another firmware
 	int _refused{0};
 	MimoState _state{kMimoStock};
 	Gains _taken{};

@@ -49,8 +49,10 @@ def betaflight_lines(gains: Gains) -> str:
     assert stock is not None  # the set is for Betaflight
     verdict = gains.verdict()[0]
     lines = [
-        f"# mimopilot: gains for Betaflight 2025.12, {verdict}. Angle mode; the selected profile is changed.",
-        "# Up to Betaflight 4.5 d_max_* is d_min_* and angle_p_gain is p_level.",
+        f"# mimopilot: gains for Betaflight 2025.12, {verdict}, in angle mode.",
+        "# They change the selected profile: choose it first (profile 0, ...). Yaw and feed-forward stay as they are.",
+        "# Betaflight 4.5: replace d_max_roll and d_max_pitch by d_min_roll and d_min_pitch.",
+        "# Not for versions before 4.5: their angle mode is another one.",
         "set simplified_pids_mode = OFF",
         "set simplified_dterm_filter = OFF",
     ]

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 from mimopilot.common.errors import check_choice
 from mimopilot.sitl.errors import SitlError
@@ -25,9 +26,11 @@ from mimopilot.tuning.parameters import (
     ARDUPILOT_PREFIX,
     ENABLE,
     EXCITATION,
+    FIRMWARE_NUMBER,
     IDENTITY,
     PARAMETERS,
     ROWS,
+    SET_NUMBER,
     Setting,
     ardupilot_name,
     rows,
@@ -46,6 +49,13 @@ class ParameterWrite:
     value: float
     minimum: float
     maximum: float
+
+
+class Binding(NamedTuple):
+    """Parameters that bind a stored set to a firmware: its number, and that with which the set is stored."""
+
+    firmware: str
+    stored: str
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,8 @@ class UploadPlan:
         Parameters that may be whole numbers on the vehicle.
     requires : dict
         Name -> value of a setting of the vehicle without which the others do not exist.
+    binding : Binding, optional
+        Of a vehicle with our controller; None: a stock vehicle, or `settings` has what it held.
     """
 
     settings: tuple[ParameterWrite, ...]
@@ -77,6 +89,13 @@ class UploadPlan:
     profile: str = ""
     integers: frozenset[str] = frozenset()
     requires: Mapping[str, float] = field(default_factory=dict)
+    binding: Binding | None = None
+
+    def bound(self, number: float) -> UploadPlan:
+        """The plan for a firmware with this number: it is written last, so a part of a first set does not fly."""
+        assert self.binding is not None
+        write = ParameterWrite(self.binding.stored, "", number, SET_NUMBER.minimum, SET_NUMBER.maximum)
+        return replace(self, settings=(*self.settings, write))
 
     @property
     def values(self) -> dict[str, float]:
@@ -91,7 +110,8 @@ def _mimo(gains: Gains) -> UploadPlan:
         ParameterWrite(p.name, p.unit, elements[p.code], p.minimum, p.maximum) for p in PARAMETERS if p.writable
     )
     fixed = {p.name: single(elements[p.code]) for p in PARAMETERS if not p.writable}
-    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY))
+    binding = Binding(FIRMWARE_NUMBER.name, SET_NUMBER.name)
+    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY), binding=binding)
 
 
 #: ArduPilot's choice of a custom controller: ours.
@@ -106,6 +126,7 @@ def _ardupilot_custom(gains: Gains) -> UploadPlan:
         settings=tuple(replace(setting, name=ardupilot_name(setting.name)) for setting in plan.settings),
         fixed={ardupilot_name(name): value for name, value in plan.fixed.items()},
         scale=tuple(map(ardupilot_name, plan.scale)),
+        binding=Binding(ardupilot_name(FIRMWARE_NUMBER.name), ardupilot_name(SET_NUMBER.name)),
         integers=frozenset(CHOSEN),
         requires=CHOSEN,
     )
@@ -245,9 +266,15 @@ def module_parameters(profile: str) -> list[str]:
 
 
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.
-_OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
+_OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, FIRMWARE_NUMBER, *EXCITATION, SET_NUMBER, ENABLE)
 TABLE = {p.name: p for p in _OURS}
-_ON_ARDUPILOT: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *ARDUPILOT_EXCITATION)
+_ON_ARDUPILOT: tuple[Parameter | Setting, ...] = (
+    *PARAMETERS,
+    *IDENTITY,
+    FIRMWARE_NUMBER,
+    *ARDUPILOT_EXCITATION,
+    SET_NUMBER,
+)
 TABLE |= {ardupilot_name(p.name): p for p in _ON_ARDUPILOT}
 PREFIXES = {
     MIMO: (PREFIX,),
@@ -296,7 +323,10 @@ def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
                 "set"
             )
     fixed = {
-        prefix + p.code for p in (*PARAMETERS, *IDENTITY) if not p.writable for prefix in (PREFIX, ARDUPILOT_PREFIX)
+        prefix + p.code
+        for p in (*PARAMETERS, *IDENTITY, FIRMWARE_NUMBER)
+        if not p.writable
+        for prefix in (PREFIX, ARDUPILOT_PREFIX)
     }
     settings = tuple(
         ParameterWrite(name, TABLE[name].unit if name in TABLE else "", value, -math.inf, math.inf)

@@ -20,6 +20,7 @@ REFUSALS: dict[int, str] = {
     ControllerState.REFUSED: "it refused the set, and the one that it took before flies",
     ControllerState.WAITING: "it is flying: the set counts on the ground",
     ControllerState.WRONG_PERIOD: "the set is for another rate, it gives no torque",
+    ControllerState.OTHER_FIRMWARE: "the set is not for this firmware, the stock controller flies",
 }
 
 
@@ -43,8 +44,11 @@ class SetSwitch:
 SWITCHES = {CRAZYFLIE: SetSwitch(ENABLE.name, f"{PREFIX}STATE")}
 
 
-def state_after(client: ParameterClient, switch: SetSwitch, value: float) -> Exchange[str]:
-    """Wait until a vehicle has taken its set; returns why it has not, empty: it has, or the switch is off (0)."""
+def state_after(client: ParameterClient, switch: SetSwitch, value: float, old: bool = False) -> Exchange[str]:
+    """Wait until a vehicle has taken its set; returns why it has not, empty: it has, or the switch is off (0).
+
+    `old`: the set that it held before, which may be one of another firmware.
+    """
     if value == 0:
         return ""
     deadline = client.now + TAKE_S
@@ -53,7 +57,7 @@ def state_after(client: ParameterClient, switch: SetSwitch, value: float) -> Exc
         client.forget(switch.state)
         if answer.value is None:
             return f"{switch.state}: {answer.problem}"
-        if answer.value == ControllerState.FLIES:
+        if answer.value == ControllerState.FLIES or (old and answer.value == ControllerState.OTHER_FIRMWARE):
             return ""
         if client.now >= deadline:
             return f"{switch.state} is {answer.value:g}: {REFUSALS.get(int(answer.value), 'not known')}"

@@ -11,7 +11,7 @@ from mimopilot.common.files import write_atomically
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.events import Heartbeat
 from mimopilot.sitl.mavlink.ground_station.parameter_protocol import AUTOSAVE_S
-from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, violated_range
+from mimopilot.sitl.mavlink.ground_station.profiles import Binding, UploadPlan, violated_range
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, Session, open_session
 from mimopilot.sitl.mavlink.ground_station.set_switch import SWITCHES
 from mimopilot.sitl.mavlink.ground_station.upload import (
@@ -25,6 +25,7 @@ from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_par
 from mimopilot.sitl.physics.moment_scale import check_moment_scale
 from mimopilot.tuning.gains import Gains, Triple
 from mimopilot.tuning.law_filters import MIMO
+from mimopilot.tuning.parameters import FIRMWARE_NUMBER
 
 STORAGE = {
     "acknowledged": "stored: the vehicle acknowledged it",
@@ -140,6 +141,9 @@ def upload_and_verify(
     with open_session(options, plan.integers, crazyflie=True) as vehicle:
         _check_choice(plan, vehicle)
         held = vehicle.read([*plan.values, *plan.fixed], plan.profile)
+        if plan.binding is not None:
+            held |= _read_binding(plan.binding, vehicle)
+            plan = plan.bound(held[plan.binding.firmware])
         if ask_scale:
             held |= _read_scale(plan, vehicle)
         switch = SWITCHES.get(vehicle.vehicle.autopilot)
@@ -192,6 +196,18 @@ def _check_choice(plan: UploadPlan, vehicle: Session) -> None:
             )
 
 
+def _read_binding(binding: Binding, vehicle: Session) -> dict[str, float]:
+    """The firmware's number, and that of the stored set; the vehicle has our other parameters."""
+    try:
+        return vehicle.run(read_values(vehicle.client, binding))
+    except NoParametersError as error:
+        raise SitlError(
+            f"{binding.firmware}: the vehicle does not have it: an older mimopilot generated its firmware, which flies "
+            "stored gains of any other; generate it again and flash it; nothing was written",
+            exit_code=1,
+        ) from error
+
+
 def _read_scale(plan: UploadPlan, vehicle: Session) -> dict[str, float]:
     """The vehicle's unit of torque; it has our other parameters."""
     try:
@@ -208,6 +224,11 @@ def _read_scale(plan: UploadPlan, vehicle: Session) -> dict[str, float]:
 def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session, options: LinkOptions) -> None:
     for name, value in plan.fixed.items():
         if held[name] != value:
+            if name.endswith(FIRMWARE_NUMBER.code):
+                raise SitlError(
+                    f"{name}: the vehicle has {held[name]:.6g}, the values are those of a firmware with {value:.6g}: "
+                    "upload gains instead (mimopilot upload)"
+                )
             raise SitlError(
                 f"{name}: the vehicle has {held[name]:.6g}, the gains are for {value:.6g}; generate its firmware "
                 "again, or tune for what it has"
@@ -240,6 +261,7 @@ def _save_snapshot(plan: UploadPlan, held: Mapping[str, float], vehicle: Heartbe
     """Write the old values to a new file: an older snapshot may be the only copy of its values."""
     path = snapshot_path(options)
     old = {name: held[name] for name in plan.values}
+    old |= {name: value for name, value in held.items() if name.endswith(FIRMWARE_NUMBER.code)}
     write_atomically(path, parameter_text("qgc", old, vehicle.system, vehicle.component))
     if read_parameters(path) != old:
         raise SitlError(

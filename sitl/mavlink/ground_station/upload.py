@@ -126,11 +126,14 @@ def _switch_off(client: ParameterClient, switch: SetSwitch, store: bool) -> Exch
     return reason
 
 
-def _switch_back(client: ParameterClient, switch: SetSwitch, value: float, keep_going: bool = False) -> Exchange[str]:
-    """Switch as before, and see that the vehicle takes the set. Returns why it does not."""
-    answers = yield from client.write({switch.enable: value}, "switching", keep_going=keep_going)
+def _switch_back(client: ParameterClient, switch: SetSwitch, value: float, old: bool = False) -> Exchange[str]:
+    """Switch as before, and see that the vehicle takes the set, or again does what it did with the `old` one.
+
+    Returns why it does not.
+    """
+    answers = yield from client.write({switch.enable: value}, "switching", keep_going=old)
     yield from client.wait_until_quiet()
-    return _problem(answers) or (yield from state_after(client, switch, value))
+    return _problem(answers) or (yield from state_after(client, switch, value, old))
 
 
 def _roll_back(
@@ -153,7 +156,7 @@ def _roll_back(
         return "mixed", ""
     refused = ""
     if switch is not None:
-        refused = yield from _switch_back(client, switch, old[switch.enable], keep_going=True)
+        refused = yield from _switch_back(client, switch, old[switch.enable], old=True)
     yield from client.wait_until_quiet()
     storage = ""
     if store:

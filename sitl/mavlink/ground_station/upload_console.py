@@ -71,9 +71,9 @@ def upload_with_dialogue(
     if options.as_json:
         _print_json(done)
     elif done.outcome.state == "verified":
-        rows = [[s.name, s.unit, shortest(done.outcome.held[s.name][0])] for s in plan.settings]
+        rows = [[s.name, s.unit, shortest(done.outcome.held[s.name][0])] for s in done.plan.settings]
         print_table("read back from the vehicle", ["parameter", "unit", "value"], rows)
-        written = sum(s.value != done.held[s.name] for s in plan.settings)
+        written = sum(s.value != done.held[s.name] for s in done.plan.settings)
         print_text(f"{len(rows)} parameters verified, {written} of them written; {STORAGE[done.outcome.storage]}")
     done.check()
 

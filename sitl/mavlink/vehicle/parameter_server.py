@@ -11,6 +11,7 @@ import numpy as np
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.codegen.cortex_m4 import EmulatedController
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.native import NativeController
 from mimopilot.sitl.autopilot.excitation_injector import AXIS, Injector
@@ -18,7 +19,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.vehicle.parameter_store import KeptParameters, ParameterStore
 from mimopilot.sitl.mavlink.wire.float32 import REAL32, shortest, single
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
+from mimopilot.tuning.parameters import EXCITATION, FIRMWARE_NUMBER, IDENTITY, PARAMETERS, SET_NUMBER
 
 #: MAV_PARAM_ERROR, the reasons of PARAM_ERROR; pymavlink's enumeration ends before the last.
 DOES_NOT_EXIST: int = mavlink.MAV_PARAM_ERROR_DOES_NOT_EXIST
@@ -78,14 +79,17 @@ class ParameterServer(KeptParameters):
     ) -> None:
         self.controller, self.injector, self.store = controller, injector, store
         identity = gains.identity()
+        published = [*(p for p in IDENTITY if p.name in identity), FIRMWARE_NUMBER]
+        others = [*EXCITATION, SET_NUMBER]
         self.table: tuple[ServedParameter, ...] = (
             *(ServedParameter(p.name, p.minimum, p.maximum, p.writable) for p in PARAMETERS),
-            *(ServedParameter(p.name, p.minimum, p.maximum, False) for p in IDENTITY if p.name in identity),
-            *(ServedParameter(s.name, s.minimum, s.maximum, True, s.integer) for s in EXCITATION),
+            *(ServedParameter(p.name, p.minimum, p.maximum, False) for p in published),
+            *(ServedParameter(s.name, s.minimum, s.maximum, True, s.integer) for s in others),
         )
         self.index = {served.name: i for i, served in enumerate(self.table)}
-        settings = {setting.name: single(setting.default) for setting in EXCITATION}
-        values = [*to_array(gains).tolist(), *map(single, identity.values()), *settings.values()]
+        settings = {setting.name: single(setting.default) for setting in others}
+        number = float(firmware_number(gains))
+        values = [*to_array(gains).tolist(), *map(single, identity.values()), number, *settings.values()]
         self.defaults: dict[str, float] = dict(zip(self.index, values, strict=True))
         self.values = dict(self.defaults)
         if store is not None:

@@ -1,3 +1,6 @@
 #pragma once
 
+#include <stdint.h>
+
+uint32_t powerDistributionGetIdleThrust();
 float powerDistributionGetMaxThrust();

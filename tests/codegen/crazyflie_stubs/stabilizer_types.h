@@ -42,6 +42,8 @@ struct firmware {
 	int position_calls;
 	int position_resets;
 	float thrust;
+	uint32_t idle_thrust;
 	attitude_t desired;
+	char console[400];
 };
 extern struct firmware firmware;

@@ -20,7 +20,7 @@ URI = "radio://0/80/2M"
 FLOAT, BYTE, READ_ONLY, EXTENDED = 0x06, 0x08, 0x40, 0x10
 ENOENT = 2
 CAN_FLY, FLYING, ARMED, AUTO = 0x08, 0x10, 0x02, 0x04
-FIXED = ("mimo.TS", "mimo.SCALE_R", "mimo.SCALE_P", "mimo.SCALE_Y")
+FIXED = ("mimo.TS", "mimo.SCALE_R", "mimo.SCALE_P", "mimo.SCALE_Y", "mimo.FW_ID")
 
 
 class ScriptedCrazyflie:
@@ -56,6 +56,8 @@ class ScriptedCrazyflie:
         self.values[STATE] = float(
             ControllerState.STOCK
             if not on
+            else ControllerState.OTHER_FIRMWARE
+            if self.values["mimo.SET_ID"] != self.values["mimo.FW_ID"]
             else ControllerState.REFUSED
             if edge and self.fault == "refuses the set"
             else ControllerState.FLIES

@@ -3,8 +3,10 @@
 import json
 import re
 
+from mimopilot.codegen.render import render
 from mimopilot.tuning.crazyflie_names import LOG_VARIABLES
 from mimopilot.tuning.gains_file import load_gains
+from tests.codegen.crazyflie_host import crazyflie_gains
 from tests.docs.blocks import BLOCKS
 from tests.paths import DOCS
 
@@ -35,3 +37,5 @@ def test_the_manuals_configuration_logs_variables_that_there_are():
     ours = {f"mimo.{variable.name}" for variable in LOG_VARIABLES}
     assert set(variables) <= ours | {"supervisor.info"}
     assert len(variables) <= MOST_VARIABLES
+    emitted = render(crazyflie_gains(), "crazyflie")["crazyflie/README.md"]
+    assert f"```\n{block.text.strip()}\n```" in emitted

@@ -14,7 +14,7 @@ from mimopilot.tuning.parameters import PARAMETERS
 from tests.conftest import assert_one_clear_line
 from tests.sitl.crtp.scripted_crazyflie import ARMED, AUTO, FLYING, URI, ScriptedCrazyflie, connect
 
-WRITTEN = sum(parameter.writable for parameter in PARAMETERS)
+WRITTEN = sum(parameter.writable for parameter in PARAMETERS) + 1  # and the number of the firmware
 
 
 STATION = "mimopilot.sitl.mavlink.ground_station"
@@ -52,7 +52,8 @@ def test_gains_arrive_are_taken_and_stored_with_the_switch_last(mimopilot, monke
     assert vehicle.values["mimo.EN"] == enabled
     assert (vehicle.values[STATE], vehicle.taken == vehicle.gains()) == ((1.0, True) if enabled else (0.0, False))
     assert vehicle.stored == on_vehicle(new) | {"mimo.EN": enabled}
-    assert read_parameters(certified.with_name("my.before-1.params")) == {name: old[name] for name in new}
+    saved = {name: old[name] for name in (*new, "MIMO_FW_ID")}
+    assert read_parameters(certified.with_name("my.before-1.params")) == saved
     assert vehicle.connections == 0
     again = upload(mimopilot, certified)
     assert f"{WRITTEN} parameters verified, 0 of them written" in again.stdout
@@ -91,6 +92,7 @@ def test_a_part_of_a_set_never_flies_and_is_never_started_with(mimopilot, monkey
 )
 def test_after_a_fault_the_old_set_is_back(mimopilot, monkeypatch, certified, old, new, fault, after, words):
     faulty = "" if fault in ("takes off", "refuses the set") else "MIMO_RP_PP"
+    old = old | {"MIMO_SET_ID": old["MIMO_FW_ID"]}  # of an earlier upload
     vehicle = connect(monkeypatch, ScriptedCrazyflie(old, fault, faulty, after))
     if fault in ("clamps", "ignores"):
         # The fault is of the first write only: the old value can be written back.
@@ -189,6 +191,28 @@ def test_nothing_is_written_to_a_vehicle_that_the_gains_are_not_for(mimopilot, m
     change(vehicle)
     failed = mimopilot("upload", file, "--connect", URI, "--yes", "--timeout", "1.5")
     assert_one_clear_line(failed, words, code=code)
+    assert vehicle.writes == 0
+
+
+def test_a_set_of_another_firmware_gets_the_number_of_this_one_and_its_snapshot_is_not_restored_on_a_third(
+    mimopilot, monkeypatch, certified, old, new
+):
+    vehicle = connect(monkeypatch, ScriptedCrazyflie(old | {"MIMO_SET_ID": 7.0}))
+    assert vehicle.values[STATE] == ControllerState.OTHER_FIRMWARE
+    assert upload(mimopilot, certified).returncode == 0
+    assert vehicle.values[STATE] == ControllerState.FLIES
+    assert vehicle.stored["mimo.SET_ID"] == vehicle.values["mimo.FW_ID"] == new["MIMO_SET_ID"]
+    vehicle.values["mimo.FW_ID"] = 8.0
+    snapshot = certified.with_name("my.before-1.params")
+    refused = mimopilot("restore", snapshot, "--connect", URI, "--yes", "--timeout", "3")
+    assert_one_clear_line(refused, "MIMO_FW_ID: the vehicle has 8, the values are those of a firmware with 123456")
+
+
+def test_a_firmware_without_a_number_is_to_be_generated_again(mimopilot, monkeypatch, certified, old):
+    vehicle = connect(monkeypatch, ScriptedCrazyflie(old))
+    vehicle.names = [name for name in vehicle.names if not name.endswith("_ID")]
+    refused = upload(mimopilot, certified)
+    assert_one_clear_line(refused, "MIMO_FW_ID: the vehicle does not have it", "generate it again", code=1)
     assert vehicle.writes == 0
 
 

@@ -33,7 +33,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
 )
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.parameters import PARAMETERS
+from mimopilot.tuning.parameters import FIRMWARE_NUMBER, PARAMETERS, SET_NUMBER
 from tests.sitl.mavlink.flying_vehicle import FlyingVehicle
 from tests.sitl.mavlink.log_transfer.logging_vehicle import ScriptedLogs
 from tests.sitl.mavlink.scripted_vehicle import SYSTEM, SimulatedLink
@@ -86,8 +86,9 @@ class FieldVehicle(FlyingVehicle):
     def __init__(self, **keywords):
         gains = first_gains()
         fixed = {p.name: gains.elements()[p.code] for p in PARAMETERS if not p.writable}
-        scale = gains.identity()
-        super().__init__(**{**make_plan(gains).values, **fixed, **scale}, **keywords)
+        published = {**gains.identity(), FIRMWARE_NUMBER.name: 123456.0}
+        values = {**make_plan(gains).values, SET_NUMBER.name: 0.0, **fixed, **published}
+        super().__init__(**values, **keywords)
         self.autopilot, self.free = 0, None
         self.stored_values = dict(self.values)
         self.logs = ScriptedLogs({})

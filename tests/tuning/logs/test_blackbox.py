@@ -187,6 +187,49 @@ def test_what_a_log_lacks_is_told_with_the_setting(flight, tmp_path, lost, messa
         read_log(write_decoded(tmp_path / "lacks.csv", columns))
 
 
+def another_log(text):
+    header, _, rows = text.partition("\n")
+    return f"{text}{header}\n{rows}"
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (
+            lambda text: text.replace(".", ",").replace(", ", ";"),
+            "separated by semicolons, so a spreadsheet has written",
+        ),
+        (lambda text: text.replace(", ", "\t"), "separated by tabs"),
+        (another_log, "another log begins at line 502; give each log in a file of its own"),
+        (lambda text: text + text.partition("\n")[2], "the time begins again at row 501 below the column names"),
+        (
+            lambda _: "\xff" * 20 + "H Product:Blackbox flight data\nH Field I name:loopIteration\n",
+            "a Betaflight log; make",
+        ),
+        (lambda _: "time (us), GPS_fixType, GPS_numSat\n1, 2, 3\n", "the positions of a blackbox log"),
+        (lambda _: '{"name":"Sync beep", "time":1}\n', "the events of a blackbox log"),
+    ],
+)
+def test_what_is_no_table_of_one_log_is_refused_with_its_true_cause(flight, tmp_path, change, reason):
+    path = write_decoded(tmp_path / "log.csv", table(short(flight)))
+    path.write_text(change(path.read_text()), "latin-1")
+    with pytest.raises(TuningError, match=reason):
+        open_log(path)
+
+
+def test_a_wrong_time_stamp_is_not_another_log_and_merged_positions_change_nothing(flight, tmp_path):
+    columns = table(short(flight))
+    columns["time"][100] += 5e6
+    path = write_decoded(tmp_path / "log.csv", columns | {"GPS_speed": columns["time"] * 0}, units={"GPS_speed": "m/s"})
+    assert len(open_log(path).signals["u"].time) == len(columns["time"]) - 1
+
+
+def test_a_log_without_setpoints_says_so(flight, tmp_path):
+    columns = {name: column for name, column in table(flight).items() if not name.startswith("setpoint")}
+    found = read_log(write_decoded(tmp_path / "log.csv", columns))
+    assert any("no setpoint[0] to setpoint[2], so no excitation" in one for one in found.warnings)
+
+
 def test_a_slow_log_is_refused(flight, tmp_path):
     columns = {name: column[::10] for name, column in table(flight).items()}
     with pytest.raises(TuningError, match=r"too slow: .* 50\.0 Hz.*blackbox_sample_rate"):

@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from mimopilot.tuning.crazyflie_names import LOG_VARIABLES
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.logs.crazyflie import LAYOUTS, YAW_LAYOUTS, record_usd
+from mimopilot.tuning.logs.crazyflie_file import read_usd_log
 from mimopilot.tuning.logs.inspection import inspect_log
-from mimopilot.tuning.logs.reader import open_log, read_log
+from mimopilot.tuning.logs.reader import open_log, read_log, unchecked_experiment
 from tests.conftest import assert_one_clear_line
 from tests.tuning.logs.crazyflie_logs import mimo_variables, stock_variables, usd_bytes, write_csv_block
 from tests.tuning.logs.flights import make_flight, pulses
@@ -145,6 +146,32 @@ def test_a_switch_off_that_waits_for_the_ground_still_flies_our_controller(flown
     assert "u" in found.signals and not found.warnings and len(found.airborne) == 2
 
 
+def test_what_flew_while_a_switch_waits_from_the_begin_of_the_log_on_is_not_known(flown_twice):
+    found, _ = flown_twice(4, 4, between=4)
+    assert "u" not in found.signals and any("state is 4 from the begin of the log on" in one for one in found.warnings)
+    found, begin = flown_twice(4, 1)  # off on the ground
+    assert found.airborne == ((pytest.approx(begin + 5.0, abs=0.003), np.inf),)
+    assert any("does not tell whether our controller flew" in one and "not used" in one for one in found.warnings)
+
+
+def test_a_set_stored_for_another_firmware_leaves_the_stock_pid_flying(flown_twice):
+    found, _ = flown_twice(6, 6, between=6)
+    assert "u" not in found.signals and any("the stock PID flew" in one for one in found.warnings)
+
+
+def test_a_part_that_flies_rates_has_no_attitude_setpoint_and_is_not_used(flight, tmp_path):
+    variables, rates = mimo_variables(flight), (flight.t > flight.t[0] + 5.0) & (flight.t < flight.t[0] + 7.0)
+    for name in ("mimo.rollSp", "mimo.pitchSp"):
+        variables[name] = "f", np.where(rates, np.nan, variables[name][1])
+    found = unchecked_experiment(open_log(written(tmp_path / "log01", usd_bytes(flight.t, variables))))
+    (_, before), (after, _) = found.segments
+    assert after - before == np.count_nonzero(rates)
+    assert any("rollSp is NaN for 25 % of the log: rates were flown" in one for one in found.warnings)
+    variables |= {name: ("f", np.full(len(flight.t), np.nan)) for name in ("mimo.rollSp", "mimo.pitchSp")}
+    found = read_log(written(tmp_path / "log02", usd_bytes(flight.t, variables)))
+    assert found.r_o is None and any("NaN for 100 % of the log: rates" in one for one in found.warnings)
+
+
 @pytest.mark.parametrize(("state", "why"), [(2, "a parameter had changed since"), (3, "the parameters were refused")])
 def test_a_log_of_another_set_than_the_parameters_says_so(flown_twice, state, why):
     found, _ = flown_twice(state, state, between=state)
@@ -195,6 +222,53 @@ def test_a_slow_or_incomplete_block_is_refused_with_what_to_do(flight, tmp_path)
     with pytest.raises(TuningError, match=r"lacks mimo.uR and mimo.uP or .*gyro.x and gyro.y"):
         read_log(path)
     assert inspect_log(path).seconds == pytest.approx(0.01)
+
+
+def rearranged(text):
+    return "".join(",".join([*cells[1:], cells[0]]) + "\n" for cells in (line.split(",") for line in text.splitlines()))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda text: "\ufeff" + text.replace("\n", "\r\n"),
+        lambda text: text.replace(",", ";").replace(".", ",").replace("mimo,", "mimo."),  # with a decimal comma
+        lambda text: text.replace(",", "\t"),
+        lambda text: '"' + text.strip().replace(",", '","').replace("\n", '"\n"') + '"\n',
+        rearranged,
+    ],
+)
+def test_a_csv_file_that_a_spreadsheet_has_written_is_the_same(flight, tmp_path, change):
+    path = write_csv_block(tmp_path / "a.csv", flight.t, mimo_variables(flight), every=5)
+    expected = open_log(path)
+    path.write_text(change(path.read_text()), "utf-8")
+    found = open_log(path)
+    assert found.signals.keys() == expected.signals.keys()
+    for name, series in found.signals.items():
+        assert (series.values == expected.signals[name].values).all()
+        assert (series.time == expected.signals[name].time).all()
+
+
+def test_a_csv_file_of_two_logs_or_with_ambiguous_commas_is_refused(flight, tmp_path):
+    path = write_csv_block(tmp_path / "a.csv", flight.t, mimo_variables(flight), every=100)
+    text = path.read_text()
+    path.write_text(text + text)
+    with pytest.raises(TuningError, match="another log begins at line 42"):
+        open_log(path)
+    path.write_text(text.replace(".", ",").replace("mimo,", "mimo."))
+    with pytest.raises(TuningError, match=r"line 2: its numbers have a decimal comma, the mark that separates"):
+        open_log(path)
+
+
+def test_time_stamps_of_an_sd_card_log_that_begin_again_go_on(flight, tmp_path):
+    data = bytearray(usd_bytes(flight.t, {"mimo.p": ("f", flight.y_i[:, 0])}, version=1))
+    row = struct.calcsize("<HIf")
+    for place in range(len(data) - 4 - row * len(flight.t), len(data) - 4, row):
+        (time,) = struct.unpack_from("<I", data, place + 2)
+        struct.pack_into("<I", data, place + 2, (time - 15_000) % 2**32)
+    data[-4:] = struct.pack("<I", zlib.crc32(data[:-4]))
+    (block,) = read_usd_log(written(tmp_path / "log00", bytes(data)))
+    assert np.diff(block.time) == pytest.approx(np.full(len(flight.t) - 1, 0.002), abs=0.0011)
 
 
 def test_a_csv_file_that_ends_within_a_line_is_used_up_to_there_and_other_damage_is_refused(flight, tmp_path):

@@ -12,7 +12,7 @@ from mimopilot.sitl.mavlink.ground_station.profiles import make_plan
 from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.gains_file import load_gains
-from mimopilot.tuning.parameters import PARAMETERS
+from mimopilot.tuning.parameters import FIRMWARE_NUMBER, PARAMETERS
 from tests.conftest import assert_one_clear_line, stock_gains
 from tests.readable import Printed
 from tests.sitl.mavlink.running import PATIENCE_S, QUICK, Pilot, running_sitl, wait_for
@@ -24,7 +24,9 @@ from tests.sitl.mavlink.scripted_vehicle import (
     UdpVehicle,
 )
 
-WRITTEN = sum(parameter.writable for parameter in PARAMETERS)
+#: What an upload writes, and a snapshot saves.
+WRITTEN = sum(parameter.writable for parameter in PARAMETERS) + 1
+SAVED = [*(p.name for p in (*PARAMETERS, FIRMWARE_NUMBER) if p.writable or p is FIRMWARE_NUMBER), "MIMO_SET_ID"]
 
 
 KEY = bytes(range(32))
@@ -58,7 +60,7 @@ def test_gains_arrive_over_udp_tcp_and_serial(mimopilot, certified, old, new, tr
     assert f"{verified}; stored: the vehicle acknowledged it" in done.stdout
     assert "MIMO_RP_RR" in done.stdout
     assert done.stderr == ""
-    assert read_parameters(certified.with_name("my.before-1.params")) == named(old, new)
+    assert read_parameters(certified.with_name("my.before-1.params")) == named(old, SAVED)
 
 
 def test_a_dry_run_only_reads(mimopilot, certified, old, tmp_path, monkeypatch):
@@ -243,16 +245,17 @@ def test_an_older_snapshot_is_never_overwritten(mimopilot, certified, old, new, 
         assert not (tmp_path / "my.before-3.params").exists()
         restored = mimopilot("restore", "my.before-1.params", "--connect", link.url, "--yes")
         assert restored.returncode == 0
-        assert read_parameters(tmp_path / "my.before-3.params") == named(new, new)
-    assert read_parameters(tmp_path / "mine.params") == named(old, new)
-    assert read_parameters(tmp_path / "my.before-1.params") == named(old, new)
-    assert read_parameters(tmp_path / "my.before-2.params") == named(new, new) | {"MIMO_RP_RR": 0.5}
+        assert read_parameters(tmp_path / "my.before-3.params") == new | named(old, ["MIMO_FW_ID"])
+    assert read_parameters(tmp_path / "mine.params") == named(old, SAVED)
+    assert read_parameters(tmp_path / "my.before-1.params") == named(old, SAVED)
+    assert read_parameters(tmp_path / "my.before-2.params") == named(old | new, SAVED) | {"MIMO_RP_RR": 0.5}
 
 
 def test_parameter_files_are_written_compared_and_read_from_a_vehicle(mimopilot, certified, old, new, tmp_path):
+    gains_only = [parameter.name for parameter in PARAMETERS if parameter.writable]
     for form in ("qgc", "mavproxy", "missionplanner"):
         assert mimopilot("params", certified, "--format", form, "--out", f"{form}.txt").returncode == 0
-        assert read_parameters(tmp_path / f"{form}.txt") == new
+        assert read_parameters(tmp_path / f"{form}.txt") == named(new, gains_only)
     assert mimopilot("params", certified, "--format", "mavproxy").stdout == (tmp_path / "mavproxy.txt").read_text()
     header = mimopilot("params", certified, "--format", "c-header").stdout
     assert header == render(load_gains(certified))["core/parameters.h"]
@@ -260,10 +263,10 @@ def test_parameter_files_are_written_compared_and_read_from_a_vehicle(mimopilot,
     assert module == render(load_gains(certified), "px4")["px4/src/modules/mc_mimo_pid/module.yaml"]
     with UdpVehicle(ScriptedVehicle(old)) as link:
         assert mimopilot("params", "--connect", link.url, "--out", "held.params").returncode == 0
-        assert read_parameters(tmp_path / "held.params") == named(old, new)
+        assert read_parameters(tmp_path / "held.params") == named(old, gains_only)
         differ = mimopilot("params", certified, "--connect", link.url)
         assert "MIMO_RP_RR" in differ.stdout
-        assert_one_clear_line(differ, f"{WRITTEN} of {len(PARAMETERS)} parameters differ", code=1)
+        assert_one_clear_line(differ, f"{len(gains_only)} of {len(PARAMETERS)} parameters differ", code=1)
         link.vehicle.values.update(new)
         same = mimopilot("params", certified, "--connect", link.url, "--json")
         assert (same.returncode, json.loads(same.stdout)["equal"]) == (0, True)
@@ -291,7 +294,7 @@ def test_our_sitl_accepts_gains_in_flight_only_if_forced(mimopilot, tmp_path):
         assert len(json.loads(same.stdout)["parameters"]) == len(PARAMETERS)
         back = mimopilot("restore", found["snapshot"], "--connect", url, "--yes", "--force-armed")
         assert back.returncode == 0
-        assert "3 of them written" in back.stdout
+        assert "4 of them written" in back.stdout  # with the number of the firmware
         while pilot.take(0.0) is not None:
             pass  # empty the receive buffer, which would overflow
         assert pilot.command(400, 0) == 0

@@ -19,7 +19,8 @@ from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
 from tests.sitl.mavlink.running import wait_for
 
-ALL = len(PARAMETERS + IDENTITY + EXCITATION)
+#: Also the numbers of the firmware and of the stored set.
+ALL = len(PARAMETERS + IDENTITY + EXCITATION) + 2
 
 
 def start(store=None):
@@ -120,7 +121,7 @@ def test_changed_parameters_and_no_others_survive_a_restart(tmp_path):
     server.write("MIMO_EX_AMP", 0.2, 9)
     server.write("MIMO_EX_AX", 3.0, 9)
     held = close_and_read(server)
-    fixed = {"MIMO_TS", *(p.name for p in IDENTITY)}
+    fixed = {"MIMO_TS", "MIMO_FW_ID", *(p.name for p in IDENTITY)}
     assert set(held) == fixed | {"MIMO_RP_RR", "MIMO_EX_AMP"}
 
     again = start(ParameterStore(path))

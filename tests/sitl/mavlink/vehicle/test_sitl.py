@@ -197,7 +197,7 @@ def test_mavproxy_connects_without_an_error_sets_parameters_and_flies(tmp_path, 
         modules = "--default-modules=param,link,arm,mode,cmdlong"
         proxy = Program(sys.executable, "-m", "MAVProxy.mavproxy", f"--master={address}", modules, cwd=tmp_path)
         try:
-            proxy.until(f"Received {len(PARAMETERS + IDENTITY + EXCITATION)} parameters")
+            proxy.until(f"Received {len(PARAMETERS + IDENTITY + EXCITATION) + 2} parameters")
             for word in ("rror", "imeout", "raceback"):
                 assert word not in proxy.output.replace("no tty", "")
             proxy.say("param set MIMO_RP_RR 0.12")

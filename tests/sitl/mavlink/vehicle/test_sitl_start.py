@@ -7,12 +7,12 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from mimopilot.sitl.mavlink.wire.sockets import listen
-from mimopilot.tuning.parameters import EXCITATION, IDENTITY, PARAMETERS
+from mimopilot.tuning.parameters import EXCITATION, FIRMWARE_NUMBER, IDENTITY, PARAMETERS, SET_NUMBER
 from tests.conftest import assert_one_clear_line
 from tests.sitl.mavlink.running import Pilot, free_port, running_sitl
 
 ACCEPTED, UNSUPPORTED = 0, 3
-TABLE = [*PARAMETERS, *IDENTITY, *EXCITATION]
+TABLE = [*PARAMETERS, *IDENTITY, FIRMWARE_NUMBER, *EXCITATION, SET_NUMBER]
 
 
 @pytest.fixture(scope="module")

@@ -362,68 +362,82 @@ const AP_Param::GroupInfo AC_CustomControl_MIMO::var_info[] = {
 	// @User: Advanced
 	AP_GROUPINFO("SCALE_Y", 51, AC_CustomControl_MIMO, _values[50], 0.2736F),
 
+	// @Param: FW_ID
+	// @DisplayName: number of the firmware's gains
+	// @Description: number of the firmware's gains. Fixed in the firmware, for checking only.
+	// @Range: 68312 68312
+	// @User: Advanced
+	AP_GROUPINFO("FW_ID", 61, AC_CustomControl_MIMO, _values[51], 68312.0F),
+
 	// @Param: EX_AX
 	// @DisplayName: excite once: 1 roll, 2 pitch, 3 both, 4 yaw, 5 all, one by one
 	// @Description: excite once: 1 roll, 2 pitch, 3 both, 4 yaw, 5 all, one by one.
 	// @Range: 0 5
 	// @User: Advanced
-	AP_GROUPINFO("EX_AX", 52, AC_CustomControl_MIMO, _values[51], 0.0F),
+	AP_GROUPINFO("EX_AX", 52, AC_CustomControl_MIMO, _values[52], 0.0F),
 
 	// @Param: EX_AMP
 	// @DisplayName: excitation: amplitude on roll and pitch
 	// @Description: excitation: amplitude on roll and pitch.
 	// @Range: 0 0.5
 	// @User: Advanced
-	AP_GROUPINFO("EX_AMP", 53, AC_CustomControl_MIMO, _values[52], 0.1F),
+	AP_GROUPINFO("EX_AMP", 53, AC_CustomControl_MIMO, _values[53], 0.1F),
 
 	// @Param: EX_AMPY
 	// @DisplayName: excitation: amplitude on yaw
 	// @Description: excitation: amplitude on yaw.
 	// @Range: 0 0.5
 	// @User: Advanced
-	AP_GROUPINFO("EX_AMPY", 54, AC_CustomControl_MIMO, _values[53], 0.2F),
+	AP_GROUPINFO("EX_AMPY", 54, AC_CustomControl_MIMO, _values[54], 0.2F),
 
 	// @Param: EX_HMIN
 	// @DisplayName: excitation: shortest pulse, control periods
 	// @Description: excitation: shortest pulse, control periods.
 	// @Range: 1 10000
 	// @User: Advanced
-	AP_GROUPINFO("EX_HMIN", 55, AC_CustomControl_MIMO, _values[54], 10.0F),
+	AP_GROUPINFO("EX_HMIN", 55, AC_CustomControl_MIMO, _values[55], 10.0F),
 
 	// @Param: EX_HMAX
 	// @DisplayName: excitation: longest pulse, control periods
 	// @Description: excitation: longest pulse, control periods.
 	// @Range: 1 10000
 	// @User: Advanced
-	AP_GROUPINFO("EX_HMAX", 56, AC_CustomControl_MIMO, _values[55], 60.0F),
+	AP_GROUPINFO("EX_HMAX", 56, AC_CustomControl_MIMO, _values[56], 60.0F),
 
 	// @Param: EX_DUR
 	// @DisplayName: excitation: time on each axis
 	// @Description: excitation: time on each axis, s.
 	// @Range: 0.1 300
 	// @User: Advanced
-	AP_GROUPINFO("EX_DUR", 57, AC_CustomControl_MIMO, _values[56], 16.0F),
+	AP_GROUPINFO("EX_DUR", 57, AC_CustomControl_MIMO, _values[57], 16.0F),
 
 	// @Param: EX_SEED
 	// @DisplayName: excitation: seed of the pulses
 	// @Description: excitation: seed of the pulses.
 	// @Range: 0 1e+06
 	// @User: Advanced
-	AP_GROUPINFO("EX_SEED", 58, AC_CustomControl_MIMO, _values[57], 1.0F),
+	AP_GROUPINFO("EX_SEED", 58, AC_CustomControl_MIMO, _values[58], 1.0F),
 
 	// @Param: EX_MODE
 	// @DisplayName: excitation: only in this flight mode (2 AltHold, 5 Loiter)
 	// @Description: excitation: only in this flight mode (2 AltHold, 5 Loiter).
 	// @Range: 0 30
 	// @User: Advanced
-	AP_GROUPINFO("EX_MODE", 59, AC_CustomControl_MIMO, _values[58], 5.0F),
+	AP_GROUPINFO("EX_MODE", 59, AC_CustomControl_MIMO, _values[59], 5.0F),
 
 	// @Param: EX_TILT
 	// @DisplayName: excitation: stop above this tilt
 	// @Description: excitation: stop above this tilt, rad.
 	// @Range: 0.05 1
 	// @User: Advanced
-	AP_GROUPINFO("EX_TILT", 60, AC_CustomControl_MIMO, _values[59], 0.5F),
+	AP_GROUPINFO("EX_TILT", 60, AC_CustomControl_MIMO, _values[60], 0.5F),
+
+	// @Param: SET_ID
+	// @DisplayName: FW_ID of the firmware that the stored parameters are for; 0: none
+	// @Description: FW_ID of the firmware that the stored parameters are for; 0: none.
+	// @Range: 0 999999
+	// @User: Advanced
+	AP_GROUPINFO("SET_ID", 62, AC_CustomControl_MIMO, _values[61], 0.0F),
 
 	AP_GROUPEND
 };

@@ -5,6 +5,7 @@
 #include "FreeRTOS.h"
 #include "task.h"
 
+#include "debug.h"
 #include "log.h"
 #include "param.h"
 
@@ -62,6 +63,7 @@ struct MimoParameters mimo_parameters = {
 	.SCALE_R = 0.0078F,
 	.SCALE_P = 0.0075F,
 	.SCALE_Y = 0.0017F,
+	.FW_ID = 713050.0F,
 	.EX_AX = 0.0F,
 	.EX_AMP = 0.1F,
 	.EX_AMPY = 0.2F,
@@ -70,15 +72,35 @@ struct MimoParameters mimo_parameters = {
 	.EX_DUR = 16.0F,
 	.EX_SEED = 1.0F,
 	.EX_TILT = 0.5F,
+	.SET_ID = 0.0F,
 	.EN = 0.0F,
 };
 
 struct MimoLog mimo_log;
 
-// The firmware wants a main function of an app; this one has no more to do.
+// The firmware wants a main function of an app: this one tells on the console why another controller flies.
 void appMain(void)
 {
-	while (1) { vTaskDelay(M2T(60000)); }
+	uint8_t told = kMimoStock;
+
+	while (1) {
+		vTaskDelay(M2T(500));
+		const uint8_t state = mimo_log.state;
+
+		if (state == told) { continue; }
+
+		told = state;
+
+		if (state == kMimoOtherFirmware) {
+			DEBUG_PRINT("mimo.SET_ID is not 713050: stored for another firmware, stock PID flies\n");
+
+		} else if (state == kMimoRefused) {
+			DEBUG_PRINT("parameter %d of the table is out of its range\n", mimo_log.refused);
+
+		} else if (state == kMimoWrongPeriod) {
+			DEBUG_PRINT("gains are not for this control rate, no thrust\n");
+		}
+	}
 }
 
 PARAM_GROUP_START(mimo)
@@ -133,6 +155,7 @@ PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, M_OMEGA, &mimo_parameters.M_OMEGA)
 PARAM_ADD(PARAM_FLOAT | PARAM_RONLY, SCALE_R, &mimo_parameters.SCALE_R)
 PARAM_ADD(PARAM_FLOAT | PARAM_RONLY, SCALE_P, &mimo_parameters.SCALE_P)
 PARAM_ADD(PARAM_FLOAT | PARAM_RONLY, SCALE_Y, &mimo_parameters.SCALE_Y)
+PARAM_ADD(PARAM_FLOAT | PARAM_RONLY, FW_ID, &mimo_parameters.FW_ID)
 PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, EX_AX, &mimo_parameters.EX_AX)
 PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, EX_AMP, &mimo_parameters.EX_AMP)
 PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, EX_AMPY, &mimo_parameters.EX_AMPY)
@@ -141,6 +164,7 @@ PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, EX_HMAX, &mimo_parameters.EX_HMAX)
 PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, EX_DUR, &mimo_parameters.EX_DUR)
 PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, EX_SEED, &mimo_parameters.EX_SEED)
 PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, EX_TILT, &mimo_parameters.EX_TILT)
+PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, SET_ID, &mimo_parameters.SET_ID)
 PARAM_ADD(PARAM_FLOAT | PARAM_PERSISTENT, EN, &mimo_parameters.EN)
 PARAM_ADD(PARAM_UINT8 | PARAM_RONLY, STATE, &mimo_log.state)
 PARAM_GROUP_STOP(mimo)

@@ -28,8 +28,6 @@ namespace
 // N m of u = 1: roll, pitch, yaw.
 constexpr float kMomentScale[kAxes] = {0.0078F, 0.0075F, 0.0017F};
 
-constexpr Motors kMotors = {ARM_LENGTH, THRUST2TORQUE, THRUST_MAX};
-
 // The gains have a fixed period, and the firmware's is the same to 5 % of it.
 constexpr float kPeriods = 1.0F / (kGains.period * ATTITUDE_RATE);
 constexpr bool kPeriodKept = kPeriods > 0.95F && kPeriods < 1.05F;
@@ -101,7 +99,9 @@ void actuate(control_t &control, float thrust)
 {
 	float torque[kAxes];
 	torque_to_flu(flight.output.moment, kMomentScale, torque);
-	unallocated(thrust, torque, kMotors, flight.input.saturation);
+	// The parameter of the idle thrust may change.
+	const float least = thrust_to_newton(static_cast<float>(powerDistributionGetIdleThrust()), THRUST_MAX);
+	unallocated(thrust, torque, {ARM_LENGTH, THRUST2TORQUE, THRUST_MAX, least}, flight.input.saturation);
 	control.controlMode = controlModeForceTorque;
 	control.thrustSi = thrust;
 	control.torqueX = torque[0];
@@ -158,9 +158,10 @@ void log()
 	log.pitch = angles[1];
 	log.yaw = angles[2];
 	angles_of(flight.state.attitude_setpoint, angles);
-	log.rollSp = angles[0];
-	log.pitchSp = angles[1];
-	log.yawSp = angles[2];
+	const bool rates_flown = input.rate_mode != 0;  // then the last attitude setpoint is not flown
+	log.rollSp = rates_flown ? NAN : angles[0];
+	log.pitchSp = rates_flown ? NAN : angles[1];
+	log.yawSp = rates_flown ? NAN : angles[2];
 	log.phase = static_cast<int8_t>(flight.excitation.phase());
 	log.end = static_cast<uint8_t>(flight.excitation.end());
 	log.state = static_cast<uint8_t>(flight.take.state());

@@ -61,6 +61,7 @@ struct MimoParameters {
 	float SCALE_R;  // torque of u = 1, roll, N m
 	float SCALE_P;  // torque of u = 1, pitch, N m
 	float SCALE_Y;  // torque of u = 1, yaw, N m
+	float FW_ID;  // number of the firmware's gains
 	float EX_AX;  // excite once: 1 roll, 2 pitch, 3 both, 4 yaw, 5 all, one by one
 	float EX_AMP;  // excitation: amplitude on roll and pitch, norm
 	float EX_AMPY;  // excitation: amplitude on yaw, norm
@@ -69,6 +70,7 @@ struct MimoParameters {
 	float EX_DUR;  // excitation: time on each axis, s
 	float EX_SEED;  // excitation: seed of the pulses
 	float EX_TILT;  // excitation: stop above this tilt, rad
+	float SET_ID;  // FW_ID of the firmware that the stored parameters are for; 0: none
 	float EN;  // 1: this controller flies; 0: the stock PID; taken on the ground
 };
 
@@ -79,6 +81,7 @@ enum MimoState {
 	kMimoRefused = 3,
 	kMimoWaiting = 4,
 	kMimoWrongPeriod = 5,
+	kMimoOtherFirmware = 6,
 };
 
 // SI units; body x forward, y right, z down.
@@ -98,9 +101,9 @@ struct MimoLog {
 	float roll;  // attitude, rad
 	float pitch;  // attitude, rad
 	float yaw;  // attitude, rad
-	float rollSp;  // attitude setpoint that is flown, rad
-	float pitchSp;  // attitude setpoint that is flown, rad
-	float yawSp;  // attitude setpoint that is flown, rad
+	float rollSp;  // attitude setpoint; NaN: rates are flown, rad
+	float pitchSp;  // attitude setpoint; NaN: rates are flown, rad
+	float yawSp;  // attitude setpoint; NaN: rates are flown, rad
 	int8_t phase;  // excitation: -2 waits, -1 off, 0 roll, 1 pitch, 2 pause, 3 yaw
 	uint8_t end;  // how the last excitation ended
 	uint8_t state;  // what flies, see STATE

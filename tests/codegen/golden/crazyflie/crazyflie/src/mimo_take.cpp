@@ -4,6 +4,7 @@
 #include <string.h>
 
 #include "gain_limits.hpp"
+#include "stored_set.hpp"
 
 namespace mimopilot
 {
@@ -43,8 +44,11 @@ void Take::take(const MimoParameters &parameters, State &controller)
 {
 	Gains gains;
 	_refused = read(parameters, gains);
+	_foreign = !for_this_firmware(gains, parameters.SET_ID);
 
-	if (_refused == 0 && !set_gains(controller, gains)) { _refused = kGainCount + 1; }
+	if (_foreign) { _refused = 0; }
+
+	if (!_foreign && _refused == 0 && !set_gains(controller, gains)) { _refused = kGainCount + 1; }
 
 	memcpy(&_taken, &parameters, sizeof(_taken));
 }
@@ -62,10 +66,13 @@ bool Take::step(const MimoParameters &parameters, bool flying, State &controller
 			_asked = false;
 		}
 
-		_flies = wanted;
+		_flies = wanted && !_foreign;
 	}
 
-	if (wanted != _flies || (wanted && _asked)) {
+	if (wanted && _foreign && !_asked) {
+		_state = kMimoOtherFirmware;
+
+	} else if (wanted != _flies || (wanted && _asked)) {
 		_state = kMimoWaiting;
 
 	} else if (!wanted) {

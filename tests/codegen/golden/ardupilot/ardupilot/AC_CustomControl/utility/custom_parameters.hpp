@@ -13,6 +13,7 @@ enum Place {
 	SCALE_R = kGainCount,
 	SCALE_P,
 	SCALE_Y,
+	FW_ID,
 	EX_AX,
 	EX_AMP,
 	EX_AMPY,
@@ -22,6 +23,7 @@ enum Place {
 	EX_SEED,
 	EX_MODE,
 	EX_TILT,
+	SET_ID,
 	kValueCount
 };
 
@@ -30,10 +32,11 @@ constexpr float kPublished[] = {
 	2.54592F,  // SCALE_R
 	2.54592F,  // SCALE_P
 	0.2736F,  // SCALE_Y
+	68312.0F,  // FW_ID
 };
 
-// Those that are no settings of the excitation.
-constexpr int kLimited = kGainCount + 3;
+// Those that are no settings.
+constexpr int kLimited = kGainCount + 4;
 
 // Whether one of these may have this value; what is fixed in the firmware has one.
 inline bool allowed(int place, float value)

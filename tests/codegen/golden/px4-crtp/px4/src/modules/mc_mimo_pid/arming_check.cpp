@@ -54,10 +54,11 @@ Obstacle wrong_parameter()
 {
 	/* EVENT
 	 * @description
-	 * The console names the parameter.
+	 * The console names the parameter: a gain out of its range, or <param>MIMO_SET_ID</param>, which is not
+	 * 972901: the stored gains were written for another firmware. Upload gains.
 	 */
 	return reporter.armingCheckFailureExt(events::ID("mimo_parameter"), events::Log::Error,
-					      "MIMO: a gain is out of its range");
+					      "MIMO: a gain or MIMO_SET_ID is wrong");
 }
 
 void ArmingCheck::ask(uint64_t now)

@@ -14,8 +14,9 @@ public:
 	// Marks all as in use: a log keeps no others.
 	Parameters();
 
-	// Reads all. Returns null, or the name of the first gain out of its range, because PX4 stores any value; `gains` is
-	// then of no use. What is fixed in the firmware stays so.
+	// Reads all. Returns null, or the name of the first gain out of its range, because PX4 stores any value, or
+	// MIMO_SET_ID if the gains were stored for another firmware; `gains` is then of no use. What is fixed in the firmware
+	// stays so.
 	const char *read(Gains &gains);
 
 	// The gains in the firmware.
@@ -36,6 +37,7 @@ private:
 		MIMO_EX_SEED,
 		MIMO_EX_MODE,
 		MIMO_EX_TILT,
+		MIMO_SET_ID,
 		MIMO_EN,
 		kSettingCount
 	};

@@ -54,13 +54,11 @@ void McMimoPid::update_parameters()
 	Gains gains;
 	_wrong_gain = _parameters.read(gains);
 
-	if (_wrong_gain != nullptr) {
-		PX4_ERR("%s is out of its range: no gain changed", _wrong_gain);
-
-	} else if (memcmp(&gains, &_state.gains, sizeof(gains)) != 0 && !set_gains(_state, gains)) {
-		_wrong_gain = "MIMO_SP_SLEW or MIMO_M_OMEGA";  // times the period
-		PX4_ERR("%s is too large for the gyro rate: no gain changed", _wrong_gain);
+	if (_wrong_gain == nullptr && memcmp(&gains, &_state.gains, sizeof(gains)) != 0 && !set_gains(_state, gains)) {
+		_wrong_gain = "MIMO_SP_SLEW or MIMO_M_OMEGA";  // too large for the period
 	}
+
+	if (_wrong_gain != nullptr) { PX4_ERR("%s is wrong: no gain changed", _wrong_gain); }
 
 	_excitation.configure(_parameters.excitation());
 	read(_settings);

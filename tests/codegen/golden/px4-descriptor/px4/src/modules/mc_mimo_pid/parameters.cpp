@@ -3,6 +3,7 @@
 
 #include "gain_limits.hpp"
 #include "parameter_value.hpp"
+#include "stored_set.hpp"
 
 namespace mimopilot
 {
@@ -69,10 +70,12 @@ constexpr px4::params kNames[] = {
 	px4::params::MIMO_EX_SEED,
 	px4::params::MIMO_EX_MODE,
 	px4::params::MIMO_EX_TILT,
+	px4::params::MIMO_SET_ID,
 	px4::params::MIMO_EN,
 	px4::params::MIMO_SCALE_R,
 	px4::params::MIMO_SCALE_P,
 	px4::params::MIMO_SCALE_Y,
+	px4::params::MIMO_FW_ID,
 };
 
 int32_t samples(float seconds)
@@ -108,7 +111,8 @@ const char *Parameters::read(Gains &gains)
 
 	for (int i = 0; i < kSettingCount; i++) { _settings[i] = parameter_value(kNames[kGainCount + i]); }
 
-	return wrong;
+	// PX4 stores values longer than a firmware.
+	return wrong != nullptr || for_this_firmware(gains, _settings[MIMO_SET_ID]) ? wrong : "MIMO_SET_ID";
 }
 
 ExcitationSettings Parameters::excitation() const
