@@ -45,7 +45,7 @@ def print_comparison(gains: Gains, logs: list[str]) -> None:
     if details.get("better_than_flown"):
         print_text("better than the gains that flew: tracking and off-axis motion, within the limits of Ms and noise")
         for trade_off in softer(details["predicted"]):
-            print_text(trade_off)
+            print_text(f"but {trade_off}")
     worth = details.get("worth_of_off_diagonals", {})
     for before, after in zip(worth.get("tuned", ()), worth.get("module", ()), strict=True):
         print_text(

@@ -55,7 +55,7 @@ def print_yaw(gains: Gains) -> None:
         if details.get("better_than_flown"):
             print_text("better than the yaw gains that flew")
             for trade_off in softer(details["predicted"]):
-                print_text(trade_off)
+                print_text(f"but {trade_off}")
     if "kept" in details:
         print_text(f"yaw: the gains are kept as they were: {details['kept']}")
     elif details["limited_by"]:

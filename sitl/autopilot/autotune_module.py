@@ -90,13 +90,16 @@ class AutotuneModule:
 
     def step(self, now: float, armed: bool, sticks: Sticks) -> Moment:
         """One control period: what is added to the rate setpoint (rad/s); `now` is the vehicle's clock, s."""
+        # Also while it waits: the values of a second run are published at the same times as those of the first.
+        published = now - self._published >= PUBLISHED_S - 1e-6 or now < self._published
+        if published:
+            self._published = now
         if self.state is State.IDLE and self.parameters[AUTOTUNE_START] == 0:
             return NO_MOMENT
         if not armed:
             return NO_MOMENT
         self._samples += 1
-        if now - self._published >= PUBLISHED_S - 1e-6 or now < self._published:
-            self._published = now
+        if published:
             self._update_state(now, sticks)
             self._value = self._next_value()
         return self._value

@@ -10,7 +10,7 @@ from mimopilot.common.console import print_table
 from mimopilot.sitl.field.autotune_report import CHECK_CAPTION, CHECKED, check_rows
 from mimopilot.sitl.field.autotune_run import FLIGHT
 from mimopilot.sitl.field.check_flight import CheckResult
-from mimopilot.tuning.design.prediction_rows import PREDICTED, predicted_rows
+from mimopilot.tuning.design.prediction_rows import PREDICTED, predicted_rows, softer
 from mimopilot.tuning.gains import Gains
 
 YES, NO = ("y", "yes"), ("n", "no")
@@ -56,6 +56,10 @@ class AutotuneTerminal:
             return
         title = "predicted, roll / pitch: RMS over doublets of 10 degrees, after a torque step, of the torque at hover"
         print_table(title, PREDICTED, predicted_rows(gains, [FLIGHT]))
+        details = gains.provenance.details
+        for part in (details, details.get("yaw", {})):
+            for trade_off in [] if "kept" in part else softer(part.get("predicted", {})):
+                print(f"with the new gains {trade_off}")
         verdict, reason = gains.verdict()
         print(f"certificate: {verdict}: {reason}", flush=True)
 

@@ -36,7 +36,7 @@ def softer(predicted: Mapping[str, Any]) -> list[str]:
     for new, flown in zip(predicted.get("tuned", ()), predicted.get("flown", ()), strict=False):
         after, before = (tuple(np.atleast_1d(one["disturbance_deg"]).tolist()) for one in (new, flown))
         if gives := giving_way(after, before):
-            found.append(f"but a step of torque moves it farther ({gives}, at Ms {flown['Ms']:.2f})")
+            found.append(f"a step of torque moves it farther ({gives}, at Ms {flown['Ms']:.2f})")
     return found
 
 

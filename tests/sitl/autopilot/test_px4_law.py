@@ -146,3 +146,18 @@ def test_a_stick_ends_the_autotune():
     assert any(moved[1990])
     assert not any(moved[2030])
     assert (module.state, values["MC_AT_START"]) == (State.IDLE, 0.0)
+
+
+def test_a_second_autotune_publishes_at_the_times_of_the_first():
+    """A log has its values at one interval; PX4 also publishes while it waits."""
+    values = {"MC_AT_START": 0.0, "MC_AT_SYSID_AMP": 2.0}
+    module, signal = AutotuneModule(values), []
+    for pause in (3, 39):  # control periods; the second is longer than 0.1 s and no multiple of it
+        end = len(signal) + pause
+        values["MC_AT_START"] = 0.0
+        while len(signal) < end or values["MC_AT_START"]:
+            signal.append(module.step((len(signal) + 1) * TS, True, HANDS_OFF)[0])
+            if len(signal) == end:
+                values["MC_AT_START"] = 1.0
+    changes = np.flatnonzero(np.diff(signal)) + 1
+    assert len(changes) > 100 and len(set((changes % 25).tolist())) == 1

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.design.conic_problem import ConicProblem
 from mimopilot.tuning.design.constraints import Cut, Definite, Distance, MotorLimit, NoiseLimit, ParameterRange
-from mimopilot.tuning.design.disturbance_limit import DisturbanceLimit
+from mimopilot.tuning.design.disturbance_limit import NEARLY_KEPT, ROOM, DisturbanceLimit, after_step, no_softer_than
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.design.rate_loop_gain import gain_above_band, structural_modes
@@ -105,6 +105,16 @@ def test_the_disturbance_of_the_next_step_is_that_of_moved_gains(plant, free):
     now = constraint.margin(LoopGradient(plant, free, vector))
     assert moved - now == pytest.approx(problem.least(step) - problem.least(0 * step), rel=0.01)
     assert problem.least(0 * step) == pytest.approx(now, abs=1e-9)
+
+
+def test_flown_gains_that_nearly_keep_the_constraints_limit_a_design(plant, free):
+    loop, step = LoopGradient(plant, free, free.vector(free.base)), np.full((len(plant.omega), 2), 1e-3)
+    noise = loop.noise_rms().max()
+    nearly, not_at_all = (NoiseLimit(np.full(2, noise / (1 - share * NEARLY_KEPT))) for share in (0.9, 1.1))
+    (limit,) = no_softer_than(loop, step, [constraints(plant)["derivative"], nearly])
+    assert limit.limit == pytest.approx(ROOM * after_step(loop, step))
+    assert limit.margin(loop) == pytest.approx(1 - 1 / ROOM)
+    assert no_softer_than(loop, step, [nearly, not_at_all]) == []
 
 
 def test_margins_are_relative_distances_to_the_limits(plant, free):
