@@ -44,10 +44,8 @@ class GroupEntry:
         As in ArduPilot's parameter documentation.
     index : int
         Place in the group, under which ArduPilot stores the value: the same for every gain set.
-    value, minimum, maximum : str
-        Default and limits; a parameter that is fixed in the firmware has one value.
-    setting : bool
-        Not a gain, and not published only.
+    value : str
+        Default.
     """
 
     name: str
@@ -56,9 +54,6 @@ class GroupEntry:
     range: str
     index: int
     value: str
-    minimum: str
-    maximum: str
-    setting: bool
 
 
 def group(gains: Gains) -> list[GroupEntry]:
@@ -101,9 +96,6 @@ def _entry(source: Parameter | Setting, value: float) -> GroupEntry:
         range=f"{low:g} {high:g}",
         index=INDEX[_name(source)],
         value=float_literal(value),
-        minimum=float_literal(low),
-        maximum=float_literal(high),
-        setting=isinstance(source, Setting),
     )
 
 
@@ -114,6 +106,7 @@ def context(gains: Gains) -> dict[str, Any]:
         "prefix": ARDUPILOT_PREFIX,
         "entries": entries,
         "places": [entry.name for entry in entries[len(PARAMETERS) :]],
+        "published": entries[len(PARAMETERS) : -len(ARDUPILOT_EXCITATION)],
         "settings": ARDUPILOT_EXCITATION,
         "indices": len(ORDER),
         "largest_index": LARGEST_INDEX,

@@ -270,7 +270,7 @@ def test_the_demo_runs_the_whole_workflow(mimopilot, tmp_path, monkeypatch):
         assert f'<div id="{chart}-0"' in page
     assert "<figure><svg" not in page
     # As in a flight's report: with the error, and the digits that it justifies; the design predicted the same.
-    row = re.search(r"roll: error to the model in doublets \[deg\]</td>(.*)</tr>", page)[1]
+    row = re.search(r"roll: tracking error in doublets \[deg\]</td>(.*)</tr>", page)[1]
     values = re.findall(r">([0-9.]+) \+- ([0-9.]+)<", row)
     predicted = load_gains(tmp_path / found["gains"]["mimo"]).provenance.details["predicted"]
     for name, (value, error) in zip(("flown", "siso", "tuned"), values, strict=True):

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import MOVES, SIGNALS, Experiment, excited_segments, external_signal, largest_move
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.parameter_row import AXES
 from mimopilot.tuning.parameters import MATRICES, YAW_GAINS
 

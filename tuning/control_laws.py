@@ -22,9 +22,3 @@ LAWS = {
 def control_law(filters: Filters) -> ControlLaw:
     """The law that a set of gains with these filters is for."""
     return LAWS[MIMO if filters.stock is None else filters.stock.controller]
-
-
-def least_attitude(filters: Filters) -> tuple[float, float, float]:
-    """Least Kp_o of a design, see `ControlLaw`; also of our law where the setpoint's rate is fed forward."""
-    fed_forward = filters.stock is None and filters.shaping_s
-    return (LAWS[ARDUPILOT_STOCK] if fed_forward else control_law(filters)).least_attitude

@@ -10,17 +10,10 @@ import numpy as np
 from scipy.linalg import block_diag, schur
 
 from mimopilot.tuning.errors import NotMinimumPhaseError
-from mimopilot.tuning.law import (
-    ERROR,
-    LOOP_TERMS,
-    RATE,
-    SINGULAR,
-    Filters,
-    Matrices,
-    Signal,
-    rate_matrices,
-    regressors,
-)
+from mimopilot.tuning.first_order_filter import Signal
+from mimopilot.tuning.law import SINGULAR, Matrices, rate_matrices, regressors
+from mimopilot.tuning.law_filters import Filters
+from mimopilot.tuning.law_terms import ERROR, LOOP_TERMS, RATE
 
 #: Remaining share of the unknown initial state at which the inverse counts as settled.
 SETTLED = 0.01

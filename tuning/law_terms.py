@@ -63,9 +63,6 @@ class ControlLaw:
         Keys of the parameter table that it does not have.
     largest : mapping
         Gain -> largest value that the autopilot accepts: roll, pitch, yaw. None: the ranges of our parameter table.
-    least_attitude : tuple of 3 float, 1/s
-        Least Kp_o of a design, unless the flown one is less: where the setpoint's rate is fed forward, following asks
-        for none, and the angle's error after a gust would stay long.
     step : mapping
         Gain -> value of 1 on an autopilot whose gains are whole numbers; empty: they are not.
     shared : tuple of str
@@ -80,7 +77,6 @@ class ControlLaw:
     filters: tuple[str, ...] = ()
     lacks: tuple[str, ...] = field(default=("derivative_cutoff_hz", "Kff_o", "Kaff_i", SLEW, "model_damping", MODEL))
     largest: Mapping[str, tuple[float, float, float]] | None = None
-    least_attitude: tuple[float, float, float] = (0.0, 0.0, 0.0)
     step: Mapping[str, float] = field(default_factory=dict)
     shared: tuple[str, ...] = ()
 

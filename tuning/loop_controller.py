@@ -9,7 +9,9 @@ import numpy as np
 
 from mimopilot.tuning import law
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law import LOOP_TERMS, Filters
+from mimopilot.tuning.law_filters import Filters
+from mimopilot.tuning.law_state_space import state_space
+from mimopilot.tuning.law_terms import ERROR, LOOP_TERMS, RATE, SETPOINT
 from mimopilot.tuning.statespace import Response, Signal, StateSpace
 
 
@@ -131,10 +133,10 @@ def closed_loop(plant: StateSpace, controller: LoopController) -> StateSpace:
         When the algebraic loop has no solution.
     """
     n, n_u, n_y = len(plant.A), plant.B.shape[1], len(plant.C)
-    flown = law.state_space(controller.gains, controller.filters)
+    flown = state_space(controller.gains, controller.filters)
     # u = C w + direct_r r - direct_y y, e = r - y
-    direct_r = flown.D[law.ERROR] + flown.D[law.SETPOINT]
-    direct_y = flown.D[law.ERROR] - flown.D[law.RATE]
+    direct_r = flown.D[ERROR] + flown.D[SETPOINT]
+    direct_y = flown.D[ERROR] - flown.D[RATE]
     loop = np.eye(n_u) + direct_y @ plant.D
     if np.linalg.cond(loop) > law.SINGULAR:
         raise TuningError("the algebraic loop of plant and controller has no solution: I + K D is singular")
@@ -145,8 +147,8 @@ def closed_loop(plant: StateSpace, controller: LoopController) -> StateSpace:
     y_x = np.hstack([plant.C, np.zeros((n_y, m))]) + plant.D @ u_x
     y_w = np.hstack([np.zeros((n_y, n_y + n_u)), np.eye(n_y)]) + plant.D @ u_w
     r_w = np.hstack([np.eye(n_y), np.zeros((n_y, n_u + n_y))])
-    of_x = {law.ERROR: -y_x, law.RATE: y_x, law.SETPOINT: np.zeros_like(y_x)}
-    of_w = {law.ERROR: r_w - y_w, law.RATE: y_w, law.SETPOINT: r_w}
+    of_x = {ERROR: -y_x, RATE: y_x, SETPOINT: np.zeros_like(y_x)}
+    of_w = {ERROR: r_w - y_w, RATE: y_w, SETPOINT: r_w}
     A = np.vstack(
         [
             np.hstack([plant.A, np.zeros((n, m))]) + plant.B @ u_x,

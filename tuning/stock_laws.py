@@ -121,8 +121,6 @@ ARDUPILOT_LAW = ControlLaw(
         "Kd_i": (0.05, 0.05, 0.02),
         "Kff_i": (0.5, 0.5, 0.5),
     },
-    # The same reference; not for yaw, whose torque is weak.
-    least_attitude=(3.0, 3.0, 0.0),
 )
 #: Hz: low-pass of the rate setpoint in Betaflight's angle mode, three first-order ones of a cut-off that many times
 #: higher (pid_init.c, ATTITUDE_CUTOFF_HZ; filter.h, CUTOFF_CORRECTION_PT3).

@@ -14,8 +14,9 @@ if TYPE_CHECKING:
 
 #: Title of the tables of predicted figures.
 PREDICTED_TITLE = (
-    "Predicted, roll / pitch. RMS in doublets of 10 degrees, 0.4 to 2 s: to the model\n"
-    "({model}) and of the other axis; after a step of torque; of the torque at hover"
+    "Predicted, roll / pitch. In doublets of 10 degrees, 0.4 to 2 s: RMS error to the\n"
+    "model ({model}), RMS off-axis angle; then RMS angle after a torque step,\n"
+    "and RMS torque at hover"
 )
 
 
@@ -41,10 +42,8 @@ def print_comparison(gains: Gains, logs: list[str]) -> None:
     model = f"{gains.provenance.outer_model[0].bandwidth:g} rad/s"
     print_table(PREDICTED_TITLE.format(model=model), PREDICTED, predicted_rows(gains, logs))
     if details.get("better_than_flown"):
-        print_text(
-            "better than the gains that flew: in following and on the other axis, within the limits of Ms and noise"
-        )
-        if trade_off := softer(gains):
+        print_text("better than the gains that flew: tracking and off-axis motion, within the limits of Ms and noise")
+        for trade_off in softer(details["predicted"]):
             print_text(trade_off)
     worth = details.get("worth_of_off_diagonals", {})
     for before, after in zip(worth.get("tuned", ()), worth.get("module", ()), strict=True):

@@ -30,6 +30,10 @@ ConnectOption = Annotated[
         "also a Crazyflie's radio://0/80/2M or usb://0.",
     ),
 ]
+CONTROLLERS = (
+    "Controller: mimo (our module), ardupilot-custom (our custom controller in ArduCopter), px4-stock or "
+    "ardupilot-stock (the autopilot's own)."
+)
 DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Only read and compare.")]
 ForceArmedOption = Annotated[
     bool, typer.Option("--force-armed", help="Write even to a vehicle that is or becomes armed.")
@@ -55,14 +59,7 @@ def register(app: typer.Typer) -> None:
 def upload(
     gains: GainsArgument,
     connect: ConnectOption,
-    profile: Annotated[
-        str | None,
-        typer.Option(
-            help="Controller: mimo (our module), ardupilot-custom (our custom controller in ArduCopter), px4-stock or "
-            "ardupilot-stock (the autopilot's own).",
-            show_default="mimo",
-        ),
-    ] = None,
+    profile: Annotated[str | None, typer.Option(help=CONTROLLERS, show_default="mimo")] = None,
     moment_scale: Annotated[
         str | None,
         typer.Option(
@@ -159,6 +156,7 @@ def params(
             help="qgc, mavproxy, missionplanner; for a gains file also c-header, px4-yaml, betaflight (its CLI).",
         ),
     ] = "qgc",
+    profile: Annotated[str | None, typer.Option(help=CONTROLLERS, show_default="that of the gains, else mimo")] = None,
     out: Annotated[Path | None, typer.Option(dir_okay=False, help="File to write; by default standard output.")] = None,
     uncertified: UncertifiedOption = False,
     timeout: TimeoutOption = 12.0,
@@ -175,11 +173,11 @@ def params(
     if gains is None or connect is None:
         if as_json:
             raise SitlError("--json: belongs to the comparison of a gains file with a vehicle")
-        export(gains, options, form, out, uncertified)
+        export(gains, options, form, out, uncertified, profile)
     elif out is not None:
         raise SitlError("--out: a comparison is printed; give either a gains file or --connect to write a file")
     else:
-        compare(gains, options)
+        compare(gains, options, profile)
 
 
 def logs(

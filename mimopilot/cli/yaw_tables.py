@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from mimopilot.tuning.gains import Gains
 
 #: Columns of the table of predicted figures.
-PREDICTED_YAW = ("", "follows [deg]", "after torque [deg]", "noise of u", "Ms")
+PREDICTED_YAW = ("", "tracking [deg]", "disturbance [deg]", "torque noise", "Ms")
 
 
 def yaw_mapping(gains: Gains) -> dict[str, Any]:
@@ -37,6 +37,8 @@ def yaw_cell(gains: Gains, name: str, deviations: Mapping[str, Any]) -> str:
 
 def print_yaw(gains: Gains) -> None:
     """Where the yaw gains come from: their predicted figures beside those of the flown ones, or why they are kept."""
+    from mimopilot.tuning.design.prediction_rows import softer
+
     details = gains.provenance.details.get("yaw")
     if details is None:
         return
@@ -47,8 +49,13 @@ def print_yaw(gains: Gains) -> None:
             for log, figures in zip(details["logs"], details["predicted"].get(name, ()), strict=False)
         ]
         model, signals = details["attitude_model"]["omega"], ", ".join(dict.fromkeys(details["excited_by"]))
-        title = f"Predicted, yaw (excited by {signals}). RMS in doublets of 10 degrees, 1.2 to 6 s, to the model\n"
-        print_table(f"{title}({model:g} rad/s); after a step of torque; of the torque at hover", PREDICTED_YAW, rows)
+        title = f"Predicted, yaw (excited by {signals}). In doublets of 10 degrees, 1.2 to 6 s:\n"
+        figures = f"RMS error to the model ({model:g} rad/s), angle after a torque step, and torque at hover"
+        print_table(title + figures, PREDICTED_YAW, rows)
+        if details.get("better_than_flown"):
+            print_text("better than the yaw gains that flew")
+            for trade_off in softer(details["predicted"]):
+                print_text(trade_off)
     if "kept" in details:
         print_text(f"yaw: the gains are kept as they were: {details['kept']}")
     elif details["limited_by"]:

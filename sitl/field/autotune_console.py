@@ -54,7 +54,7 @@ class AutotuneTerminal:
         """Print what the flown and the new gains are predicted to do, and the certificate."""
         if self.quiet:
             return
-        title = "predicted, roll / pitch: RMS in doublets of 10 degrees, after a step of torque, torque at hover"
+        title = "predicted, roll / pitch: RMS over doublets of 10 degrees, after a torque step, of the torque at hover"
         print_table(title, PREDICTED, predicted_rows(gains, [FLIGHT]))
         verdict, reason = gains.verdict()
         print(f"certificate: {verdict}: {reason}", flush=True)

@@ -111,8 +111,8 @@ class CheckResult:
 
 #: Figure -> its description, unit, and floor.
 FIGURES: Mapping[str, tuple[str, str, float]] = {
-    "follow_deg": ("distance from the attitude model", "deg", ANGLE_FLOOR_DEG),
-    "offaxis_deg": ("motion of the other axis", "deg", ANGLE_FLOOR_DEG),
+    "follow_deg": ("tracking error to the attitude model", "deg", ANGLE_FLOOR_DEG),
+    "offaxis_deg": ("off-axis motion", "deg", ANGLE_FLOOR_DEG),
     "torque": ("torque", "", TORQUE_FLOOR),
     "rest_torque": ("torque in level flight", "", TORQUE_FLOOR),
 }

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mimopilot.common.charts import MODEL_COLOUR, NEW
 from mimopilot.common.figures import Chart, Line, Panel
 from mimopilot.sitl.studies.benchmarks import Benchmark
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 
 #: Colour and line style of each controller, in their order.

@@ -18,7 +18,7 @@ from mimopilot.tuning.design.refine_on_model import refine_on_model
 from mimopilot.tuning.estimation.cbt_ift import Comparison, correlation_based_tuning, iterative_feedback_tuning
 from mimopilot.tuning.estimation.siso import siso_vrft
 from mimopilot.tuning.estimation.vrft import vrft
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.loop_controller import LoopController
 from mimopilot.tuning.plant.pbsid import pbsid
 

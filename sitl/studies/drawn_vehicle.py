@@ -16,7 +16,7 @@ from mimopilot.sitl.physics.airframe import Airframe, Frame, MotorConstants, Noi
 from mimopilot.sitl.physics.rigid_body import GRAVITY, is_physical_inertia
 from mimopilot.sitl.studies.true_plant import TruePlant
 from mimopilot.tuning.gains import Gains, Limits, YawGains
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 
 #: Control period, s: 250 Hz, as all airframes here.
 TS = 0.004

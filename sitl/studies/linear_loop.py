@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import ERROR, RATE, SETPOINT, rate_matrices, state_space
+from mimopilot.tuning.law import rate_matrices
+from mimopilot.tuning.law_state_space import state_space
+from mimopilot.tuning.law_terms import ERROR, RATE, SETPOINT
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.small_matrices import singular_values
 from mimopilot.tuning.statespace import Response, StateSpace

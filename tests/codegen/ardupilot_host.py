@@ -42,7 +42,7 @@ FLAGS = (
 )
 #: Columns of a row that the host program prints.
 TORQUE, LOGGED, PHASE = slice(0, 3), 3, 4
-LOG_RATE, LOG_TORQUE, LOG_EXCITATION = slice(5, 8), slice(8, 11), slice(11, 14)
+LOG_RATE, LOG_TORQUE, LOG_EXCITATION, LOG_FAULTS = slice(5, 8), slice(8, 11), slice(11, 14), 14
 
 
 def at_400_hz(gains: Gains) -> Gains:

@@ -7,7 +7,9 @@ import pytest
 
 from mimopilot.codegen.layout import offset
 from mimopilot.codegen.native import NativeController, load_native
-from mimopilot.tuning.law import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, TERMS, Filters, response
+from mimopilot.tuning.law import response
+from mimopilot.tuning.law_filters import Filters
+from mimopilot.tuning.law_terms import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, TERMS
 from mimopilot.tuning.parameter_row import Shape
 from mimopilot.tuning.parameters import PARAMETERS, ROWS
 from tests.codegen.input_rows import input_rows

@@ -8,7 +8,7 @@ import pytest
 import typer.main
 
 from mimopilot.cli.main import app
-from mimopilot.sitl.campaign.variation import variation_from_toml
+from mimopilot.sitl.campaign.variation import read_variation
 from mimopilot.sitl.flight.scenario import load_scenario
 from mimopilot.sitl.physics.airframe import load_airframe
 from mimopilot.tuning.gains_file import load_gains
@@ -24,8 +24,8 @@ READERS = {
     "columns": load_columns,
     "spec": load_spec,
     "margins": load_spec,
-    "vary": lambda path: variation_from_toml(path.read_text(), str(path)),
-    "fault": lambda path: variation_from_toml(path.read_text(), str(path)),
+    "vary": read_variation,
+    "fault": read_variation,
     "scenario": lambda path: load_scenario(path, 0.004),
     "airframe": load_airframe,
     "gains": load_gains,

@@ -8,7 +8,8 @@ import pytest
 from mimopilot.tuning.controller import Controller
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
-from mimopilot.tuning.law import Filters, rate_matrices, regressors
+from mimopilot.tuning.law import rate_matrices, regressors
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.law_inverse import inverse_law, rebuild_rate_setpoint
 from tests.codegen.input_rows import quaternion
 

@@ -10,7 +10,7 @@ from mimopilot.tuning.certificate import Certificate
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains, gains_to_toml
 from mimopilot.tuning.gains_file import gains_from_toml, load_gains
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.parameters import MATRICES
 from mimopilot.tuning.provenance import Provenance
 from tests.conftest import coupled_gains, following_gains

@@ -10,7 +10,7 @@ from mimopilot.tuning.certificate import Certificate, Verdict
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits, YawGains, gains_to_toml
 from mimopilot.tuning.gains_file import gains_from_toml
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.parameter_row import Row, Shape
 from mimopilot.tuning.parameters import MATRICES, ROWS, rows
 from mimopilot.tuning.reference_model import SecondOrder

@@ -7,7 +7,7 @@ from mimopilot.sitl.studies.benchmarks import excitation, lv100, numerical_examp
 from mimopilot.tuning.design.refine_on_model import refine_on_model
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.vrft import vrft
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.loop_controller import LoopController, complementary_sensitivity
 from mimopilot.tuning.reference_matrix import ReferenceMatrix, wanted_response
 from mimopilot.tuning.reference_model import ReferenceModel, SecondOrder, SecondOrderAndPoles, model_from_table

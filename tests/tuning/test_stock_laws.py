@@ -10,17 +10,9 @@ from mimopilot.codegen.render import render
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import gains_to_toml
 from mimopilot.tuning.gains_file import gains_from_toml
-from mimopilot.tuning.law import (
-    ERROR,
-    RATE,
-    SETPOINT,
-    rate_matrices,
-    regressors,
-    response,
-    setpoint_rate_response,
-    shaping_response,
-    state_space,
-)
+from mimopilot.tuning.law import rate_matrices, regressors, response, setpoint_rate_response, shaping_response
+from mimopilot.tuning.law_state_space import state_space
+from mimopilot.tuning.law_terms import ERROR, RATE, SETPOINT
 from mimopilot.tuning.parameters import YAW_GAINS
 from tests.conftest import stock_gains
 

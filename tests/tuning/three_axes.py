@@ -13,6 +13,8 @@ from mimopilot.tuning import law
 from mimopilot.tuning.axes import law_of
 from mimopilot.tuning.excitation import hold_from_bandwidth, prbs
 from mimopilot.tuning.experiment import Experiment, YawSignals
+from mimopilot.tuning.law_state_space import state_space
+from mimopilot.tuning.law_terms import ERROR, RATE, SETPOINT
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 
 TS = 0.004
@@ -55,7 +57,7 @@ class Vehicle:
     def loop(self, gains, axes=slice(0, 3)):
         """The closed loop as a matrix: from [state, u_bar, noise of rates, of angles] to [next state, u, y_i, y_o]."""
         whole = law_of(gains, 3)
-        rate_law = law.state_space(_rate_matrices(whole, axes), whole.filters)
+        rate_law = state_space(_rate_matrices(whole, axes), whole.filters)
         n, m, a = len(rate_law.C), len(rate_law.A), np.exp(-DAMPING * TS)
         size = m + n * (2 + self.late)
         inputs = np.split(np.eye(size + 3 * n), np.cumsum([m, *[n] * (4 + self.late)]))
@@ -63,7 +65,7 @@ class Vehicle:
         u_bar, of_rate, of_angle = inputs[3 + self.late :]
         y_i, y_o = rate + of_rate, angle + of_angle
         setpoint = -whole.Kp_o[axes, axes] @ y_o
-        signals = {law.ERROR: setpoint - y_i, law.RATE: y_i, law.SETPOINT: setpoint}
+        signals = {ERROR: setpoint - y_i, RATE: y_i, SETPOINT: setpoint}
         u = rate_law.C @ memory + sum(rate_law.D[name] @ value for name, value in signals.items()) + u_bar
         memory = rate_law.A @ memory + sum(rate_law.B[name] @ value for name, value in signals.items())
         turned = a * rate + self.B[axes, axes] @ queue[0] * (1 - a) / DAMPING

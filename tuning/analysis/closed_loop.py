@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 from mimopilot.tuning import law
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.control_laws import control_law
+from mimopilot.tuning.law_state_space import state_space
+from mimopilot.tuning.law_terms import ERROR, RATE, SETPOINT
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.statespace import StateSpace
@@ -63,7 +65,7 @@ def closed_loop_poles(gains: Law, plant: StateSpace) -> Complex:
     plant : StateSpace
         From torque to body rates; the angles are their integrals.
     """
-    flown = law.state_space(law.rate_matrices(gains), gains.filters)
+    flown = state_space(law.rate_matrices(gains), gains.filters)
     n, m = len(plant.A), len(flown.A)
     axes = len(plant.C)
     start = np.eye(n + m + 2 * axes)
@@ -74,7 +76,7 @@ def closed_loop_poles(gains: Law, plant: StateSpace) -> Complex:
     # The attitude controller's setpoint is that of this period or, with a delay, of the one before.
     measured = before if control_law(gains.filters).delay else angle
     for setpoint in (np.zeros_like(now), -law.attitude_matrix(gains) @ measured):
-        signals = {law.ERROR: setpoint - now, law.RATE: now, law.SETPOINT: setpoint}
+        signals = {ERROR: setpoint - now, RATE: now, SETPOINT: setpoint}
         torque = flown.C @ memory + sum(flown.D[signal] @ values for signal, values in signals.items())
         ahead = flown.A @ memory + sum(flown.B[signal] @ values for signal, values in signals.items())
         step = np.vstack([plant.A @ state + plant.B @ torque, ahead, now, angle])

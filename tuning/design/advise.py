@@ -14,8 +14,7 @@ from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.zeros import flexible_model, slowest_zero
 from mimopilot.tuning.experiment import Experiment, external_signal
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import Filters
-from mimopilot.tuning.law_filters import MIMO
+from mimopilot.tuning.law_filters import MIMO, Filters
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import ContinuousModel, second_order
 from mimopilot.tuning.spec import TuningSpec

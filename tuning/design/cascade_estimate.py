@@ -22,9 +22,9 @@ from mimopilot.tuning.estimation.siso import siso_vrft
 from mimopilot.tuning.estimation.vrft import LoopEstimate, vrft
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains, Limits, YawGains
-from mimopilot.tuning.law import TERMS, Filters
-from mimopilot.tuning.law_filters import MIMO
+from mimopilot.tuning.law_filters import MIMO, Filters
 from mimopilot.tuning.law_inverse import rebuild_rate_setpoint
+from mimopilot.tuning.law_terms import TERMS
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.spec import TuningSpec

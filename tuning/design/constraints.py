@@ -78,11 +78,11 @@ class Distance:
         """I + L, its derivative, and the least distance at each frequency."""
         where, eye = self.where, np.eye(loop.plant.axes)
         if self.cut is Cut.ATTITUDE:
-            S = eye - loop.T[where]
+            S = eye - loop.T_y[where]
             P = inverse(S)
             return (
                 P,
-                ProductGradient(loop.dT.left[where] @ P.transpose(0, 2, 1), loop.dT.right[where] @ P),
+                ProductGradient(loop.dT_y.left[where] @ P.transpose(0, 2, 1), loop.dT_y.right[where] @ P),
                 np.full(len(P), self.floor),
             )
         whole = self.cut is Cut.TORQUE
@@ -94,7 +94,7 @@ class Distance:
         """See `Constraint`."""
         eye = np.eye(loop.plant.axes)
         if self.cut is Cut.ATTITUDE:
-            return float(np.min(1 / singular_values(eye - loop.T[self.where])[0]) / self.floor - 1)
+            return float(np.min(1 / singular_values(eye - loop.T_y[self.where])[0]) / self.floor - 1)
         whole = self.cut is Cut.TORQUE
         L = loop.L_u if whole else loop.L_i
         distance = singular_values(eye + L[self.where])[1] - loop.loop_error(whole)[self.where]

@@ -137,7 +137,10 @@ class DesignTask:
 
 
 def _errors(loop: LoopGradient, task: Manoeuvres, derivative: bool = False) -> Iterator[tuple[Complex, Complex]]:
-    """Weighted errors whose squared sum is the cost, (m,), and their derivatives (n, m): following, disturbance."""
+    """Weighted errors whose squared sum is the cost, (m,), and their derivatives (n, m).
+
+    Of following, after the step of torque, and after the offset of an angle.
+    """
     eye = np.eye(loop.plant.axes)
     own_and_other = np.where(eye, 1.0, OTHER_AXIS)
     following = np.sqrt(task.following)[:, None, None] * own_and_other
@@ -146,6 +149,9 @@ def _errors(loop: LoopGradient, task: Manoeuvres, derivative: bool = False) -> I
     error = loop.T - task.target[:, None, None] * eye
     yield (following * error).ravel(), (following * loop.dT.whole()).reshape(count, -1) if derivative else none
     yield (disturbance * loop.D).ravel(), (disturbance * loop.dD.whole()).reshape(count, -1) if derivative else none
+    if task.offset.any():
+        left = np.sqrt(task.returning)[:, None, None]
+        yield (left * (eye - loop.T_y)).ravel(), -(left * loop.dT_y.whole()).reshape(count, -1) if derivative else none
 
 
 def descend(task: DesignTask, vector: Signal, enough: float = ENOUGH) -> Signal:

@@ -14,8 +14,8 @@ from mimopilot.tuning.design.loop_gradient import LoopGradient
 
 #: Room above what the step of torque does under the flown gains. Chosen: less than a pilot feels.
 ROOM = 1.1
-#: Flown gains whose margins are less by more than this hold nobody to their stiffness. Chosen.
-NEARLY_KEPT = -0.05
+#: Flown gains that violate a constraint by more than this do not limit a design. Chosen: as much as the room.
+NEARLY_KEPT = -0.1
 
 Signal = NDArray[np.float64]
 

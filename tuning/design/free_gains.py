@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.axes import Law
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, TERMS
+from mimopilot.tuning.law_terms import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS, TERMS
 from mimopilot.tuning.parameter_row import Shape
 from mimopilot.tuning.parameters import rows
 from mimopilot.tuning.plant.rigid_body_fit import RigidBody

@@ -2,11 +2,12 @@
 
 u = C_ref r_o - C_o y_o - C_y y_i, with C_ref = C_r (Kp_o m + Kff_o m_w) + Kaff_i m_a: m, m_w and m_a are the attitude
 model's angle, rate and acceleration, or 1, 0 and 0 without one. ArduPilot's law adds C_r times the setpoint's rate.
-Each gain adds the product of a column and a row to the controller, dL = alpha beta' and dC_ref = alpha gamma', so all
-derivatives are such products:
+Each gain adds the product of a column and a row to the controller, dL = alpha beta', dC_ref = alpha gamma' and
+dC_o = alpha delta', so all derivatives are such products:
 
     S = (I + L)^-1,  L = C_y G_i + C_o G_o        dS = -(S alpha) (beta' S)
     U = S C_ref,     T = G_o U                    dU = (S alpha) (gamma' - beta' U)
+    T_y = G_o S C_o                               dT_y = (G_o S alpha) (delta' - beta' S C_o)
     u_n = S (C_y N_i + C_o N_o)                   du_n = (S alpha) (xi' - beta' u_n)
 """
 
@@ -21,15 +22,13 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.design.free_gains import ACCELERATION, FreeGains
 from mimopilot.tuning.law import (
-    ATTITUDE,
-    ATTITUDE_FEEDFORWARD,
-    LOOP_TERMS,
     attitude_response,
     fixed_matrices,
     model_response,
     rate_response,
     setpoint_rate_response,
 )
+from mimopilot.tuning.law_terms import ATTITUDE, ATTITUDE_FEEDFORWARD, LOOP_TERMS
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.small_matrices import inverse
 
@@ -144,6 +143,11 @@ class LoopGradient:
         return found + self.matrices[ATTITUDE_FEEDFORWARD.matrix] * rate if self._follows else found
 
     @property
+    def _feeds_forward(self) -> bool:
+        """Whether the setpoint acts otherwise than the measured attitude: C_ref is not C_o."""
+        return self._follows or any(self.free.base.filters.shaping)
+
+    @property
     def _follows(self) -> bool:
         return ATTITUDE_FEEDFORWARD.matrix in self.matrices
 
@@ -162,6 +166,20 @@ class LoopGradient:
     def T(self) -> Complex:  # noqa: N802
         """From the attitude setpoint to the attitude, (K, n, n)."""
         return self.plant.G_o @ self.U
+
+    @cached_property
+    def T_y(self) -> Complex:  # noqa: N802
+        """From an offset of the measured attitude to the attitude, its sign reversed, (K, n, n).
+
+        I - T_y is the sensitivity cut at the angles, and how an angle returns. It is T where nothing is fed forward.
+        """
+        found: Complex = self.plant.G_o @ self._U_y if self._feeds_forward else self.T
+        return found
+
+    @cached_property
+    def _U_y(self) -> Complex:  # noqa: N802
+        found: Complex = self.S @ self.C_o
+        return found
 
     @cached_property
     def D(self) -> Complex:  # noqa: N802
@@ -190,14 +208,14 @@ class LoopGradient:
 
     @cached_property
     def _rows(self) -> Mapping[str, Complex]:
-        """alpha, beta, gamma, xi of the module's equations and beta of the rate loop alone, (K, n, ...) each."""
+        """alpha, beta, gamma, delta, xi of the module's equations, beta of the rate loop alone, (K, n, ...) each."""
         count, n, N = len(self.plant.omega), self.plant.axes, self.plant.noise
         eye, delay = np.eye(n), self._delay[:, 0]
         Kp_o = self.matrices[ATTITUDE.matrix] * self._delay
         angle, noise_o = Kp_o @ self.plant.G_o, Kp_o @ N[:, n:]
         model_angle, model_rate, model_acceleration = (part[:, 0] for part in self._model)
         none, noiseless = np.zeros(n), np.zeros(2 * n)
-        parts: dict[str, list[Complex]] = {name: [] for name in ("alpha", "beta", "gamma", "xi", "beta_i")}
+        parts: dict[str, list[Complex]] = {name: [] for name in ("alpha", "beta", "gamma", "delta", "xi", "beta_i")}
 
         def add(**rows: NDArray[np.generic]) -> None:
             for name, row in rows.items():
@@ -209,6 +227,7 @@ class LoopGradient:
                     alpha=self.C_r[:, :, row],
                     beta=self.plant.G_o[:, column] * delay,
                     gamma=model_angle * eye[column] * delay,
+                    delta=eye[column] * delay,
                     xi=N[:, n + column] * delay,
                     beta_i=none,
                 )
@@ -218,6 +237,7 @@ class LoopGradient:
                     alpha=eye[row],
                     beta=of_y * self.plant.G_i[:, column] + of_r * angle[:, column],
                     gamma=of_r * self._rate_setpoint[:, column],
+                    delta=of_r * Kp_o[:, column],
                     xi=of_y * N[:, column] + of_r * noise_o[:, column],
                     beta_i=of_y * self.plant.G_i[:, column],
                 )
@@ -227,6 +247,7 @@ class LoopGradient:
                     alpha=self.C_r[:, :, row] if first else eye[row],
                     beta=none,
                     gamma=(model_rate if first else model_acceleration) * eye[column],
+                    delta=none,
                     xi=noiseless,
                     beta_i=none,
                 )
@@ -258,6 +279,13 @@ class LoopGradient:
     def dT(self) -> ProductGradient:  # noqa: N802
         """Derivative of `T`."""
         return self.dU.after(self.plant.G_o)
+
+    @cached_property
+    def dT_y(self) -> ProductGradient:  # noqa: N802
+        """Derivative of `T_y`."""
+        if not self._feeds_forward:
+            return self.dT
+        return ProductGradient(self._left, self._rows["delta"] - self._rows["beta"] @ self._U_y).after(self.plant.G_o)
 
     @cached_property
     def dD(self) -> ProductGradient:  # noqa: N802

@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mimopilot.tuning.analysis.manoeuvres import AMPLITUDE, Manoeuvres, manoeuvres
-from mimopilot.tuning.axes import Law
+from mimopilot.tuning.axes import Law, axis_names
+from mimopilot.tuning.design.disturbance_limit import ROOM
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
 from mimopilot.tuning.plant.wide_response import WideResponse
@@ -126,6 +127,17 @@ def offaxis_doubt(new: Law, flown: Law, plant: WideResponse, task: Manoeuvres) -
     return float(np.std(found))
 
 
+def giving_way(new: ByAxis, flown: ByAxis) -> str:
+    """Where a step of torque moves the vehicle farther than with flown gains, beyond `ROOM`; empty: on no axis."""
+    names = axis_names(len(new))
+    found = [
+        f"{name} {ours:.2f} degrees, flown {theirs:.2f}"
+        for name, ours, theirs in zip(names, new, flown, strict=True)
+        if ours > theirs * ROOM * (1 + ROUNDING)
+    ]
+    return "; ".join(found)
+
+
 def reasons_to_keep(
     new: Sequence[Prediction],
     flown: Sequence[Prediction],
@@ -161,6 +173,9 @@ def reasons_to_keep(
                 f"the log cannot tell whether it moves the other axis less ({offaxis:.2f} degrees, flown {before:.2f}, "
                 f"error of the difference {doubt:.2f}): record longer, excite more strongly, or in less wind"
             )
+        gives = giving_way(ours.disturbance_deg, theirs.disturbance_deg)
+        if gives and theirs.Ms <= Ms:
+            reasons.append(f"a step of torque moves it farther ({gives})")
         if ours.Ms > max(Ms, theirs.Ms) * (1 + ROUNDING):
             reasons.append(f"its margin is thinner (Ms {ours.Ms:.2f}, flown {theirs.Ms:.2f})")
         pairs = [*zip(ours.noise, theirs.noise, strict=True), *zip(ours.fast_noise, theirs.fast_noise, strict=True)]

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from mimopilot.tuning.design.disturbance_limit import ROOM
+from mimopilot.tuning.design.prediction import giving_way
 from mimopilot.tuning.gains import Gains
 
 #: Columns of `predicted_rows`; without the first one, those of `prediction_cells`.
-PREDICTED = ("", "follows [deg]", "other axis [deg]", "after torque [deg]", "noise of u", "Ms")
+PREDICTED = ("", "tracking [deg]", "off-axis [deg]", "disturbance [deg]", "torque noise", "Ms")
 #: Gain set of a design -> its name in the table.
 SETS = {"flown": "flown", "siso": "SISO", "tuned": "tuned", "module": "our module"}
 
@@ -27,15 +27,17 @@ def predicted_rows(gains: Gains, logs: Sequence[str]) -> list[list[str]]:
     ]
 
 
-def softer(gains: Gains) -> str:
-    """How much farther a step of torque moves the vehicle than with the flown gains; empty: no farther, to `ROOM`."""
-    predicted = gains.provenance.details.get("predicted", {})
-    for new, flown in zip(predicted.get("tuned", ()), predicted.get("flown", ()), strict=True):
-        after, before = (float(np.linalg.norm(one["disturbance_deg"])) for one in (new, flown))
-        if after > ROOM * before:
-            flown_text = f"flown {before:.2f}, at Ms {flown['Ms']:.2f}"
-            return f"but a step of torque moves it farther ({after:.2f} degrees; {flown_text})"
-    return ""
+def softer(predicted: Mapping[str, Any]) -> list[str]:
+    """Where a step of torque moves the vehicle farther than with the flown gains, on each log; empty: nowhere.
+
+    Of the predicted figures of roll and pitch, or of those of yaw.
+    """
+    found = []
+    for new, flown in zip(predicted.get("tuned", ()), predicted.get("flown", ()), strict=False):
+        after, before = (tuple(np.atleast_1d(one["disturbance_deg"]).tolist()) for one in (new, flown))
+        if gives := giving_way(after, before):
+            found.append(f"but a step of torque moves it farther ({gives}, at Ms {flown['Ms']:.2f})")
+    return found
 
 
 def prediction_cells(figures: Mapping[str, Any]) -> list[str]:

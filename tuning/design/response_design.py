@@ -25,7 +25,7 @@ from mimopilot.tuning.design.prediction import SLOWEST, bandwidth, sensitivity_p
 from mimopilot.tuning.design.vehicle_constraints import MeasuredVehicle, vehicle_constraints
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import LOOP_TERMS, TERMS
+from mimopilot.tuning.law_terms import LOOP_TERMS, TERMS
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import WideResponse, wide_response
 from mimopilot.tuning.reference_model import SecondOrder

@@ -15,8 +15,8 @@ from mimopilot.tuning.design.response_design import Design, ResponseDesign
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Gains, Matrix
-from mimopilot.tuning.law import LOOP_TERMS
 from mimopilot.tuning.law_filters import MIMO
+from mimopilot.tuning.law_terms import LOOP_TERMS
 from mimopilot.tuning.logs.flown_gains import LACKING, LOOP_RATE
 from mimopilot.tuning.logs.imported_gains import SAME_RATE
 from mimopilot.tuning.spec import TuningSpec

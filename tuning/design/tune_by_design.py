@@ -20,8 +20,8 @@ from mimopilot.tuning.design.stock_profile import WORTH, at_loop_rates, our_modu
 from mimopilot.tuning.design.yaw_design import tune_yaw, with_yaw
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.law import ATTITUDE, LOOP_TERMS
 from mimopilot.tuning.law_filters import MIMO
+from mimopilot.tuning.law_terms import ATTITUDE, LOOP_TERMS
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.provenance import Provenance
 from mimopilot.tuning.reference_model import SecondOrder

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mimopilot.tuning.analysis.beyond_band import MAX_SENSITIVITY_BELOW_BAND
 from mimopilot.tuning.analysis.manoeuvres import doublet_torque
 from mimopilot.tuning.axes import Law, axes_slice, flown_law
-from mimopilot.tuning.control_laws import control_law, least_attitude
+from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.design.constraints import (
     SHARE,
     Constraint,
@@ -30,7 +30,8 @@ from mimopilot.tuning.design.prediction import FAST
 from mimopilot.tuning.design.rate_loop_gain import gain_above_band, structural_modes
 from mimopilot.tuning.experiment import Experiment
 from mimopilot.tuning.gains import Limits
-from mimopilot.tuning.law import ATTITUDE, TERMS, Filters
+from mimopilot.tuning.law_filters import Filters
+from mimopilot.tuning.law_terms import ATTITUDE, TERMS
 from mimopilot.tuning.motors import Motors
 from mimopilot.tuning.plant.wide_response import WideResponse
 from mimopilot.tuning.spec import DesignLimits
@@ -102,7 +103,7 @@ def vehicle_constraints(
         ),
         gain_above_band(plant),
         structural_modes(plant, vehicle.limited),
-        _least_attitude(free.base, vehicle),
+        Definite(ATTITUDE.matrix, np.eye(plant.axes), 0.0),
     ]
     if TERMS["I"].matrix in free.units:
         found.append(Definite(TERMS["I"].matrix, B, MIN_INTEGRAL_RATIO * max(proportional, 0.0)))
@@ -113,19 +114,9 @@ def vehicle_constraints(
     found += [ParameterRange(name, np.array(largest[name][axes])) for name in free.units if name in largest]
     found += _actuators(vehicle, free.base.filters)
     flown = flown_law(vehicle.experiment)
-    if flown is not None and any(free.base.filters.shaping):  # else following asks for stiffness
+    if flown is not None:
         found += no_softer_than(flown_loop(flown, plant), step, found)
     return found
-
-
-def _least_attitude(base: Law, vehicle: MeasuredVehicle) -> Definite:
-    """The least attitude gain of a design, or the flown one."""
-    axes, flown = vehicle.plant.axes, flown_law(vehicle.experiment)
-    least = least_attitude(base.filters)[axes_slice(axes).start]
-    if flown is not None:
-        least = min(least, float(np.diag(getattr(flown, ATTITUDE.matrix)).min()))
-    name = f"the autopilot's range of {ATTITUDE.matrix}" if least else ""
-    return Definite(ATTITUDE.matrix, np.eye(axes), least, name)
 
 
 def _actuators(vehicle: MeasuredVehicle, filters: Filters) -> list[Constraint]:

@@ -14,7 +14,8 @@ from scipy.linalg import lstsq
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.correlations import cross_correlation
-from mimopilot.tuning.law import Filters, regressors
+from mimopilot.tuning.law import regressors
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.loop_controller import LoopController
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import Signal

@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.regression import Regression, Solution, solve
-from mimopilot.tuning.law import LOOP_TERMS, Filters, regressors
+from mimopilot.tuning.law import regressors
+from mimopilot.tuning.law_filters import Filters
+from mimopilot.tuning.law_terms import LOOP_TERMS
 from mimopilot.tuning.reference_matrix import ReferenceMatrix, Wanted
 from mimopilot.tuning.reference_model import ReferenceModel
 

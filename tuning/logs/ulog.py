@@ -273,7 +273,7 @@ def _airborne(log: _UlogLog) -> tuple[tuple[Interval, ...] | None, str]:
     else:
         for topic, field, sign in THRUSTS:
             data = log.fields(topic)
-            if field in data:
+            if np.isfinite(data.get(field, np.nan)).any():  # a controller that does not run publishes NaN
                 states.append((f"{topic}.{field}", data["timestamp"] * 1e-6, sign * data[field] > MIN_THRUST))
                 break
     for topic, field, value in ARMED:

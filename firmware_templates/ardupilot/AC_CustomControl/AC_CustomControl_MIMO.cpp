@@ -22,6 +22,7 @@ namespace
 constexpr float kPeriodTolerance = 0.05F;  // relative, as for the gyro of PX4
 constexpr int32_t kUpdateSamples = static_cast<int32_t>(1.0F / kGains.period + 0.5F);  // parameters: once a second
 constexpr float kAllAxes = 7.0F;       // CC_AXIS_MASK: roll, pitch and yaw
+constexpr const char *kWrongRate = "loop rate is not the gains'";
 constexpr uint8_t kAcro = 1;           // flight mode ACRO
 constexpr uint32_t kRateLoopOnly = 2;  // bit of ACRO_OPTIONS
 
@@ -104,7 +105,14 @@ void AC_CustomControl_MIMO::reset()
 	_rate_loop_only = (static_cast<uint32_t>(parameter("ACRO_OPTIONS", 0.0F)) & kRateLoopOnly) != 0;
 	memset(_main_integral, 0, sizeof(_main_integral));
 	_wrong = -1;
-	_obstacle = initialise(_state, kGains) && update_parameters() ? obstacle() : "parameter out of range";
+	_clock = SampleClock(kGains.period);
+	leave_to_main(initialise(_state, kGains) && update_parameters() ? obstacle() : "parameter out of range");
+}
+
+// Until it is switched on again; null: this controller flies.
+void AC_CustomControl_MIMO::leave_to_main(const char *obstacle)
+{
+	_obstacle = obstacle;
 
 	if (_obstacle != nullptr) {
 		GCS_SEND_TEXT(MAV_SEVERITY_WARNING, "MIMO: %s: main flies", _obstacle);
@@ -114,7 +122,7 @@ void AC_CustomControl_MIMO::reset()
 // Why this controller must not fly; null if it may.
 const char *AC_CustomControl_MIMO::obstacle()
 {
-	if (period_differs()) { return "loop rate is not the gains'"; }
+	if (period_differs()) { return kWrongRate; }
 
 	if (!(__builtin_fabsf(parameter("CC_AXIS_MASK", 0.0F) - kAllAxes) < 0.5F)) { return "CC_AXIS_MASK is not 7"; }
 
@@ -139,7 +147,7 @@ bool AC_CustomControl_MIMO::update_parameters()
 
 		if (i < kGainCount) { gain[i] = value; }
 
-		if (!(value >= kLimits[i].minimum && value <= kLimits[i].maximum)) { _wrong = i; }
+		if (!allowed(i, value)) { _wrong = i; }
 	}
 
 	if (_wrong < 0 && memcmp(&gains, &_state.gains, sizeof(gains)) != 0 && !set_gains(_state, gains)) { _wrong = kLimited; }
@@ -169,6 +177,8 @@ Vector3f AC_CustomControl_MIMO::update()
 	const AP_Motors::SpoolState spool = _motors->get_spool_state();
 	const bool flying = spool != AP_Motors::SpoolState::SHUT_DOWN && spool != AP_Motors::SpoolState::GROUND_IDLE;
 
+	if (_obstacle == nullptr) { check_clock(); }
+
 	if (_obstacle != nullptr) { return main_controller(flying); }
 
 	if (--_until_update <= 0) { update_parameters(); }
@@ -193,6 +203,18 @@ Vector3f AC_CustomControl_MIMO::update()
 	_motors->set_yaw_ff(0.0F);
 	log();
 	return Vector3f(_output.moment[0], _output.moment[1], _output.moment[2]);
+}
+
+// The scheduler's rate is what is asked for; a processor that is too busy runs slower. The main controller then goes on
+// with our integrators.
+void AC_CustomControl_MIMO::check_clock()
+{
+	_clock.advance(AP_HAL::micros64());
+
+	if (_clock.rate() == SampleClock::Rate::Wrong) {
+		memcpy(_main_integral, _state.integral, sizeof(_main_integral));
+		leave_to_main(kWrongRate);
+	}
 }
 
 void AC_CustomControl_MIMO::update_inputs(bool flying)
@@ -311,6 +333,7 @@ void AC_CustomControl_MIMO::log() const
 {
 #if HAL_LOGGING_ENABLED
 	const int phase = _excitation.running() ? static_cast<int>(_excitation.phase()) : -1;
+	const unsigned faults = _clock.faults() < UINT16_MAX ? static_cast<unsigned>(_clock.faults()) : UINT16_MAX;
 	// @LoggerMessage: MIMO
 	// @Description: the custom controller's rate setpoint, torque and excitation
 	// @Field: TimeUS: Time since system startup
@@ -324,14 +347,15 @@ void AC_CustomControl_MIMO::log() const
 	// @Field: XR: excitation, roll
 	// @Field: XP: excitation, pitch
 	// @Field: XY: excitation, yaw
-	AP::logger().WriteStreaming("MIMO", "TimeUS,Ph,RR,RP,RY,UR,UP,UY,XR,XP,XY", "s-EEE------", "F----------",
-				    "Qbfffffffff", AP_HAL::micros64(), phase,
+	// @Field: TF: intervals outside 0.5 to 1.5 periods since this controller was switched on
+	AP::logger().WriteStreaming("MIMO", "TimeUS,Ph,RR,RP,RY,UR,UP,UY,XR,XP,XY,TF", "s-EEE-------", "F-----------",
+				    "QbfffffffffH", AP_HAL::micros64(), phase,
 				    static_cast<double>(_output.rates_setpoint[0]),
 				    static_cast<double>(_output.rates_setpoint[1]),
 				    static_cast<double>(_output.rates_setpoint[2]),
 				    static_cast<double>(_output.moment[0]), static_cast<double>(_output.moment[1]),
 				    static_cast<double>(_output.moment[2]), static_cast<double>(_excited[0]),
-				    static_cast<double>(_excited[1]), static_cast<double>(_excited[2]));
+				    static_cast<double>(_excited[1]), static_cast<double>(_excited[2]), faults);
 #endif
 }
 

@@ -16,6 +16,7 @@
 #include "utility/custom_parameters.hpp"
 #include "utility/excitation.hpp"
 #include "utility/mimo_pid.hpp"
+#include "utility/sample_clock.hpp"
 
 class AC_CustomControl_MIMO : public AC_CustomControl_Backend
 {
@@ -39,6 +40,8 @@ public:
 
 private:
 	const char *obstacle();
+	void leave_to_main(const char *obstacle);
+	void check_clock();
 	bool update_parameters();
 	void update_inputs(bool flying);
 	void take_over(bool flying);
@@ -55,6 +58,7 @@ private:
 	mimopilot::Output _output {};
 	mimopilot::Bumpless _bumpless {};
 	mimopilot::Excitation _excitation {};
+	mimopilot::SampleClock _clock{mimopilot::kGains.period};
 	mimopilot::Excitation::Phase _told{mimopilot::Excitation::Phase::Off};  // to the ground station
 	float _excited[mimopilot::kAxes] {};
 	float _main_integral[mimopilot::kAxes] {};  // of the main controller, while it flies in our place

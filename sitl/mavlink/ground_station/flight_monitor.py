@@ -172,13 +172,23 @@ class FlightMonitor:
         return ""
 
 
-def request_streams(client: VehicleLinkState, streams: Streams) -> Exchange[FlightMonitor]:
-    """Request streams and wait until all have arrived, or the time is up; see `FlightMonitor.overdue`."""
+def request_streams(
+    client: VehicleLinkState, streams: Streams, seconds: float = STREAM_TIMEOUT_S
+) -> Exchange[FlightMonitor]:
+    """Request streams and wait until all have arrived, or the time is up.
+
+    Parameters
+    ----------
+    client : VehicleLinkState
+    streams : mapping
+    seconds : float, s
+        Age at which a message counts no longer; see `FlightMonitor.overdue`.
+    """
     assert client.vehicle is not None
     target = client.vehicle.system, client.vehicle.component
     monitor = client.on_report = FlightMonitor(client, streams)
     next_request, deadline = client.now, client.now + FIRST_STREAM_TIMEOUT_S
-    while monitor.overdue() and client.now < deadline and not (client.interrupted or client.closed):
+    while monitor.overdue(seconds) and client.now < deadline and not (client.interrupted or client.closed):
         requests: list[Outgoing] = []
         if client.now >= next_request:
             next_request = client.now + REPEAT_REQUEST_S

@@ -11,15 +11,14 @@ from mimopilot.common.files import write_atomically
 from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
-from mimopilot.sitl.mavlink.ground_station.profiles import TABLE, make_plan
+from mimopilot.sitl.mavlink.ground_station.profiles import make_plan, module_parameters
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
 from mimopilot.tuning.acceptance import check_verdict
 from mimopilot.tuning.gains import Gains
 from mimopilot.tuning.gains_file import load_gains
-from mimopilot.tuning.law_filters import BETAFLIGHT
-from mimopilot.tuning.parameters import PARAMETERS
+from mimopilot.tuning.law_filters import BETAFLIGHT, MIMO
 
 #: Format -> code generation target that emits it, and its path there.
 GENERATED = {
@@ -28,18 +27,19 @@ GENERATED = {
 }
 
 
-def compare(file: Path, options: LinkOptions) -> None:
-    """Compare a gains file with the vehicle's parameters.
+def compare(file: Path, options: LinkOptions, profile: str | None = None) -> None:
+    """Compare a gains file with the vehicle's parameters; by default with those of the controller that it is for.
 
     Raises
     ------
     SitlError
         With exit code 1 if they differ.
     """
-    plan = make_plan(load_gains(file))
-    wanted = plan.values | plan.fixed
+    gains = load_gains(file)
+    plan = make_plan(gains, profile or gains.controller)
+    wanted, units = plan.values | plan.fixed, {setting.name: setting.unit for setting in plan.settings}
     with open_session(options, crazyflie=True) as vehicle:
-        held = vehicle.read(list(wanted))
+        held = vehicle.read(list(wanted), profile or "")
     differ = [name for name, value in wanted.items() if held[name] != value]
     if options.as_json:
         both = {name: {"file": value, "vehicle": held[name]} for name, value in wanted.items()}
@@ -47,7 +47,7 @@ def compare(file: Path, options: LinkOptions) -> None:
     else:
         rows = [
             [
-                *(name, TABLE[name].unit, shortest(value), shortest(held[name])),
+                *(name, units.get(name, ""), shortest(value), shortest(held[name])),
                 f"{held[name] - value:+.6g}" if name in differ else "",
             ]
             for name, value in wanted.items()
@@ -57,8 +57,17 @@ def compare(file: Path, options: LinkOptions) -> None:
         raise SitlError(f"{len(differ)} of {len(wanted)} parameters differ", exit_code=1)
 
 
-def export(file: Path | None, options: LinkOptions, form: str, out: Path | None, uncertified: bool = False) -> None:
+def export(
+    file: Path | None,
+    options: LinkOptions,
+    form: str,
+    out: Path | None,
+    uncertified: bool = False,
+    profile: str | None = None,
+) -> None:
     """Write a gains file, or a vehicle's parameters, as a parameter file.
+
+    Its parameters are those that an upload with the profile writes; by default with that of the gains' controller.
 
     Raises
     ------
@@ -67,22 +76,28 @@ def export(file: Path | None, options: LinkOptions, form: str, out: Path | None,
     """
     from_gains = (*GENERATED, BETAFLIGHT)
     check_choice("--format", form, (*FORMATS, *from_gains), SitlError)
+    if form in from_gains and profile is not None:
+        raise SitlError(f"--format {form}: is for one controller only; leave out --profile")
     if file is not None:
         gains = load_gains(file)
         warning = check_verdict(gains, allow=uncertified)
-        if warning:
-            warn(file, [warning])
         if form == BETAFLIGHT:
             text = betaflight_lines(gains)
+        elif form in GENERATED:
+            text = _generated(gains, form)
         else:
-            text = _generated(gains, form) if form in GENERATED else parameter_text(form, make_plan(gains).values)
+            plan = make_plan(gains, profile or gains.controller)
+            unit = dict(zip(plan.scale, gains.moment_scale or (), strict=False))
+            text = parameter_text(form, plan.values, built_with={**plan.requires, **plan.fixed, **unit})
+        if warning:
+            warn(file, [warning])
     elif not options.connect:
         raise SitlError("give a gains file to write, --connect to read from a vehicle, or both to compare them")
     elif form in from_gains:
         raise SitlError(f"--format {form}: needs a gains file; a vehicle cannot be written in this format")
     else:
         with open_session(options, crazyflie=True) as vehicle:
-            held = vehicle.read([p.name for p in PARAMETERS if p.writable])
+            held = vehicle.read(module_parameters(profile or MIMO), profile or "")
         text = parameter_text(form, held, vehicle.vehicle.system, vehicle.vehicle.component)
     if out is None:
         sys.stdout.write(text)

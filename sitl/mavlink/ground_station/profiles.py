@@ -225,6 +225,25 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
     return replace(plan, settings=tuple(replace(s, value=single(s.value)) for s in plan.settings), profile=profile)
 
 
+def module_parameters(profile: str) -> list[str]:
+    """Names of the writable parameters of our module, or of our custom controller.
+
+    Raises
+    ------
+    SitlError
+        If it is the profile of another controller: what it has depends on the gains.
+    """
+    names = [p.name for p in PARAMETERS if p.writable]
+    if profile == ARDUPILOT_CUSTOM:
+        return [ardupilot_name(name) for name in names]
+    if profile != MIMO:
+        raise SitlError(
+            f"--profile {profile}: expected {MIMO} or {ARDUPILOT_CUSTOM} without a gains file; gains of a stock "
+            "controller: mimopilot import-params"
+        )
+    return names
+
+
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.
 _OURS: tuple[Parameter | Setting, ...] = (*PARAMETERS, *IDENTITY, *EXCITATION, ENABLE)
 TABLE = {p.name: p for p in _OURS}

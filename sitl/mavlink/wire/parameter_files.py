@@ -1,7 +1,7 @@
 """Parameter files of QGroundControl, MAVProxy and Mission Planner: float32 values read back bit for bit.
 
 The first line, a comment in all three formats, holds the number of parameters and the SHA-256 of the rest. So a
-truncated file, with half a gain matrix, is detected.
+truncated file, with half a gain matrix, is detected. The next one, if any, says what a ground station cannot check.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ def parameter_text(
     component: int = COMPONENT,
     checksum: bool = True,
     integers: Collection[str] = (),
+    built_with: Mapping[str, float] | None = None,
 ) -> str:
     """Text of a parameter file.
 
@@ -58,8 +59,13 @@ def parameter_text(
         Begin with the checksum line; False for a file that is meant to be edited.
     integers : collection of str
         Names of INT32 parameters; only QGroundControl's files hold the type.
+    built_with : mapping, optional
+        Name -> value that the vehicle must hold already, for a comment.
     """
     body = FORMATS[form](values, system, component, integers)
+    if built_with:
+        held = ", ".join(f"{name} {shortest(value)}" for name, value in built_with.items())
+        body = f"# load only into a vehicle that holds {held}\n{body}"
     first = f"# mimopilot: {len(values)} parameters, sha256 {sha256(body.strip())}\n" if checksum else ""
     return first + body
 

@@ -1,4 +1,5 @@
 // Steps the controller in a loop of ArduPilot, driven by lines of text: a word and numbers.
+#include <AP_HAL/AP_HAL.h>
 #include <AP_Logger/AP_Logger.h>
 #include <AP_RCMapper/AP_RCMapper.h>
 #include <AP_Scheduler/AP_Scheduler.h>
@@ -18,6 +19,7 @@ namespace
 
 float slope[3];  // what the main controller's integrators gain in a period
 float proportional[3];
+float interval = 2500;  // us
 
 void read(float *values, int count)
 {
@@ -144,6 +146,9 @@ int main()
         } else if (strcmp(word, "period") == 0) {
             read(&AP::scheduler().period, 1);
 
+        } else if (strcmp(word, "interval") == 0) {
+            read(&interval, 1);
+
         } else if (strcmp(word, "switch") == 0) {
             read(value, 1);
             frontend.set_custom_controller(value[0] > 0);
@@ -157,6 +162,7 @@ int main()
                     motors.in[i] = proportional[i] + control.pid[i].integral;
                 }
 
+                AP_HAL::clock() += static_cast<uint64_t>(interval);
                 AP_Logger &logger = AP::logger();
                 logger = AP_Logger();
                 frontend.update();
@@ -164,10 +170,10 @@ int main()
 
                 for (int i = 0; i < 3; i++) { printf(" %.9g", static_cast<double>(motors.in[i] + motors.ff[i])); }
 
-                // Logged: 1 if it is, phase, rate setpoint, torque, excitation.
+                // Logged: 1 if it is, phase, rate setpoint, torque, excitation, faults of the clock.
                 printf(" %d", logger.valid ? 1 : 0);
 
-                for (int i = 1; i < 11; i++) { printf(" %.9g", logger.values[i]); }
+                for (int i = 1; i < 12; i++) { printf(" %.9g", logger.values[i]); }
 
                 printf("\n");
             }

@@ -4,7 +4,7 @@ import pytest
 from mimopilot.sitl.studies.benchmarks import excitation, lv100, numerical_example
 from mimopilot.tuning.design.refine_on_model import refine_on_model
 from mimopilot.tuning.estimation.vrft import vrft
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from mimopilot.tuning.plant.pbsid import pbsid
 

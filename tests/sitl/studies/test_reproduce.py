@@ -10,7 +10,7 @@ from mimopilot.sitl.studies.benchmarks import excitation, lv100
 from mimopilot.sitl.studies.reproduce import reproduce
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.estimation.cbt_ift import correlation_based_tuning, iterative_feedback_tuning
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from tests.conftest import assert_one_clear_line
 

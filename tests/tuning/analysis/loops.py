@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 
 from mimopilot.sitl.physics.airframe import load_airframe
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.reference_model import second_order

@@ -12,7 +12,7 @@ from mimopilot.tuning.analysis.certify import certify
 from mimopilot.tuning.certificate import Thresholds, Verdict
 from mimopilot.tuning.design.cascade import certify_from_log, tune
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.spec import load_spec

@@ -8,7 +8,7 @@ import pytest
 import mimopilot.tuning.design.advise as advisor
 from mimopilot.tuning.design.advise import advise
 from mimopilot.tuning.design.cascade import tune
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.spec import TuningSpec
 from tests.tuning.analysis.test_certify import experiment
 

@@ -10,13 +10,14 @@ from mimopilot.tuning.analysis.closed_loop import cascade_loop
 from mimopilot.tuning.control_laws import control_law
 from mimopilot.tuning.design.free_gains import free_gains
 from mimopilot.tuning.design.loop_gradient import LoopGradient
+from mimopilot.tuning.law import cascade_response
 from mimopilot.tuning.plant.frequency_response import PlantResponse
 from mimopilot.tuning.plant.plant_estimates import PlantEstimates
 from mimopilot.tuning.plant.wide_response import wide_response
 from tests.conftest import stock_gains
 from tests.tuning.analysis.test_certify import experiment
 
-RESPONSES = {"L_i": "dL_i", "L_u": "dL_u", "U": "dU", "T": "dT", "D": "dD", "noise": "dnoise"}
+RESPONSES = {"L_i": "dL_i", "L_u": "dL_u", "U": "dU", "T": "dT", "T_y": "dT_y", "D": "dD", "noise": "dnoise"}
 STEP = 1e-5
 
 
@@ -70,6 +71,12 @@ def test_the_responses_are_those_of_the_law(plant, gains):
         (loop.U, expected.U_o),
     ):
         assert ours == pytest.approx(theirs, rel=1e-9, abs=1e-12)
+    # An offset of the measured attitude passes the feedback alone, whatever the law adds for its setpoint.
+    _, C_o, _ = cascade_response(gains, plant.omega)
+    expected_return = plant.G_o @ np.linalg.solve(np.eye(2) + expected.L_u, C_o)
+    assert loop.T_y == pytest.approx(expected_return, rel=1e-9, abs=1e-12)
+    apart = np.abs(loop.T - loop.T_y).max()
+    assert apart > 0.1 if gains.filters.model_omega or any(gains.filters.shaping) else apart == 0
 
 
 def test_the_derivatives_are_those_of_finite_differences(plant, gains):

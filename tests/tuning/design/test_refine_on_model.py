@@ -5,7 +5,7 @@ import pytest
 
 from mimopilot.tuning.design.refine_on_model import frequency_grid, refine_on_model
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.loop_controller import LoopController, closed_loop, complementary_sensitivity
 from mimopilot.tuning.reference_model import ReferenceModel
 from mimopilot.tuning.statespace import StateSpace

@@ -56,6 +56,12 @@ def test_without_land_detector_thrust_tells_the_flight_and_short_idling_counts_a
     assert len(log.segments) == 1
 
 
+def test_a_thrust_that_is_nan_throughout_is_no_evidence_of_the_ground(tmp_path, flight):
+    thrust = {"timestamp": microseconds(flight.t), "xyz": np.full((len(flight.t), 3), np.nan, np.float32)}
+    log, without = read(tmp_path, flight, vehicle_thrust_setpoint=thrust), read(tmp_path, flight)
+    assert log.seconds == without.seconds > 0
+
+
 def test_a_log_that_was_landed_throughout_is_refused(tmp_path, flight):
     with pytest.raises(TuningError, match=r"no flight: .* vehicle_land_detected\.landed .* never left the ground"):
         read(tmp_path, flight, vehicle_land_detected=landed((10, 1), (15, 1)))

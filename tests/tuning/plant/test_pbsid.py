@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from mimopilot.tuning.errors import TuningError
-from mimopilot.tuning.law import Filters
+from mimopilot.tuning.law_filters import Filters
 from mimopilot.tuning.logs.reader import read_log
 from mimopilot.tuning.loop_controller import LoopController, closed_loop
 from mimopilot.tuning.plant.frequency_response import measured_plant

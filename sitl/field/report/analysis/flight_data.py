@@ -106,7 +106,7 @@ class ReportedFlight:
     def drawn(self, time: Signal, values: Signal, share: float = 1.0) -> tuple[Signal, Signal]:
         """A signal (N,) as a line of at most a share of `samples`, interrupted where the log has a gap."""
         pauses = np.diff(time)
-        after = np.flatnonzero(pauses > MAX_GAP * np.median(pauses)) + 1 if len(pauses) else []
+        after = np.flatnonzero(pauses > MAX_GAP * np.median(pauses)) + 1 if len(pauses) else np.array([], int)
         x, y = np.insert(time, after, time[after]), np.insert(np.asarray(values, np.float64), after, np.nan)
         return thinned(x, y, int(share * self.samples))
 

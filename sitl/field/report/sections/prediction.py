@@ -32,10 +32,10 @@ from mimopilot.tuning.reference_model import ReferenceModel
 HEADING = "Predicted motion"
 #: Predicted figures -> what they are, with the unit.
 PREDICTED = {
-    "follow_deg": "error to the model in doublets [deg]",
-    "offaxis_deg": "other axis in doublets [deg]",
-    "disturbance_deg": "after the step of torque [deg]",
-    "noise": "torque at hover from noise",
+    "follow_deg": "tracking error in doublets [deg]",
+    "offaxis_deg": "off-axis motion in doublets [deg]",
+    "disturbance_deg": "angle after the torque step [deg]",
+    "noise": "torque noise at hover",
 }
 #: Number of axes of yaw.
 YAW = 1

@@ -232,10 +232,10 @@ def test_yaw_is_predicted_and_compared_beside_roll_and_pitch(bench):
     stability = next(one for one in report.sections if one.heading == "Stability and margins")
     assert any(point.startswith("flown: yaw is not examined: excitation begins at") for point in stability.points)
     rows = {row[0]: row[1:] for row in report.tables[0].rows}
-    assert {"Ms", "roll: phase margin [deg]", "pitch: torque at hover from noise"} <= set(rows)
+    assert {"Ms", "roll: phase margin [deg]", "pitch: torque noise at hover"} <= set(rows)
     new = report.cases[1]
     assert {"yaw: Ms", "yaw: phase margin [deg]"} <= set(_set_figures(new, new))
-    before, after, difference, _ = rows["roll: other axis in doublets [deg]"]
+    before, after, difference, _ = rows["roll: off-axis motion in doublets [deg]"]
     values = [float(cell.split(" +- ")[0]) for cell in (before, after, difference)]
     assert values[1] - values[0] == pytest.approx(values[2], abs=1.5 * 10.0 ** -len(before.split()[0].split(".")[1]))
     # Both sets are predicted around the same plants: their difference is surer than two independent figures.

@@ -1,12 +1,15 @@
 """upload and restore with our custom controller in ArduCopter."""
 
+import numpy as np
 import pytest
+from pymavlink.mavparm import MAVParmDict
 
 from mimopilot.sitl.mavlink.ground_station.profiles import make_plan, make_restore_plan
+from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 from mimopilot.tuning.logs.dataflash_custom import our_name
 from mimopilot.tuning.logs.flown_gains import flown_gains
 from mimopilot.tuning.parameters import ardupilot_name
-from tests.conftest import assert_one_clear_line
+from tests.conftest import assert_one_clear_line, stock_gains
 from tests.sitl.mavlink.scripted_vehicle import ScriptedVehicle, UdpVehicle
 
 PROFILE = "ardupilot-custom"
@@ -91,6 +94,45 @@ def test_firmware_that_does_not_say_its_unit_of_torque_needs_it_from_the_user(mi
     assert vehicle.writes == 0
     done = upload(mimopilot, certified, vehicle, "--moment-scale", "flown")
     assert done.returncode == 0, done.stderr
+
+
+def test_a_parameter_file_holds_what_an_upload_writes(mimopilot, certified, gains, old, tmp_path):
+    """Read by MAVProxy's own reader, which is pymavlink's; and compared with the vehicle that it was loaded into."""
+    arguments = ("params", certified, "--profile", PROFILE)
+    for form in ("mavproxy", "missionplanner"):
+        assert mimopilot(*arguments, "--format", form, "--out", f"{form}.parm").returncode == 0
+        read = MAVParmDict()
+        read.load(str(tmp_path / f"{form}.parm"))
+        assert {name: np.float32(value) for name, value in read.items()} == make_plan(gains, PROFILE).values
+        assert read["CC3_RP_RR"] == pytest.approx(gains.Kp_i[0, 0], rel=1e-7)
+        assert read["CC3_AP_PR"] == pytest.approx(gains.Kp_o[1, 0], rel=1e-7)
+    text = (tmp_path / "mavproxy.parm").read_text()
+    scale = ", ".join(f"CC3_SCALE_{axis} {value:g}" for axis, value in zip("RPY", gains.moment_scale, strict=True))
+    assert f"# load only into a vehicle that holds CC_TYPE 3.0, CC3_TS 0.004, {scale}\n" in text
+    vehicle = CustomVehicle(old)
+    with UdpVehicle(vehicle) as link:
+        differ = mimopilot(*arguments, "--connect", link.url)
+        assert differ.returncode == 1 and "CC3_RP_RR" in differ.stdout
+        vehicle.values.update(read)
+        assert mimopilot(*arguments, "--connect", link.url).returncode == 0
+        again = mimopilot("params", "--profile", PROFILE, "--connect", link.url, "--format", "mavproxy")
+    assert again.stdout.splitlines()[1:] == [line for line in text.splitlines()[1:] if line[0] != "#"]
+    assert vehicle.writes == 0
+
+
+@pytest.mark.parametrize("controller", ["px4-stock", "ardupilot-stock"])
+def test_a_parameter_file_of_stock_gains_is_for_their_controller(mimopilot, tmp_path, controller):
+    stock = stock_gains(controller)
+    stock.save(tmp_path / "stock.gains.toml")
+    done = mimopilot("params", "stock.gains.toml", "--format", "mavproxy", "--out", "stock.parm", "--uncertified")
+    assert done.returncode == 0, done.stderr
+    assert read_parameters(tmp_path / "stock.parm") == make_plan(stock, controller).values
+    refused = mimopilot("params", "stock.gains.toml", "--profile", "mimo", "--uncertified")
+    assert_one_clear_line(refused, f"the gains are for {controller}")
+    refused = mimopilot("params", "--connect", "udpin:127.0.0.1:1", "--profile", controller)
+    assert_one_clear_line(refused, f"--profile {controller}: expected mimo or ardupilot-custom", "import-params")
+    refused = mimopilot("params", "stock.gains.toml", "--format", "px4-yaml", "--profile", controller, "--uncertified")
+    assert_one_clear_line(refused, "--format px4-yaml", "leave out --profile")
 
 
 def test_its_experiment_is_started_by_hand(mimopilot):

@@ -17,7 +17,7 @@ public:
         for (int i = 0; format[i] != 0; i++) {
             if (format[i] == 'Q') {
                 values[i] = static_cast<double>(va_arg(arguments, uint64_t));
-            } else if (format[i] == 'b') {
+            } else if (format[i] == 'b' || format[i] == 'H') {
                 values[i] = va_arg(arguments, int);
             } else {
                 values[i] = va_arg(arguments, double);

@@ -2,6 +2,7 @@
 // The parameters CC3_*, in the order of AC_CustomControl_MIMO::var_info.
 #pragma once
 
+#include "gain_limits.hpp"
 #include "gains.hpp"
 
 namespace mimopilot
@@ -24,66 +25,23 @@ enum Place {
 	kValueCount
 };
 
-struct Limits {
-	float minimum;
-	float maximum;
+// Of what is only published, after the gains.
+constexpr float kPublished[] = {
+	2.54592F,  // SCALE_R
+	2.54592F,  // SCALE_P
+	0.2736F,  // SCALE_Y
 };
 
-// Of the gains, and of what is only published. What is fixed in the firmware has one value.
-constexpr Limits kLimits[] = {
-	{0.01F, 50.0F},  // AP_RR
-	{-50.0F, 50.0F},  // AP_RP
-	{-50.0F, 50.0F},  // AP_PR
-	{0.01F, 50.0F},  // AP_PP
-	{1e-04F, 5.0F},  // RP_RR
-	{-5.0F, 5.0F},  // RP_RP
-	{-5.0F, 5.0F},  // RP_PR
-	{1e-04F, 5.0F},  // RP_PP
-	{0.0F, 10.0F},  // RI_RR
-	{-10.0F, 10.0F},  // RI_RP
-	{-10.0F, 10.0F},  // RI_PR
-	{0.0F, 10.0F},  // RI_PP
-	{-0.5F, 0.5F},  // RD_RR
-	{-0.5F, 0.5F},  // RD_RP
-	{-0.5F, 0.5F},  // RD_PR
-	{-0.5F, 0.5F},  // RD_PP
-	{-5.0F, 5.0F},  // RF_RR
-	{-5.0F, 5.0F},  // RF_RP
-	{-5.0F, 5.0F},  // RF_PR
-	{-5.0F, 5.0F},  // RF_PP
-	{-5.0F, 5.0F},  // AF_RR
-	{-5.0F, 5.0F},  // AF_RP
-	{-5.0F, 5.0F},  // AF_PR
-	{-5.0F, 5.0F},  // AF_PP
-	{-0.5F, 0.5F},  // RA_RR
-	{-0.5F, 0.5F},  // RA_RP
-	{-0.5F, 0.5F},  // RA_PR
-	{-0.5F, 0.5F},  // RA_PP
-	{0.01F, 50.0F},  // AP_YY
-	{1e-04F, 5.0F},  // RP_YY
-	{0.0F, 10.0F},  // RI_YY
-	{-0.5F, 0.5F},  // RD_YY
-	{-5.0F, 5.0F},  // RF_YY
-	{0.01F, 50.0F},  // RMAX_R
-	{0.01F, 50.0F},  // RMAX_P
-	{0.01F, 50.0F},  // RMAX_Y
-	{0.01F, 1.0F},  // UMAX_R
-	{0.01F, 1.0F},  // UMAX_P
-	{0.01F, 1.0F},  // UMAX_Y
-	{0.001F, 1.0F},  // IMAX_R
-	{0.001F, 1.0F},  // IMAX_P
-	{0.001F, 1.0F},  // IMAX_Y
-	{0.01F, 1.0F},  // YAW_W
-	{0.0F, 50.0F},  // SP_SLEW
-	{0.0F, 0.9999F},  // D_POLE
-	{0.0025F, 0.0025F},  // TS
-	{0.3F, 2.0F},  // M_DAMP
-	{0.0F, 50.0F},  // M_OMEGA
-	{2.54592F, 2.54592F},  // SCALE_R
-	{2.54592F, 2.54592F},  // SCALE_P
-	{0.2736F, 0.2736F},  // SCALE_Y
-};
+// Those that are no settings of the excitation.
+constexpr int kLimited = kGainCount + 3;
 
-constexpr int kLimited = sizeof(kLimits) / sizeof(kLimits[0]);
+// Whether one of these may have this value; what is fixed in the firmware has one.
+inline bool allowed(int place, float value)
+{
+	if (place >= kGainCount) { return value >= kPublished[place - kGainCount] && value <= kPublished[place - kGainCount]; }
+
+	const float only = (&kGains.kp_o[0][0])[place];
+	return fixed(place) ? value >= only && value <= only : accepted(place, value);
+}
 
 }  // namespace mimopilot
