@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import ClassVar
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -45,6 +44,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.hover_checks import (
     check_hover,
     stop_reason,
 )
+from mimopilot.sitl.mavlink.ground_station.experiments.px4_autotune_run import Px4AutotuneRun
 from mimopilot.sitl.mavlink.ground_station.experiments.vehicle_setup import (
     identify,
     on_the_ground,
@@ -74,85 +74,11 @@ COMMAND: int = mavlink.MAV_CMD_DO_AUTOTUNE_ENABLE
 #: rad/s; twice PX4's default, as in the flight of docs/logs.md that gave gains: tilt stayed below 13 degrees.
 DEFAULT_AMPLITUDE, AMPLITUDES = 1.5, (0.1, 6.0)  # the range is that of MC_AT_SYSID_AMP
 DEFAULT_RUNS = 4  # one run is too short for a certificate; four gave one up to 50 rad/s
-#: Progress -> the axis that is excited, or was before the pause.
-AXES = {20: "roll", 40: "pitch", 60: "yaw"}
-AFTER_AXES = 80  # progress from here on: nothing is excited any more
-CONVERGED_S, GIVE_UP_S = 5.0, 19.0  # PX4: an axis takes 5 s or more; the module gives up after 20 s
-PAUSE_S = 2.0  # PX4: after each axis
 # Chosen:
 POLL_RUN_S = 0.25  # between two requests for the progress
 START_TIMEOUT_S = 15.0  # from the command to the first axis; PX4 measures 1000 samples of its rate first
 RUN_TIMEOUT_S = 90.0  # of a run: three axes of 20 s and their pauses
 SETTLE_S = 3.0  # between two runs
-
-
-@dataclass
-class _Run:
-    """What is known of one run of the autotune; times by the vehicle's clock, s.
-
-    Attributes
-    ----------
-    requested : bool
-        The vehicle has acknowledged the start.
-    begun : bool
-        It has excited an axis.
-    ended : bool
-        The autotune is idle again.
-    result : int or None
-        Last MAV_RESULT that is not "in progress".
-    axis : str
-        Excited last; "end": none any more.
-    since : float
-        When that began.
-    seconds : dict
-        Axis -> its duration so far, with the pause after it.
-    """
-
-    requested: bool = False
-    begun: bool = False
-    ended: bool = False
-    result: int | None = None
-    axis: str = ""
-    since: float = 0.0
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def over(self) -> bool:
-        """Whether nothing is excited any more."""
-        return self.axis == "end" or self.result is not None
-
-    def pass_time(self, now: float) -> None:
-        """Count the time of the axis."""
-        if self.axis in AXES.values() and not self.over:
-            self.seconds[self.axis] = now - self.since
-
-    @property
-    def excited(self) -> float:
-        """Duration of the excitation of all axes, s, to the interval of the requests."""
-        return sum(max(0.0, seconds - PAUSE_S) for seconds in self.seconds.values())
-
-    def note(self, ack: CommandAck, now: float) -> None:
-        """Record an acknowledgement that came at a time."""
-        self.pass_time(now)
-        if ack.result == mavlink.MAV_RESULT_IN_PROGRESS:
-            self.requested = True
-            axis = AXES.get(ack.progress, "end" if ack.progress >= AFTER_AXES else "")
-            if axis != self.axis and axis:
-                self.axis, self.since, self.begun = axis, now, True
-        elif self.begun or ack.result not in (mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_FAILED):
-            # A result before this run has begun is that of the run before.
-            self.result = ack.result
-
-    def problem(self, text: str) -> str:
-        """Why it is no whole excitation of all axes; empty: it is."""
-        if self.axis == "end" or self.result == mavlink.MAV_RESULT_ACCEPTED:
-            return ""
-        spent = self.seconds.get(self.axis, 0.0)
-        if self.axis == "yaw" and spent >= CONVERGED_S:
-            return ""
-        if spent >= GIVE_UP_S:
-            return f"PX4's autotune gave up on {self.axis} after 20 s: its model did not converge; raise --amplitude"
-        return f"the vehicle ended its autotune in {self.axis or 'the beginning'} (a stick moved?): {text}"
 
 
 class Px4Autotune(ExperimentProfile):
@@ -268,7 +194,7 @@ class Px4Autotune(ExperimentProfile):
         yield from set_values(client, idle, old, store=False)
         mode, seconds, reason = client.vehicle.mode, 0.0, ""
         for number in range(self.runs):
-            run = _Run()
+            run = Px4AutotuneRun()
             reason = yield from self._run(client, monitor, mode, run, f"run {number + 1} of {self.runs}")
             seconds += run.excited
             if reason:
@@ -277,7 +203,9 @@ class Px4Autotune(ExperimentProfile):
         stopped = not reason or (yield from self._stop(client, monitor))
         return ExperimentResult(not reason, reason, seconds, stopped, True)
 
-    def _run(self, client: ParameterClient, monitor: FlightMonitor, mode: int, run: _Run, phase: str) -> Exchange[str]:
+    def _run(
+        self, client: ParameterClient, monitor: FlightMonitor, mode: int, run: Px4AutotuneRun, phase: str
+    ) -> Exchange[str]:
         """One run and the pause after it; returns why the experiment must end, empty: it may go on."""
         begin, due, settled = client.now, client.now, math.inf
         while client.now < settled:
@@ -295,7 +223,7 @@ class Px4Autotune(ExperimentProfile):
         return ""
 
     @staticmethod
-    def _run_problem(client: ParameterClient, monitor: FlightMonitor, run: _Run, begin: float) -> str:
+    def _run_problem(client: ParameterClient, monitor: FlightMonitor, run: Px4AutotuneRun, begin: float) -> str:
         """Why a run, requested at a time `begin` (s), is no experiment; empty: it is, or may become one."""
         if run.ended:
             return run.problem(monitor.text)
@@ -305,7 +233,7 @@ class Px4Autotune(ExperimentProfile):
             return f"the autotune did not begin within {START_TIMEOUT_S:g} s: {monitor.text}"
         return f"the autotune did not end within {RUN_TIMEOUT_S:g} s" if client.now > begin + RUN_TIMEOUT_S else ""
 
-    def _request(self, client: ParameterClient, run: _Run) -> Outgoing:
+    def _request(self, client: ParameterClient, run: Px4AutotuneRun) -> Outgoing:
         """The command that starts the autotune; once requested, what asks for its state and starts no other run."""
         assert client.vehicle is not None
         target = client.vehicle.system, client.vehicle.component
@@ -314,7 +242,7 @@ class Px4Autotune(ExperimentProfile):
         return SendCommand(*target, COMMAND, (0.0 if run.requested else 1.0,))
 
     def _exchange(
-        self, client: ParameterClient, monitor: FlightMonitor, run: _Run, send: list[Outgoing]
+        self, client: ParameterClient, monitor: FlightMonitor, run: Px4AutotuneRun, send: list[Outgoing]
     ) -> Exchange[None]:
         """Send, wait for `POLL_S`, and record what is heard of the run."""
         assert client.vehicle is not None
@@ -341,7 +269,7 @@ class Px4Autotune(ExperimentProfile):
         if (yield from client.read([AUTOTUNE_AMPLITUDE], "stopping", keep_going=True))[AUTOTUNE_AMPLITUDE].value != 0.0:
             return False
         # The old amplitude goes back after the end of the run only: it would be injected.
-        run, begin, due = _Run(requested=True), client.now, client.now
+        run, begin, due = Px4AutotuneRun(requested=True), client.now, client.now
         while not run.ended and client.now < begin + (RUN_TIMEOUT_S if run.begun else START_TIMEOUT_S):
             client.progress("excitation stopped; waiting for the end of the autotune", 0, 1)
             send: list[Outgoing] = []
