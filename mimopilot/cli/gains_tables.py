@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from mimopilot.cli.yaw_tables import print_cross_terms, yaw_cell, yaw_margins
@@ -77,13 +78,9 @@ def print_certificate(gains: Gains) -> None:
         kind = figures["gain_margin"][axis]
         gain = "gain not known" if kind == "not known" else f"{figures['gain_margin_db'][axis]:.1f} dB"
         phase, error = (figures[name][axis] for name in ("phase_margin_deg", "phase_margin_error_deg"))
-        rows.append(
-            [
-                axis,
-                f"{'at least ' if kind == 'at least' else ''}{gain}, {phase:.0f} +- {error:.0f} deg, "
-                f"{figures['delay_margin_ms'][axis]:.1f} ms",
-            ]
-        )
+        delay = figures["delay_margin_ms"][axis]
+        crossing = f"{phase:.0f} +- {error:.0f} deg, {delay:.1f} ms" if isfinite(phase) else "no crossover in this band"
+        rows.append([axis, f"{'at least ' if kind == 'at least' else ''}{gain}, {crossing}"])
     low, high = certificate.band
     rows += yaw_margins(figures)
     print_table(f"Margins, known from {low:.1f} to {high:.0f} rad/s", ["", "value"], rows)

@@ -27,7 +27,7 @@ def register(app: typer.Typer) -> None:
 
 def report(
     logs: Annotated[
-        list[Path], typer.Argument(help="Any flight log; two or three to compare flights, the one before first.")
+        list[Path], typer.Argument(help="Any flight log; up to four to compare flights, the one before first.")
     ],
     out: Annotated[Path, typer.Option(dir_okay=False, help="The page to write (HTML).")],
     gains: Annotated[

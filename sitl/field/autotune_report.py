@@ -62,6 +62,10 @@ def write_autotune_report(run: AutotuneRun, gains: Gains, result: CheckResult) -
         "mimopilot autotune",
         flights.lead,
         [check, *flights.sections],
-        Headline(f"The check flight was {outcome}.", tone="bad" if result.worse else "good"),
+        Headline(
+            f"The check flight was {outcome}.",
+            tone="bad" if result.worse else "good",
+            notes=flights.headline.notes,
+        ),
         LARGEST_PAGE,
     )

@@ -12,6 +12,7 @@ from mimopilot.sitl.field.report.analysis.weak_coherence import coherence_note
 from mimopilot.sitl.field.report.sections.stability import loops_of, yaw_loops_of
 from mimopilot.tuning.certificate import ACCEPTED, Certificate, Verdict
 from mimopilot.tuning.experiment import external_signal
+from mimopilot.tuning.law_filters import ARDUPILOT_STOCK, BETAFLIGHT, PX4_STOCK
 
 #: Verdict -> colour of the conclusion.
 TONES = {Verdict.CERTIFIED: "good", Verdict.THIN: "doubt"}
@@ -21,6 +22,13 @@ WIDER = {
     "higher). ArduPilot: SID_F_START_HZ and SID_F_STOP_HZ. A longer or stronger excitation widens the band, too.",
     "r_bar": "PX4's autotune: more runs, or a larger MC_AT_SYSID_AMP. ArduPilot: SID_F_START_HZ and SID_F_STOP_HZ.",
     "r_o": "A setpoint hardly reaches the frequencies of the crossover: inject a torque instead.",
+}
+#: Controller of a set -> how its gains get to the vehicle, where that is not `UPLOAD`.
+UPLOAD = "upload GAINS --connect DEVICE,BAUD"
+PUT = {
+    PX4_STOCK: f"{UPLOAD} --profile {PX4_STOCK}",
+    ARDUPILOT_STOCK: f"{UPLOAD} --profile {ARDUPILOT_STOCK}",
+    BETAFLIGHT: f"params GAINS --format {BETAFLIGHT}",
 }
 #: Where the names of everything in a log begin in a message: of no use in a sentence.
 CONTENTS = " In this log: "
@@ -78,7 +86,7 @@ def _next_step(case: GainCase, certificate: Certificate) -> str:
     if case.flown:
         return f"Find better gains from this flight: mimopilot tune {log} --out my.gains.toml --report tuned.html"
     if certificate.verdict == Verdict.CERTIFIED:
-        return "Put them on the vehicle: mimopilot upload GAINS --connect DEVICE,BAUD"
+        return f"Put them on the vehicle: mimopilot {PUT.get(case.gains.controller, UPLOAD)}"
     return f"Tune again before flying them: mimopilot tune {log} --out my.gains.toml"
 
 

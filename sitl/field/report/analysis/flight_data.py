@@ -105,8 +105,9 @@ class ReportedFlight:
 
     def drawn(self, time: Signal, values: Signal, share: float = 1.0) -> tuple[Signal, Signal]:
         """A signal (N,) as a line of at most a share of `samples`, interrupted where the log has a gap."""
-        pauses = np.diff(time)
-        after = np.flatnonzero(pauses > MAX_GAP * np.median(pauses)) + 1 if len(pauses) else np.array([], int)
+        if len(time) < 3:
+            return time, values
+        after = np.flatnonzero(np.diff(time) > MAX_GAP * sampling_period(time)) + 1
         x, y = np.insert(time, after, time[after]), np.insert(np.asarray(values, np.float64), after, np.nan)
         return thinned(x, y, int(share * self.samples))
 
@@ -157,7 +158,9 @@ class ReportedFlight:
         if self.found.experiment is None or self.found.reason:
             return ()
         yaw = self._excited((self.recording.yaw,)) if self.yaw_response is not None else ()
-        return bridged(tuple(sorted((*self.found.parts, *intersection(yaw, self.airborne)))), BRIDGE)
+        used = bridged(tuple(sorted((*self.found.parts, *intersection(yaw, self.airborne)))), BRIDGE)
+        edges = [0.0, *(edge for gap in self._gaps() for edge in gap), self.span[1] - self.span[0]]
+        return intersection(used, tuple(zip(edges[::2], edges[1::2], strict=True)))
 
     def _excited(self, sources: Sequence[Mapping[str, Series]]) -> tuple[Interval, ...]:
         parts: tuple[Interval, ...] = ()

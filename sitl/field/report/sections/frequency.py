@@ -79,6 +79,11 @@ def _seconds(flight: ReportedFlight) -> float:
     return flight.measured.experiment.seconds if flight.measured else 0.0
 
 
+def _span(flights: Measured) -> tuple[float, float]:
+    """Frequencies (rad/s) of all flights: panels above one another have the same axis."""
+    return min(float(plant.omega[0]) for _, plant in flights), max(float(plant.omega[-1]) for _, plant in flights)
+
+
 def _panel(
     title: str, unit: str, lines: list[Line | Spread], band: tuple[float, float] | None, **options: object
 ) -> Panel:
@@ -104,7 +109,9 @@ def _magnitude(flights: Measured, axis: int, band: Band) -> Panel:
             label = f"by {axis_names(plant.axes)[column]} torque{f', {flight.label}' if len(flights) > 1 else ''}"
             lines.append(Spread(plant.omega, low, size + 2 * deviation, colour=flight.colour))
             lines.append(Line(plant.omega, size, label, flight.colour, dash))
-    return _panel(f"{_name(flights, axis)} rate: magnitude", "[rad/s per unit]", lines, band, log_y=True)
+    return _panel(
+        f"{_name(flights, axis)} rate: magnitude", "[rad/s per unit]", lines, band, log_y=True, x_range=_span(flights)
+    )
 
 
 def _phase(flights: Measured, axis: int, band: Band) -> Panel:
@@ -113,9 +120,9 @@ def _phase(flights: Measured, axis: int, band: Band) -> Panel:
         G, deviation, good = _element(plant, axis, axis)
         if not good.any():
             continue
-        # Across a gap the turn of the phase is not known: the longest stretch without one is drawn.
+        # Across a gap the turn of the phase is not known: the widest stretch without one, in octaves, is drawn.
         parts = np.split(np.flatnonzero(good), np.flatnonzero(np.diff(np.flatnonzero(good)) > 1) + 1)
-        good = np.isin(np.arange(len(G)), max(parts, key=len))
+        good = np.isin(np.arange(len(G)), max(parts, key=lambda part: plant.omega[part[-1]] / plant.omega[part[0]]))
         phase = np.full(len(G), np.nan)
         phase[good] = np.degrees(np.unwrap(np.angle(G[good])))
         # A vehicle's response begins between -90 and 0 degrees: the turn in which its phase is counted.
@@ -125,7 +132,7 @@ def _phase(flights: Measured, axis: int, band: Band) -> Panel:
         lines.append(Spread(plant.omega, phase - error, phase + error, colour=flight.colour))
         lines.append(Line(plant.omega, phase, label, flight.colour))
     marks = [LimitLine(-180.0, colour="#888888", dash=":")]
-    return _panel(f"{_name(flights, axis)} rate: phase", "[deg]", lines, band, marks=marks)
+    return _panel(f"{_name(flights, axis)} rate: phase", "[deg]", lines, band, marks=marks, x_range=_span(flights))
 
 
 def _coherence(flights: Measured, axis: int, band: Band) -> Panel:
@@ -137,4 +144,12 @@ def _coherence(flights: Measured, axis: int, band: Band) -> Panel:
         lines.append(Spread(plant.omega, low, high, colour=flight.colour))
         lines.append(Line(plant.omega, value, label, flight.colour))
     marks = [LimitLine(COHERENT, f"coherent above {COHERENT:g}", LIMIT)]
-    return _panel(f"{_name(flights, axis)} rate: coherence", "", lines, band, marks=marks, y_range=(0.0, 1.05))
+    return _panel(
+        f"{_name(flights, axis)} rate: coherence",
+        "",
+        lines,
+        band,
+        marks=marks,
+        y_range=(0.0, 1.05),
+        x_range=_span(flights),
+    )

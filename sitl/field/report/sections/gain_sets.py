@@ -45,6 +45,7 @@ def gains_section(cases: Sequence[GainCase]) -> Section:
     body = [[element, *(cells.get((element, case.label), "") for case in cases)] for element in order]
     body += _yaw_rows(cases)
     body.append(["derivative filter", *(_hertz(case.gains.derivative_cutoff_hz) for case in cases)])
+    body.append(["controller", *(case.gains.controller for case in cases)])
     body.append(["control rate", *(f"{1 / case.gains.Ts:g} Hz" for case in cases)])
     caption = (
         "Bars: two standard deviations, the spread to expect if the flight were repeated. A set without bars was not "

@@ -32,7 +32,7 @@ NYQUIST = 3.0
 #: Loops of drawn plants that are shown in the determinant's plot, of all sets together.
 SHOWN_DRAWS = 8
 #: Instead of a margin, for a loop whose gain is never 1.
-NEVER = "gain below 1"
+NEVER = "no crossover"
 #: Of a margin that the flight does not show.
 UNKNOWN = "not known"
 #: Points of a circle.
@@ -271,22 +271,16 @@ def _bode(found: Sequence[CaseLoops]) -> Panel:
     lines: list[Line | Spread] = []
     marks: list[LimitLine | SpanMark] = [LimitLine(1.0, colour="#888888"), *_band(found)]
     for loops in found:
+        case, phases = loops.case, [margins.phase_margin(loop, loops.omega)[0] for loop in loops.axis_loops]
+        told = ", ".join(f"{axis} {deg:.0f} deg" for axis, deg in zip(AXES, phases, strict=True) if np.isfinite(deg))
+        # One entry of the legend for both axes: ten of them would leave no room for the curves.
+        labels = (f"{case.label}: {told}" if told else case.label, "")
         for axis, loop in enumerate(loops.axis_loops):
-            label, at = f"{loops.case.label}, {AXES[axis]}", crossover(loop, loops.omega)
-            phase, _ = margins.phase_margin(loop, loops.omega)
-            margin = f": {phase:.0f} deg" if np.isfinite(phase) else ""
-            lines.append(Line(loops.omega, np.abs(loop), label + margin, loops.case.colour, ("-", "--")[axis]))
-            if at > 0:
-                lines.append(
-                    Line(
-                        np.array([at]),
-                        np.array([1.0]),
-                        colour=loops.case.colour,
-                        width=0,
-                        marker="o",
-                        text=[f"{label}: phase margin {phase:.0f} deg at {at:.0f} rad/s"],
-                    )
-                )
+            lines.append(Line(loops.omega, np.abs(loop), labels[axis], case.colour, ("-", "--")[axis]))
+            if (at := crossover(loop, loops.omega)) > 0:
+                text = [f"{case.label}, {AXES[axis]}: phase margin {phases[axis]:.0f} deg at {at:.0f} rad/s"]
+                dot = np.array([at]), np.array([1.0])
+                lines.append(Line(*dot, colour=case.colour, width=0, marker="o", text=text))
     return Panel(
         "Loop gain and crossover",
         "frequency [rad/s]; shaded: known",

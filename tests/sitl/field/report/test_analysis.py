@@ -33,14 +33,14 @@ from mimopilot.sitl.field.report.analysis.step_response import WIDEST, estimate_
 from mimopilot.sitl.field.report.analysis.vibration import Tone, air_spectrum, find_tones, spectrogram
 from mimopilot.sitl.field.report.analysis.weak_coherence import coherence_note, deciding_range, weak_ranges
 from mimopilot.sitl.field.report.flight_report import make_report
-from mimopilot.sitl.field.report.headline import headline
+from mimopilot.sitl.field.report.headline import _next_step, headline
 from mimopilot.sitl.field.report.sections.compare import _set_figures
 from mimopilot.sitl.field.report.sections.frequency import coherence_band
 from mimopilot.sitl.field.report.sections.spectra import _change_table
 from mimopilot.sitl.field.report.sections.stability import crossover, loops_of, margin_table
 from mimopilot.sitl.field.report.sections.tracking import busiest, tracking_error
 from mimopilot.tuning.axes import law_of
-from mimopilot.tuning.certificate import Thresholds
+from mimopilot.tuning.certificate import Certificate, Thresholds, Verdict
 from mimopilot.tuning.law_filters import StockFilters
 from mimopilot.tuning.logs.resample import Series
 from mimopilot.tuning.reference_model import second_order
@@ -362,6 +362,28 @@ def test_the_derivative_filter_of_a_stock_set_is_its_own(gains):
     changed = with_derivative_filter(replace(gains, filters=own, **diagonal), 20.0)
     assert changed.filters.stock.derivative_hz == (20.0, 20.0, 30.0)
     assert with_derivative_filter(gains, 20.0).derivative_cutoff_hz == 20.0
+
+
+def test_what_is_used_leaves_the_gaps_out(bench):
+    flight = replace(bench[2].flights[0])
+    flight.__dict__["_gaps"] = lambda: ((2.0, 3.0), (5.0, 5.5))
+    length = flight.span[1] - flight.span[0]
+    used = [pytest.approx(part, abs=0.01) for part in ((0.0, 2.0), (3.0, 5.0), (5.5, length))]
+    assert list(flight.phases["used"]) == used
+
+
+def test_certified_gains_are_put_on_the_vehicle_by_the_command_of_their_controller(bench, gains):
+    case = next(case for case in bench[2].cases if case.label == "my")
+    stock = replace(
+        gains.filters, derivative_cutoff_hz=0.0, stock=StockFilters("px4-stock", derivative_hz=(30.0, 30.0, 30.0))
+    )
+    diagonal = {name: np.diag(np.diag(matrix)) for name, matrix in gains.matrices.items()}
+    for one, wanted in ((case.gains, "BAUD"), (replace(gains, filters=stock, **diagonal), "--profile px4-stock")):
+        step = _next_step(replace(case, gains=one, problem="left out"), Certificate(Verdict.CERTIFIED, ""))
+        assert step.startswith("Put them on the vehicle: mimopilot upload GAINS")
+        assert step.endswith(wanted)
+    table = next(one for one in bench[2].tables if one.caption.startswith("Gains"))
+    assert ["controller", "mimo", "mimo"] in [list(row) for row in table.rows]
 
 
 def test_phases_of_a_flight_are_told_apart(tmp_path):
