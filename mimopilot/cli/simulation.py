@@ -319,5 +319,7 @@ def report_flight(out: Path, flight: Flight, airframe: Airframe, gains: Gains) -
 
 
 def _text(value: float | str | None) -> str:
-    """A figure in a table."""
-    return "-" if value in (None, "") else value if isinstance(value, str) else f"{value:.5g}"
+    """A figure in a table, with the digits that hold for another seed of the noise and other versions of numpy."""
+    if value in (None, ""):
+        return "-"
+    return f"{value:#.3g}".rstrip(".") if isinstance(value, float) else str(value)

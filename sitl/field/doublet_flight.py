@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pymavlink.dialects.v20 import common as mavlink
-
 from mimopilot.sitl.field.flight_watch import not_followed, trip
 from mimopilot.sitl.mavlink.ground_station.events import (
     ARDUPILOT,
@@ -22,6 +20,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
 )
 from mimopilot.sitl.mavlink.ground_station.flight_monitor import FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import TRY_S
+from mimopilot.sitl.mavlink.wire.dialect import mavlink
 from mimopilot.sitl.physics.rigid_body import GRAVITY
 
 # All chosen, unless a source is given:

@@ -8,8 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 
-from pymavlink.dialects.v20 import common as mavlink
-
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.flight_watch import no_answer
 from mimopilot.sitl.mavlink.ground_station.events import (
@@ -20,6 +18,7 @@ from mimopilot.sitl.mavlink.ground_station.events import (
 )
 from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.vehicle_link_state import VehicleLinkState
+from mimopilot.sitl.mavlink.wire.dialect import mavlink
 
 NAN = math.nan
 # Times are chosen.

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pymavlink.dialects.v20 import common as mavlink
-
 from mimopilot.sitl.autopilot.flight_modes import Mode
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import FLIGHT, GAINS, AutotuneOptions, AutotuneRun, Decided
@@ -21,6 +19,7 @@ from mimopilot.sitl.mavlink.ground_station.experiments.experiments_by_name impor
 from mimopilot.sitl.mavlink.ground_station.experiments.module_profile import PX4
 from mimopilot.sitl.mavlink.ground_station.flight_monitor import POLL_S, FlightMonitor
 from mimopilot.sitl.mavlink.ground_station.session import Session
+from mimopilot.sitl.mavlink.wire.dialect import mavlink
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.px4_modes import custom_mode
 from mimopilot.tuning.design.yaw_design import yaw_model
