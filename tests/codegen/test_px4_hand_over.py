@@ -68,6 +68,17 @@ def test_what_it_cannot_fly_fails_the_arming_check(program, event, message):
     assert not lines(result, "stock") and not any(result.ticks)
 
 
+def test_what_is_fixed_in_the_firmware_is_shown_whatever_a_parameter_file_has_stored(program):
+    stored = ["param MIMO_FW_ID 7", "param MIMO_TS 0.001", "param MIMO_SCALE_Y 9", "param MIMO_EX_AMPY 0.11"]
+    names = ("MIMO_FW_ID", "MIMO_TS", "MIMO_SCALE_Y", "MIMO_EX_AMPY")
+    result = drive(program, [*stored, *AIRBORNE, *SECOND, *(f"value {name}" for name in names), "arming"])
+    shown = {name: np.float32(value) for _, name, value in map(str.split, lines(result, "value"))}
+    gains = coupled_gains()
+    expected = (NUMBER, gains.filters.Ts, gains.moment_scale[2], 0.11)
+    assert shown == dict(zip(names, map(np.float32, expected), strict=True))
+    assert lines(result, "arming") == ["arming 3 1 0"]
+
+
 def test_if_it_is_not_wanted_it_hinders_no_arming(program):
     result = drive(program, ["param MIMO_EN 0", "vehicle 1 1", *AIRBORNE, *SECOND, "arming"])
     assert lines(result, "arming") == ["arming 3 1 0"]

@@ -228,6 +228,11 @@ void execute(Line &line)
 		px4::set_value(name.c_str(), line.number());
 		publish(ORB_ID(parameter_update), parameter_update_s{});
 
+	} else if (command == "value") {
+		std::string name;
+		line >> name;
+		printf("value %s %.9g\n", name.c_str(), px4::values()[px4::find(name.c_str())]);
+
 	} else if (command == "mode") {
 		vehicle_control_mode_s mode{};
 		mode.flag_armed = line.flag();

@@ -118,6 +118,13 @@ param_t param_find(const char *name) { return static_cast<param_t>(px4::find(nam
 const char *param_name(param_t handle) { return px4::name(handle); }
 int param_type(param_t handle) { return px4::kFloat[handle] ? PARAM_TYPE_FLOAT : PARAM_TYPE_INT32; }
 void param_set_used(param_t) {}
+bool param_value_is_default(param_t handle) { return px4::values()[handle] == px4::kDefaults[handle]; }
+
+int param_reset(param_t handle)
+{
+	px4::values()[handle] = px4::kDefaults[handle];
+	return 0;
+}
 
 int param_get(param_t handle, float *value)
 {

@@ -77,6 +77,7 @@ constexpr px4::params kNames[] = {
 	px4::params::MIMO_SCALE_Y,
 	px4::params::MIMO_FW_ID,
 };
+constexpr int kNameCount = sizeof(kNames) / sizeof(kNames[0]);
 
 int32_t samples(float seconds)
 {
@@ -84,11 +85,6 @@ int32_t samples(float seconds)
 }
 
 }  // namespace
-
-Parameters::Parameters()
-{
-	for (const px4::params name : kNames) { param_set_used(param_handle(name)); }
-}
 
 const Gains &Parameters::programmed() { return kGains; }
 
@@ -99,17 +95,28 @@ const char *Parameters::read(Gains &gains)
 	const char *wrong = nullptr;
 	gains = kGains;
 
-	for (int i = 0; i < kGainCount; i++) {
-		if (fixed(i)) { continue; }
+	for (int i = 0; i < kNameCount; i++) {
+		const param_t handle = param_handle(kNames[i]);
+		param_set_used(handle);  // a log keeps no others
 
-		values[i] = parameter_value(kNames[i]);
+		if (i < kGainCount ? fixed(i) : i >= kGainCount + kSettingCount) {
+			// Only published. A value that a parameter file has stored would tell of another firmware.
+			if (!param_value_is_default(handle)) { param_reset(handle); }
 
-		if (!accepted(i, values[i]) && wrong == nullptr) {
-			wrong = param_name(param_handle(kNames[i]));
+			continue;
 		}
-	}
 
-	for (int i = 0; i < kSettingCount; i++) { _settings[i] = parameter_value(kNames[kGainCount + i]); }
+		const float value = parameter_value(kNames[i]);
+
+		if (i >= kGainCount) {
+			_settings[i - kGainCount] = value;
+			continue;
+		}
+
+		values[i] = value;
+
+		if (!accepted(i, value) && wrong == nullptr) { wrong = param_name(handle); }
+	}
 
 	// PX4 stores values longer than a firmware.
 	return wrong != nullptr || for_this_firmware(gains, _settings[MIMO_SET_ID]) ? wrong : "MIMO_SET_ID";

@@ -11,12 +11,9 @@ namespace mimopilot
 class Parameters
 {
 public:
-	// Marks all as in use: a log keeps no others.
-	Parameters();
-
 	// Reads all. Returns null, or the name of the first gain out of its range, because PX4 stores any value, or
 	// MIMO_SET_ID if the gains were stored for another firmware; `gains` is then of no use. What is fixed in the firmware
-	// stays so.
+	// stays so, and shows its default again.
 	const char *read(Gains &gains);
 
 	// The gains in the firmware.
