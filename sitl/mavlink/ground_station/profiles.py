@@ -292,6 +292,27 @@ def violated_range(name: str, value: float) -> str:
     return f"{ours.minimum:g} to {ours.maximum:g} {ours.unit}".rstrip() + f" ({ours.description})"
 
 
+def set_warning(values: Mapping[str, float]) -> str:
+    """Why the firmware of a vehicle would not fly gains of ours from a file; empty: it would, or they are none of ours.
+
+    Parameters
+    ----------
+    values : mapping
+        Name -> value; all that would be written, and what the vehicle has fixed.
+    """
+    for prefix in (PREFIX, ARDUPILOT_PREFIX):
+        if not any(prefix + p.code in values for p in PARAMETERS if p.writable):
+            continue
+        number, stored = (prefix + p.name.removeprefix(PREFIX) for p in (FIRMWARE_NUMBER, SET_NUMBER))
+        then = f"firmware with other gains does not fly it: upload gains, or set {stored} to the vehicle's {number}"
+        if stored not in values:
+            return f"the set has no {stored}; {then}"
+        if values[stored] not in (0.0, values.get(number, values[stored])):
+            two = f"{stored} {values[stored]:.6g} of another firmware than {number} {values[number]:.6g}"
+            return f"the set holds {two}; {then}"
+    return ""
+
+
 def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:
     """Plan the restoration of values that a vehicle held.
 
