@@ -92,21 +92,24 @@ const char *Parameters::read(Gains &gains)
 {
 	static_assert(sizeof(gains) == kGainCount * sizeof(float), "Gains is a row of floats");
 	float *const values = &gains.kp_o[0][0];
-	const char *wrong = nullptr;
+	int wrong = -1;
 	gains = kGains;
 
 	for (int i = 0; i < kNameCount; i++) {
 		const param_t handle = param_handle(kNames[i]);
 		param_set_used(handle);  // a log keeps no others
+		const float value = parameter_value(kNames[i]);
 
 		if (i < kGainCount ? fixed(i) : i >= kGainCount + kSettingCount) {
-			// Only published. A value that a parameter file has stored would tell of another firmware.
-			if (!param_value_is_default(handle)) { param_reset(handle); }
+			// Only published. A value that a parameter file has stored would tell of another firmware. (PX4's
+			// param_value_is_default() takes any smaller value for the default.)
+			float programmed;
+			param_get_default_value(handle, &programmed);
+
+			if (memcmp(&value, &programmed, sizeof(value)) != 0) { param_reset(handle); }
 
 			continue;
 		}
-
-		const float value = parameter_value(kNames[i]);
 
 		if (i >= kGainCount) {
 			_settings[i - kGainCount] = value;
@@ -115,11 +118,13 @@ const char *Parameters::read(Gains &gains)
 
 		values[i] = value;
 
-		if (!accepted(i, value) && wrong == nullptr) { wrong = param_name(handle); }
+		if (!accepted(i, value) && wrong < 0) { wrong = i; }
 	}
 
 	// PX4 stores values longer than a firmware.
-	return wrong != nullptr || for_this_firmware(gains, _settings[MIMO_SET_ID]) ? wrong : "MIMO_SET_ID";
+	if (wrong < 0 && !for_this_firmware(gains, _settings[MIMO_SET_ID])) { wrong = kGainCount + MIMO_SET_ID; }
+
+	return wrong < 0 ? nullptr : param_name(param_handle(kNames[wrong]));
 }
 
 ExcitationSettings Parameters::excitation() const
