@@ -142,7 +142,7 @@ def upload_and_verify(
         _check_choice(plan, vehicle)
         held = vehicle.read([*plan.values, *plan.fixed], plan.profile)
         if plan.binding is not None:
-            held |= _read_binding(plan.binding, vehicle)
+            held |= read_binding(plan.binding, vehicle)
             plan = plan.bound(held[plan.binding.firmware])
         if ask_scale:
             held |= _read_scale(plan, vehicle)
@@ -175,7 +175,8 @@ def upload_and_verify(
             snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
             if snapshot is not None and dialogue is not None:
                 dialogue.saved(snapshot)
-            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch))
+            seal = plan.seal if switch is None else ""  # the switch is one, too
+            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch, seal=seal))
         return Upload(plan, held, vehicle.vehicle, outcome, snapshot, options.connect)
 
 
@@ -196,8 +197,14 @@ def _check_choice(plan: UploadPlan, vehicle: Session) -> None:
             )
 
 
-def _read_binding(binding: Binding, vehicle: Session) -> dict[str, float]:
-    """The firmware's number, and that of the stored set; the vehicle has our other parameters."""
+def read_binding(binding: Binding, vehicle: Session) -> dict[str, float]:
+    """The firmware's number, and that of the stored set; the vehicle has our other parameters.
+
+    Raises
+    ------
+    SitlError
+        If its firmware has no number.
+    """
     try:
         return vehicle.run(read_values(vehicle.client, binding))
     except NoParametersError as error:
