@@ -103,6 +103,15 @@ class UploadPlan:
         return next((name for name in self.values if name in SEALS), "")
 
     @property
+    def unnumbered(self) -> str:
+        """The firmware's number that our gains from a file lack; empty: they have it, or there are none."""
+        for binding, prefix in ((MODULE_BINDING, PREFIX), (CUSTOM_BINDING, ARDUPILOT_PREFIX)):
+            ours = any(prefix + parameter.code in self.values for parameter in PARAMETERS)
+            if ours and self.binding is None and binding.firmware not in self.fixed:
+                return binding.firmware
+        return ""
+
+    @property
     def values(self) -> dict[str, float]:
         """Name -> value to write."""
         return {setting.name: setting.value for setting in self.settings}

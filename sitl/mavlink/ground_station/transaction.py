@@ -144,6 +144,8 @@ def upload_and_verify(
         if plan.binding is not None:
             held |= read_binding(plan.binding, vehicle)
             plan = plan.bound(held[plan.binding.firmware])
+        if plan.unnumbered:
+            _check_unnumbered(plan.unnumbered, vehicle)
         if ask_scale:
             held |= _read_scale(plan, vehicle)
         switch = SWITCHES.get(vehicle.vehicle.autopilot)
@@ -213,6 +215,16 @@ def read_binding(binding: Binding, vehicle: Session) -> dict[str, float]:
             "stored gains of any other; generate it again and flash it; nothing was written",
             exit_code=1,
         ) from error
+
+
+def _check_unnumbered(number: str, vehicle: Session) -> None:
+    """Refuse gains of an unknown firmware, unless the vehicle's has no number either."""
+    if vehicle.run(vehicle.client.read([number], "reading"))[number].absent:
+        return
+    raise SitlError(
+        f"the file holds our gains without {number}, so it is not known for which firmware they are; upload gains "
+        "instead (mimopilot upload); nothing was written"
+    )
 
 
 def _read_scale(plan: UploadPlan, vehicle: Session) -> dict[str, float]:
