@@ -117,6 +117,6 @@ def write_set(run: AutotuneRun, plan: UploadPlan) -> None:
                     f"{name}: the vehicle has {held[name]:.6g}, the values are for {value:.6g}; nothing was written",
                     exit_code=1,
                 )
-        outcome = session.run(write_and_verify(session.client, plan.values, held, seal=plan.seal))
+        outcome = session.run(write_and_verify(session.client, plan.values, held, lock=plan.lock))
         done = Upload(plan, held, session.vehicle, outcome, run.file(SNAPSHOT), run.options.connect)
     done.check()

@@ -98,9 +98,9 @@ class UploadPlan:
         return replace(self, settings=(*self.settings, write), fixed=self.fixed | {self.binding.firmware: number})
 
     @property
-    def seal(self) -> str:
+    def lock(self) -> str:
         """The parameter of `settings` without which a vehicle takes none of the others; empty: there is none."""
-        return next((name for name in self.values if name in SEALS), "")
+        return next((name for name in self.values if name in LOCKS), "")
 
     @property
     def unnumbered(self) -> str:
@@ -120,7 +120,7 @@ class UploadPlan:
 #: Of our module, and of our custom controller in ArduPilot.
 MODULE_BINDING = Binding(FIRMWARE_NUMBER.name, SET_NUMBER.name)
 CUSTOM_BINDING = Binding(*map(ardupilot_name, MODULE_BINDING))
-SEALS = (MODULE_BINDING.stored, CUSTOM_BINDING.stored)
+LOCKS = (MODULE_BINDING.stored, CUSTOM_BINDING.stored)
 
 
 def _mimo(gains: Gains) -> UploadPlan:

@@ -177,8 +177,8 @@ def upload_and_verify(
             snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
             if snapshot is not None and dialogue is not None:
                 dialogue.saved(snapshot)
-            seal = plan.seal if switch is None else ""  # the switch is one, too
-            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch, seal=seal))
+            lock = plan.lock if switch is None else ""  # the switch is one, too
+            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch, lock=lock))
         return Upload(plan, held, vehicle.vehicle, outcome, snapshot, options.connect)
 
 

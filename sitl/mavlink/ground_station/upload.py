@@ -76,7 +76,7 @@ def write_and_verify(
     old: Mapping[str, float],
     store: bool = True,
     switch: SetSwitch | None = None,
-    seal: str = "",
+    lock: str = "",
 ) -> Exchange[UploadOutcome]:
     """Write the differences, verify all, store, verify all again; on any failure roll back.
 
@@ -93,8 +93,8 @@ def write_and_verify(
     switch : SetSwitch, optional
         Of a vehicle that takes a set as a whole; `old` has its value. It is switched off and back also if no value
         differs: what it holds need not be what it flies.
-    seal : str
-        Name of the parameter without which the vehicle takes none of the others, see `UploadPlan.seal`: 0 while they
+    lock : str
+        Name of the parameter without which the vehicle takes none of the others, see `UploadPlan.lock`: 0 while they
         are written, so no part of a set flies, whatever happens. Empty: there is none.
     """
     expected = {**old, **new}
@@ -103,7 +103,7 @@ def write_and_verify(
     storage = ""
     reason = "" if switch is None else (yield from _switch_off(client, switch, store))
     if not reason:
-        reason = yield from _write_sealed(client, new, old, seal)
+        reason = yield from _write_locked(client, new, old, lock)
     if not reason:
         reason = yield from _verify(client, expected if switch is None else expected | {switch.enable: 0.0})
     if not reason and switch is not None:
@@ -114,7 +114,7 @@ def write_and_verify(
         reason = (yield from client.wait_for_autosave()) or (yield from _verify(client, expected))
     state = "verified"
     if reason:
-        state, storage = yield from _roll_back(client, new, old, store, switch, seal)
+        state, storage = yield from _roll_back(client, new, old, store, switch, lock)
     client.check_contradictions(False)
     held = {name: tuple(sorted(values)) for name, values in client.possible.items()}
     return UploadOutcome(state, reason, held, storage, client.was_armed)
@@ -146,7 +146,7 @@ def _roll_back(
     old: Mapping[str, float],
     store: bool,
     switch: SetSwitch | None,
-    seal: str,
+    lock: str,
 ) -> Exchange[tuple[str, str]]:
     """Write the old values back; returns the state of the upload and of the storage."""
     if not client.written:
@@ -156,7 +156,7 @@ def _roll_back(
     back = {name: old[name] for name in new if name in client.written or client.possible[name] != {old[name]}}
     if switch is not None:
         yield from client.write({switch.enable: 0.0}, "switching", keep_going=True)
-    last = {name: back.pop(name) for name in (seal,) if name in back}
+    last = {name: back.pop(name) for name in (lock,) if name in back}
     if last and back:
         yield from client.write(dict.fromkeys(last, 0.0), "rolling back", keep_going=True)
     yield from client.write(back, "rolling back", keep_going=True)
@@ -176,20 +176,20 @@ def _roll_back(
     return "rolled back" if restored and not refused else "mixed", storage
 
 
-def _write_sealed(
-    client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float], seal: str
+def _write_locked(
+    client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float], lock: str
 ) -> Exchange[str]:
-    """Write the differences, with the seal as 0 until all others are written; returns why that failed."""
-    others = {name: value for name, value in new.items() if name != seal}
-    sealed = {name: old[name] for name in new if name == seal}
+    """Write the differences, with the lock as 0 until all others are written; returns why that failed."""
+    others = {name: value for name, value in new.items() if name != lock}
+    locked = {name: old[name] for name in new if name == lock}
     reason = ""
     if any(value != old[name] for name, value in others.items()):
-        reason = yield from _write(client, dict.fromkeys(sealed, 0.0), sealed)
-        sealed = dict.fromkeys(sealed, 0.0)
+        reason = yield from _write(client, dict.fromkeys(locked, 0.0), locked)
+        locked = dict.fromkeys(locked, 0.0)
     if not reason:
         reason = yield from _write(client, others, old)
-    if not reason and sealed:
-        reason = yield from _write(client, {seal: new[seal]}, sealed)
+    if not reason and locked:
+        reason = yield from _write(client, {lock: new[lock]}, locked)
     return reason
 
 

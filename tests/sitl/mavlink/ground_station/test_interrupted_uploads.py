@@ -96,7 +96,7 @@ def test_ctrl_c_between_any_two_writes_ends_with_the_old_values():
 @pytest.mark.parametrize("stored", [0.0, 7.0])
 def test_the_number_of_the_firmware_never_stands_beside_a_part_of_a_set(stored):
     """With any other number a vehicle does not fly its stored values: 7 is its own."""
-    old, new = OLD | {"SEAL": stored}, NEW | {"SEAL": 7.0}
+    old, new = OLD | {"LOCK": stored}, NEW | {"LOCK": 7.0}
     states = set()
     for count in (1, 4, len(NEW), len(NEW) + 1, 99):
         for fault in ("", "disconnects"):
@@ -114,9 +114,9 @@ def test_the_number_of_the_firmware_never_stands_beside_a_part_of_a_set(stored):
                 return answer
 
             vehicle.write = noting
-            outcome = run_exchange(write_and_verify(client, new, held, seal="SEAL"), link)
+            outcome = run_exchange(write_and_verify(client, new, held, lock="LOCK"), link)
             states.add(outcome.state)
-            assert all(values in (old, new) or {**values, "SEAL": 7.0} == new for values in seen if values["SEAL"] == 7)
+            assert all(values in (old, new) or {**values, "LOCK": 7.0} == new for values in seen if values["LOCK"] == 7)
             assert all(value in outcome.held[name] for name, value in vehicle.values.items())
             assert vehicle.values == {"verified": new, "rolled back": old}.get(outcome.state, vehicle.values)
     assert states == {"verified", "rolled back", "mixed"}
