@@ -177,8 +177,7 @@ def upload_and_verify(
             snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
             if snapshot is not None and dialogue is not None:
                 dialogue.saved(snapshot)
-            lock = plan.lock if switch is None else ""  # the switch is one, too
-            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch, lock=lock))
+            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch, lock=plan.lock))
         return Upload(plan, held, vehicle.vehicle, outcome, snapshot, options.connect)
 
 

@@ -101,9 +101,10 @@ def write_and_verify(
     client.possible = {name: {value} for name, value in old.items()}
     client.check_contradictions(True)
     storage = ""
-    reason = "" if switch is None else (yield from _switch_off(client, switch, store))
+    reason = "" if switch is None else (yield from _switch_off(client, switch, lock, store))
     if not reason:
-        reason = yield from _write_locked(client, new, old, lock)
+        locked = {lock: 0.0} if lock and switch is not None else {}
+        reason = yield from _write_locked(client, new, {**old, **locked}, lock)
     if not reason:
         reason = yield from _verify(client, expected if switch is None else expected | {switch.enable: 0.0})
     if not reason and switch is not None:
@@ -120,11 +121,15 @@ def write_and_verify(
     return UploadOutcome(state, reason, held, storage, client.was_armed)
 
 
-def _switch_off(client: ParameterClient, switch: SetSwitch, store: bool) -> Exchange[str]:
-    """Switch the set off, stored: a vehicle that restarts then flies no part of one. Returns why that failed."""
-    reason = yield from _write(client, {switch.enable: 0.0}, {switch.enable: 1.0})
+def _switch_off(client: ParameterClient, switch: SetSwitch, lock: str, store: bool) -> Exchange[str]:
+    """Switch the set off, stored, and the lock, too: a vehicle that restarts then flies no part of a set.
+
+    Not even if somebody switches it on again. Returns why that failed.
+    """
+    off = dict.fromkeys([name for name in (switch.enable, lock) if name], 0.0)
+    reason = yield from _write(client, off, dict.fromkeys(off, 1.0))
     if not reason:
-        reason = yield from _verify(client, {switch.enable: 0.0})
+        reason = yield from _verify(client, off)
     if not reason and store and (yield from client.store()) != "acknowledged":
         reason = f"{switch.enable}: 0 was not stored"
     return reason
