@@ -188,7 +188,7 @@ def _write_locked(
     others = {name: value for name, value in new.items() if name != lock}
     locked = {name: old[name] for name in new if name == lock}
     reason = ""
-    if any(value != old[name] for name, value in others.items()):
+    if locked and any(value != old[name] for name, value in others.items()):
         reason = yield from _write(client, dict.fromkeys(locked, 0.0), locked)
         locked = dict.fromkeys(locked, 0.0)
     if not reason:
