@@ -4,6 +4,7 @@
 #include <stdarg.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 #include <systemlib/mavlink_log.h>
 
 #include <map>
@@ -118,7 +119,13 @@ param_t param_find(const char *name) { return static_cast<param_t>(px4::find(nam
 const char *param_name(param_t handle) { return px4::name(handle); }
 int param_type(param_t handle) { return px4::kFloat[handle] ? PARAM_TYPE_FLOAT : PARAM_TYPE_INT32; }
 void param_set_used(param_t) {}
-bool param_value_is_default(param_t handle) { return px4::values()[handle] == px4::kDefaults[handle]; }
+
+int param_get_default_value(param_t handle, void *value)
+{
+	const float compiled = static_cast<float>(px4::kDefaults[handle]);
+	memcpy(value, &compiled, sizeof(compiled));
+	return 0;
+}
 
 int param_reset(param_t handle)
 {
