@@ -92,15 +92,35 @@ class UploadPlan:
     binding: Binding | None = None
 
     def bound(self, number: float) -> UploadPlan:
-        """The plan for a firmware with this number: it is written last, so a part of a first set does not fly."""
+        """The plan for a firmware with this number."""
         assert self.binding is not None
         write = ParameterWrite(self.binding.stored, "", number, SET_NUMBER.minimum, SET_NUMBER.maximum)
-        return replace(self, settings=(*self.settings, write))
+        return replace(self, settings=(*self.settings, write), fixed=self.fixed | {self.binding.firmware: number})
+
+    @property
+    def lock(self) -> str:
+        """The parameter of `settings` without which a vehicle takes none of the others; empty: there is none."""
+        return next((name for name in self.values if name in LOCKS), "")
+
+    @property
+    def unnumbered(self) -> str:
+        """The firmware's number that our gains from a file lack; empty: they have it, or there are none."""
+        for binding, prefix in ((MODULE_BINDING, PREFIX), (CUSTOM_BINDING, ARDUPILOT_PREFIX)):
+            ours = any(prefix + parameter.code in self.values for parameter in PARAMETERS)
+            if ours and self.binding is None and binding.firmware not in self.fixed:
+                return binding.firmware
+        return ""
 
     @property
     def values(self) -> dict[str, float]:
         """Name -> value to write."""
         return {setting.name: setting.value for setting in self.settings}
+
+
+#: Of our module, and of our custom controller in ArduPilot.
+MODULE_BINDING = Binding(FIRMWARE_NUMBER.name, SET_NUMBER.name)
+CUSTOM_BINDING = Binding(*map(ardupilot_name, MODULE_BINDING))
+LOCKS = (MODULE_BINDING.stored, CUSTOM_BINDING.stored)
 
 
 def _mimo(gains: Gains) -> UploadPlan:
@@ -110,8 +130,7 @@ def _mimo(gains: Gains) -> UploadPlan:
         ParameterWrite(p.name, p.unit, elements[p.code], p.minimum, p.maximum) for p in PARAMETERS if p.writable
     )
     fixed = {p.name: single(elements[p.code]) for p in PARAMETERS if not p.writable}
-    binding = Binding(FIRMWARE_NUMBER.name, SET_NUMBER.name)
-    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY), binding=binding)
+    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY), binding=MODULE_BINDING)
 
 
 #: ArduPilot's choice of a custom controller: ours.
@@ -126,7 +145,7 @@ def _ardupilot_custom(gains: Gains) -> UploadPlan:
         settings=tuple(replace(setting, name=ardupilot_name(setting.name)) for setting in plan.settings),
         fixed={ardupilot_name(name): value for name, value in plan.fixed.items()},
         scale=tuple(map(ardupilot_name, plan.scale)),
-        binding=Binding(ardupilot_name(FIRMWARE_NUMBER.name), ardupilot_name(SET_NUMBER.name)),
+        binding=CUSTOM_BINDING,
         integers=frozenset(CHOSEN),
         requires=CHOSEN,
     )

@@ -105,7 +105,7 @@ class ParameterServer(KeptParameters):
             if not served.writable and value != self.values[name]:
                 raise SitlError(
                     f"{store.path}: {name} is {shortest(value)}, the gains are for {shortest(self.values[name])}: "
-                    "the file belongs to another vehicle; name another file"
+                    "the file is of a vehicle with other gains in its firmware; name another file"
                 )
             if not served.accepts(value):
                 raise SitlError(f"{store.path}: {name}: got {shortest(value)}, {served.range}; correct the line")

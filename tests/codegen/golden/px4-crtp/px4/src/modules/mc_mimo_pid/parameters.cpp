@@ -92,7 +92,7 @@ const char *Parameters::read(Gains &gains)
 {
 	static_assert(sizeof(gains) == kGainCount * sizeof(float), "Gains is a row of floats");
 	float *const values = &gains.kp_o[0][0];
-	int wrong = -1;
+	const char *wrong = nullptr;
 	gains = kGains;
 
 	for (int i = 0; i < kNameCount; i++) {
@@ -118,13 +118,17 @@ const char *Parameters::read(Gains &gains)
 
 		values[i] = value;
 
-		if (!accepted(i, value) && wrong < 0) { wrong = i; }
+		if (!accepted(i, value) && wrong == nullptr) { wrong = param_name(handle); }
 	}
 
-	// PX4 stores values longer than a firmware.
-	if (wrong < 0 && !for_this_firmware(gains, _settings[MIMO_SET_ID])) { wrong = kGainCount + MIMO_SET_ID; }
+	// PX4 stores values longer than a firmware, but not those that equal a value of the present one: in the firmware that
+	// the set is for, it would not be whole.
+	const param_t set_number = param_handle(px4::params::MIMO_SET_ID);
+	const float number = _settings[MIMO_SET_ID];
 
-	return wrong < 0 ? nullptr : param_name(param_handle(kNames[wrong]));
+	if (number > 0.0F && !of_this_firmware(number)) { param_reset(set_number); }
+
+	return wrong != nullptr || for_this_firmware(gains, number) ? wrong : param_name(set_number);
 }
 
 ExcitationSettings Parameters::excitation() const
