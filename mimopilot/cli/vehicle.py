@@ -122,14 +122,12 @@ def restore(
 
     A snapshot that is not whole, holds a part of our gains only, or a value out of its range, is refused.
     """
-    from mimopilot.sitl.mavlink.ground_station.profiles import make_restore_plan, set_warning
+    from mimopilot.sitl.mavlink.ground_station.profiles import make_restore_plan
     from mimopilot.sitl.mavlink.ground_station.session import LinkOptions
     from mimopilot.sitl.mavlink.ground_station.upload_console import upload_with_dialogue
     from mimopilot.sitl.mavlink.wire.parameter_files import read_parameters
 
     plan = make_restore_plan(read_parameters(parameters), str(parameters))
-    doubt = set_warning(plan.values | plan.fixed)
-    warn(parameters, [doubt] if doubt else [])
     stem = parameters.with_name(
         re.sub(r"(\.before-\d+)?\.\w+$", "", parameters.name)
     )  # the next snapshot gets the next number

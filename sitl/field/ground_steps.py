@@ -254,7 +254,9 @@ def _check_flown(run: AutotuneRun, flight: Experiment) -> None:
     """Refuse a log of a flight with other gains than the new ones."""
     if flight.flown is None:
         raise SitlError(f"{flight.source}: does not say which gains flew", exit_code=1)
-    flown, wanted = make_plan(flight.flown, run.options.profile).values, new_plan(run).values
+    flown, wanted = (
+        make_plan(gains, run.options.profile).values for gains in (flight.flown, load_gains(run.file(GAINS)))
+    )
     other = [name for name, value in wanted.items() if not math.isclose(flown[name], value, rel_tol=SAME)]
     if other:
         raise SitlError(f"{flight.source}: was flown with other gains ({', '.join(other[:3])}, ...)", exit_code=1)

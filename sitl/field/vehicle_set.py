@@ -11,10 +11,15 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.field.autotune_run import GAINS, SNAPSHOT, AutotuneRun
 from mimopilot.sitl.field.flight_commands import wait_until_disarmed
 from mimopilot.sitl.field.flight_watch import start_watch
-from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, make_plan, make_restore_plan
+from mimopilot.sitl.mavlink.ground_station.profiles import (
+    MODULE_BINDING,
+    UploadPlan,
+    make_plan,
+    make_restore_plan,
+)
 from mimopilot.sitl.mavlink.ground_station.session import Session
 from mimopilot.sitl.mavlink.ground_station.stock_parameters import read_stock_parameters
-from mimopilot.sitl.mavlink.ground_station.transaction import Upload
+from mimopilot.sitl.mavlink.ground_station.transaction import Upload, read_binding
 from mimopilot.sitl.mavlink.ground_station.upload import write_and_verify
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.tuning.gains_file import load_gains
@@ -45,6 +50,8 @@ def save_snapshot(run: AutotuneRun) -> dict[str, float]:
     names = _set_names(run)
     with run.vehicle() as session:
         held = session.read(names, run.options.profile)
+        if run.options.profile == MIMO:
+            held |= read_binding(MODULE_BINDING, session)
         vehicle = session.vehicle
     path = run.file(SNAPSHOT)
     write_atomically(path, parameter_text("qgc", held, vehicle.system, vehicle.component))
@@ -61,8 +68,15 @@ def old_plan(run: AutotuneRun) -> UploadPlan:
 
 
 def new_plan(run: AutotuneRun) -> UploadPlan:
-    """The new set, from the gains file."""
-    return make_plan(load_gains(run.file(GAINS)), run.options.profile)
+    """The new set, from the gains file, for the firmware that the snapshot is of."""
+    plan = make_plan(load_gains(run.file(GAINS)), run.options.profile)
+    if plan.binding is None:
+        return plan
+    path = run.file(SNAPSHOT)
+    number = read_parameters(path).get(plan.binding.firmware)
+    if number is None:
+        raise SitlError(f"{path}: lacks {plan.binding.firmware}: an older mimopilot wrote it; give another --out")
+    return plan.bound(number)
 
 
 def compare_set(run: AutotuneRun, session: Session) -> str:
@@ -96,7 +110,13 @@ def write_set(run: AutotuneRun, plan: UploadPlan) -> None:
             run.dialogue.tell("the vehicle is armed: land and disarm it")
             session.run(wait_until_disarmed(session.run(start_watch(session.client))))
     with run.vehicle(armed=False) as session:
-        held = session.read(list(plan.values), run.options.profile)
-        outcome = session.run(write_and_verify(session.client, plan.values, held))
+        held = session.read([*plan.values, *plan.fixed], run.options.profile)
+        for name, value in plan.fixed.items():
+            if held[name] != value:
+                raise SitlError(
+                    f"{name}: the vehicle has {held[name]:.6g}, the values are for {value:.6g}; nothing was written",
+                    exit_code=1,
+                )
+        outcome = session.run(write_and_verify(session.client, plan.values, held, lock=plan.lock))
         done = Upload(plan, held, session.vehicle, outcome, run.file(SNAPSHOT), run.options.connect)
     done.check()

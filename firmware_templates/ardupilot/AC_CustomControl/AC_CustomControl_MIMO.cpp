@@ -148,11 +148,15 @@ bool AC_CustomControl_MIMO::update_parameters()
 	_wrong = -1;
 
 	for (int32_t i = kLimited - 1; i >= 0; i--) {
-		const float value = _values[i].get();
+		if (published(i)) {
+			// A value that a parameter file of another build has stored would tell of another firmware.
+			_values[i].set(programmed(i));
 
-		if (i < kGainCount) { gain[i] = value; }
+		} else if (!accepted(i, _values[i].get())) {
+			_wrong = i;
+		}
 
-		if (!allowed(i, value)) { _wrong = i; }
+		if (i < kGainCount) { gain[i] = _values[i].get(); }
 	}
 
 	if (_wrong < 0 && !for_this_firmware(gains, setting(SET_ID))) { _wrong = kForeign; }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from mimopilot.codegen.firmware_number import firmware_number
 from mimopilot.common.console import print_json, print_table
 from mimopilot.common.errors import check_choice
 from mimopilot.common.files import write_atomically
@@ -13,6 +14,7 @@ from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
 from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, make_plan, module_parameters
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
+from mimopilot.sitl.mavlink.ground_station.transaction import read_binding
 from mimopilot.sitl.mavlink.wire.float32 import shortest
 from mimopilot.sitl.mavlink.wire.parameter_files import FORMATS, parameter_text
 from mimopilot.tuning.acceptance import check_verdict
@@ -30,6 +32,8 @@ GENERATED = {
 def compare(file: Path, options: LinkOptions, profile: str | None = None) -> None:
     """Compare a gains file with the vehicle's parameters; by default with those of the controller that it is for.
 
+    The number of the vehicle's firmware must stand with them, else they would not fly.
+
     Raises
     ------
     SitlError
@@ -40,6 +44,11 @@ def compare(file: Path, options: LinkOptions, profile: str | None = None) -> Non
     wanted, units = plan.values | plan.fixed, {setting.name: setting.unit for setting in plan.settings}
     with open_session(options, crazyflie=True) as vehicle:
         held = vehicle.read(list(wanted), profile or "")
+        if plan.binding is not None:
+            held |= read_binding(plan.binding, vehicle)
+            number = held[plan.binding.firmware]
+            if number != firmware_number(gains):  # else they are the firmware's own, which need no number
+                wanted[plan.binding.stored] = number
     differ = [name for name, value in wanted.items() if held[name] != value]
     if options.as_json:
         both = {name: {"file": value, "vehicle": held[name]} for name, value in wanted.items()}

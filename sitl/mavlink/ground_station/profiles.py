@@ -92,15 +92,35 @@ class UploadPlan:
     binding: Binding | None = None
 
     def bound(self, number: float) -> UploadPlan:
-        """The plan for a firmware with this number: it is written last, so a part of a first set does not fly."""
+        """The plan for a firmware with this number."""
         assert self.binding is not None
         write = ParameterWrite(self.binding.stored, "", number, SET_NUMBER.minimum, SET_NUMBER.maximum)
-        return replace(self, settings=(*self.settings, write))
+        return replace(self, settings=(*self.settings, write), fixed=self.fixed | {self.binding.firmware: number})
+
+    @property
+    def lock(self) -> str:
+        """The parameter of `settings` without which a vehicle takes none of the others; empty: there is none."""
+        return next((name for name in self.values if name in LOCKS), "")
+
+    @property
+    def unnumbered(self) -> str:
+        """The firmware's number that our gains from a file lack; empty: they have it, or there are none."""
+        for binding, prefix in ((MODULE_BINDING, PREFIX), (CUSTOM_BINDING, ARDUPILOT_PREFIX)):
+            ours = any(prefix + parameter.code in self.values for parameter in PARAMETERS)
+            if ours and self.binding is None and binding.firmware not in self.fixed:
+                return binding.firmware
+        return ""
 
     @property
     def values(self) -> dict[str, float]:
         """Name -> value to write."""
         return {setting.name: setting.value for setting in self.settings}
+
+
+#: Of our module, and of our custom controller in ArduPilot.
+MODULE_BINDING = Binding(FIRMWARE_NUMBER.name, SET_NUMBER.name)
+CUSTOM_BINDING = Binding(*map(ardupilot_name, MODULE_BINDING))
+LOCKS = (MODULE_BINDING.stored, CUSTOM_BINDING.stored)
 
 
 def _mimo(gains: Gains) -> UploadPlan:
@@ -110,8 +130,7 @@ def _mimo(gains: Gains) -> UploadPlan:
         ParameterWrite(p.name, p.unit, elements[p.code], p.minimum, p.maximum) for p in PARAMETERS if p.writable
     )
     fixed = {p.name: single(elements[p.code]) for p in PARAMETERS if not p.writable}
-    binding = Binding(FIRMWARE_NUMBER.name, SET_NUMBER.name)
-    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY), binding=binding)
+    return UploadPlan(settings, fixed, tuple(p.name for p in IDENTITY), binding=MODULE_BINDING)
 
 
 #: ArduPilot's choice of a custom controller: ours.
@@ -126,7 +145,7 @@ def _ardupilot_custom(gains: Gains) -> UploadPlan:
         settings=tuple(replace(setting, name=ardupilot_name(setting.name)) for setting in plan.settings),
         fixed={ardupilot_name(name): value for name, value in plan.fixed.items()},
         scale=tuple(map(ardupilot_name, plan.scale)),
-        binding=Binding(ardupilot_name(FIRMWARE_NUMBER.name), ardupilot_name(SET_NUMBER.name)),
+        binding=CUSTOM_BINDING,
         integers=frozenset(CHOSEN),
         requires=CHOSEN,
     )
@@ -290,27 +309,6 @@ def violated_range(name: str, value: float) -> str:
     if ours is None or ours.minimum <= value <= ours.maximum:
         return ""
     return f"{ours.minimum:g} to {ours.maximum:g} {ours.unit}".rstrip() + f" ({ours.description})"
-
-
-def set_warning(values: Mapping[str, float]) -> str:
-    """Why the firmware of a vehicle would not fly gains of ours from a file; empty: it would, or they are none of ours.
-
-    Parameters
-    ----------
-    values : mapping
-        Name -> value; all that would be written, and what the vehicle has fixed.
-    """
-    for prefix in (PREFIX, ARDUPILOT_PREFIX):
-        if not any(prefix + p.code in values for p in PARAMETERS if p.writable):
-            continue
-        number, stored = (prefix + p.name.removeprefix(PREFIX) for p in (FIRMWARE_NUMBER, SET_NUMBER))
-        then = f"firmware with other gains does not fly it: upload gains, or set {stored} to the vehicle's {number}"
-        if stored not in values:
-            return f"the set has no {stored}; {then}"
-        if values[stored] not in (0.0, values.get(number, values[stored])):
-            two = f"{stored} {values[stored]:.6g} of another firmware than {number} {values[number]:.6g}"
-            return f"the set holds {two}; {then}"
-    return ""
 
 
 def make_restore_plan(values: Mapping[str, float], source: str) -> UploadPlan:

@@ -142,8 +142,10 @@ def upload_and_verify(
         _check_choice(plan, vehicle)
         held = vehicle.read([*plan.values, *plan.fixed], plan.profile)
         if plan.binding is not None:
-            held |= _read_binding(plan.binding, vehicle)
+            held |= read_binding(plan.binding, vehicle)
             plan = plan.bound(held[plan.binding.firmware])
+        if plan.unnumbered:
+            _check_unnumbered(plan.unnumbered, vehicle)
         if ask_scale:
             held |= _read_scale(plan, vehicle)
         switch = SWITCHES.get(vehicle.vehicle.autopilot)
@@ -175,7 +177,7 @@ def upload_and_verify(
             snapshot = _save_snapshot(plan, held, vehicle.vehicle, options) if changes else None
             if snapshot is not None and dialogue is not None:
                 dialogue.saved(snapshot)
-            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch))
+            outcome = vehicle.run(write_and_verify(vehicle.client, plan.values, held, switch=switch, lock=plan.lock))
         return Upload(plan, held, vehicle.vehicle, outcome, snapshot, options.connect)
 
 
@@ -196,8 +198,14 @@ def _check_choice(plan: UploadPlan, vehicle: Session) -> None:
             )
 
 
-def _read_binding(binding: Binding, vehicle: Session) -> dict[str, float]:
-    """The firmware's number, and that of the stored set; the vehicle has our other parameters."""
+def read_binding(binding: Binding, vehicle: Session) -> dict[str, float]:
+    """The firmware's number, and that of the stored set; the vehicle has our other parameters.
+
+    Raises
+    ------
+    SitlError
+        If its firmware has no number.
+    """
     try:
         return vehicle.run(read_values(vehicle.client, binding))
     except NoParametersError as error:
@@ -206,6 +214,16 @@ def _read_binding(binding: Binding, vehicle: Session) -> dict[str, float]:
             "stored gains of any other; generate it again and flash it; nothing was written",
             exit_code=1,
         ) from error
+
+
+def _check_unnumbered(number: str, vehicle: Session) -> None:
+    """Refuse gains of an unknown firmware, unless the vehicle's has no number either."""
+    if vehicle.run(vehicle.client.read([number], "reading"))[number].absent:
+        return
+    raise SitlError(
+        f"the file holds our gains without {number}, so it is not known for which firmware they are; upload gains "
+        "instead (mimopilot upload); nothing was written"
+    )
 
 
 def _read_scale(plan: UploadPlan, vehicle: Session) -> dict[str, float]:

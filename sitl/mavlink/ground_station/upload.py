@@ -76,6 +76,7 @@ def write_and_verify(
     old: Mapping[str, float],
     store: bool = True,
     switch: SetSwitch | None = None,
+    lock: str = "",
 ) -> Exchange[UploadOutcome]:
     """Write the differences, verify all, store, verify all again; on any failure roll back.
 
@@ -92,14 +93,18 @@ def write_and_verify(
     switch : SetSwitch, optional
         Of a vehicle that takes a set as a whole; `old` has its value. It is switched off and back also if no value
         differs: what it holds need not be what it flies.
+    lock : str
+        Name of the parameter without which the vehicle takes none of the others, see `UploadPlan.lock`: 0 while they
+        are written, so no part of a set flies, whatever happens. Empty: there is none.
     """
     expected = {**old, **new}
     client.possible = {name: {value} for name, value in old.items()}
     client.check_contradictions(True)
     storage = ""
-    reason = "" if switch is None else (yield from _switch_off(client, switch, store))
+    reason = "" if switch is None else (yield from _switch_off(client, switch, lock, store))
     if not reason:
-        reason = yield from _write(client, new, old)
+        locked = {lock: 0.0} if lock and switch is not None else {}
+        reason = yield from _write_locked(client, new, {**old, **locked}, lock)
     if not reason:
         reason = yield from _verify(client, expected if switch is None else expected | {switch.enable: 0.0})
     if not reason and switch is not None:
@@ -110,17 +115,21 @@ def write_and_verify(
         reason = (yield from client.wait_for_autosave()) or (yield from _verify(client, expected))
     state = "verified"
     if reason:
-        state, storage = yield from _roll_back(client, new, old, store, switch)
+        state, storage = yield from _roll_back(client, new, old, store, switch, lock)
     client.check_contradictions(False)
     held = {name: tuple(sorted(values)) for name, values in client.possible.items()}
     return UploadOutcome(state, reason, held, storage, client.was_armed)
 
 
-def _switch_off(client: ParameterClient, switch: SetSwitch, store: bool) -> Exchange[str]:
-    """Switch the set off, stored: a vehicle that restarts then flies no part of one. Returns why that failed."""
-    reason = yield from _write(client, {switch.enable: 0.0}, {switch.enable: 1.0})
+def _switch_off(client: ParameterClient, switch: SetSwitch, lock: str, store: bool) -> Exchange[str]:
+    """Switch the set off, stored, and the lock, too: a vehicle that restarts then flies no part of a set.
+
+    Not even if somebody switches it on again. Returns why that failed.
+    """
+    off = dict.fromkeys([name for name in (switch.enable, lock) if name], 0.0)
+    reason = yield from _write(client, off, dict.fromkeys(off, 1.0))
     if not reason:
-        reason = yield from _verify(client, {switch.enable: 0.0})
+        reason = yield from _verify(client, off)
     if not reason and store and (yield from client.store()) != "acknowledged":
         reason = f"{switch.enable}: 0 was not stored"
     return reason
@@ -142,6 +151,7 @@ def _roll_back(
     old: Mapping[str, float],
     store: bool,
     switch: SetSwitch | None,
+    lock: str,
 ) -> Exchange[tuple[str, str]]:
     """Write the old values back; returns the state of the upload and of the storage."""
     if not client.written:
@@ -151,7 +161,11 @@ def _roll_back(
     back = {name: old[name] for name in new if name in client.written or client.possible[name] != {old[name]}}
     if switch is not None:
         yield from client.write({switch.enable: 0.0}, "switching", keep_going=True)
+    last = {name: back.pop(name) for name in (lock,) if name in back}
+    if last and back:
+        yield from client.write(dict.fromkeys(last, 0.0), "rolling back", keep_going=True)
     yield from client.write(back, "rolling back", keep_going=True)
+    yield from client.write(last, "rolling back", keep_going=True)
     if client.lost:
         return "mixed", ""
     refused = ""
@@ -165,6 +179,23 @@ def _roll_back(
     answers = yield from client.read(list(old), "verifying", keep_going=True)
     restored = all(answers[name].value == old[name] and client.possible[name] == {old[name]} for name in old)
     return "rolled back" if restored and not refused else "mixed", storage
+
+
+def _write_locked(
+    client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float], lock: str
+) -> Exchange[str]:
+    """Write the differences, with the lock as 0 until all others are written; returns why that failed."""
+    others = {name: value for name, value in new.items() if name != lock}
+    locked = {name: old[name] for name in new if name == lock}
+    reason = ""
+    if locked and any(value != old[name] for name, value in others.items()):
+        reason = yield from _write(client, dict.fromkeys(locked, 0.0), locked)
+        locked = dict.fromkeys(locked, 0.0)
+    if not reason:
+        reason = yield from _write(client, others, old)
+    if not reason and locked:
+        reason = yield from _write(client, {lock: new[lock]}, locked)
+    return reason
 
 
 def _write(client: ParameterClient, new: Mapping[str, float], old: Mapping[str, float]) -> Exchange[str]:

@@ -102,16 +102,10 @@ class ParameterServer(KeptParameters):
             if name not in self.index:
                 raise SitlError(f"{store.path}: {name}: this vehicle has no such parameter; delete the line")
             served = self.table[self.index[name]]
-            if name == FIRMWARE_NUMBER.name and value != self.values[name]:
-                raise SitlError(
-                    f"{store.path}: {name} is {value:.6g}, the gains at the start have {self.values[name]:.6g}: the "
-                    "values were stored over other gains; start with those, or name another file and "
-                    "upload the gains to fly"
-                )
             if not served.writable and value != self.values[name]:
                 raise SitlError(
                     f"{store.path}: {name} is {shortest(value)}, the gains are for {shortest(self.values[name])}: "
-                    "the file belongs to another vehicle; name another file"
+                    "the file is of a vehicle with other gains in its firmware; name another file"
                 )
             if not served.accepts(value):
                 raise SitlError(f"{store.path}: {name}: got {shortest(value)}, {served.range}; correct the line")

@@ -47,13 +47,10 @@ Vector3f vector()
     return Vector3f(v[0], v[1], v[2]);
 }
 
-void set_parameter(const char *name, float value)
+AP_Float &parameter(const char *name)
 {
     for (const AP_Param::GroupInfo *one = AP_Param::table(); one->name != nullptr; one++) {
-        if (strcmp(one->name, name) == 0) {
-            AP_Param::at(*one).set(value);
-            return;
-        }
+        if (strcmp(one->name, name) == 0) { return AP_Param::at(*one); }
     }
 
     abort();
@@ -88,10 +85,15 @@ int main()
             read(value, 1);
 
             if (word[0] == 'p') {
-                set_parameter(name, value[0]);
+                parameter(name).set(value[0]);
             } else {
                 AP_Param::others()[name] = value[0];
             }
+
+        } else if (strcmp(word, "value") == 0) {
+            if (scanf("%31s", name) != 1) { abort(); }
+
+            printf("text %.9g\n", static_cast<double>(parameter(name).get()));
 
         } else if (strcmp(word, "attitude") == 0) {
             attitude.attitude = quaternion();

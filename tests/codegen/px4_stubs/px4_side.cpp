@@ -118,7 +118,14 @@ param_t param_find(const char *name) { return static_cast<param_t>(px4::find(nam
 const char *param_name(param_t handle) { return px4::name(handle); }
 int param_type(param_t handle) { return px4::kFloat[handle] ? PARAM_TYPE_FLOAT : PARAM_TYPE_INT32; }
 void param_set_used(param_t) {}
-bool param_value_is_default(param_t handle) { return px4::values()[handle] == px4::kDefaults[handle]; }
+
+int param_get_default_value(param_t handle, void *value)
+{
+	const auto real = static_cast<float>(px4::kDefaults[handle]);
+	const auto whole = static_cast<int32_t>(px4::kDefaults[handle]);
+	memcpy(value, px4::kFloat[handle] ? static_cast<const void *>(&real) : &whole, sizeof(real));
+	return 0;
+}
 
 int param_reset(param_t handle)
 {

@@ -60,7 +60,10 @@ def test_gains_arrive_are_taken_and_stored_with_the_switch_last(mimopilot, monke
 
 
 def test_a_part_of_a_set_never_flies_and_is_never_started_with(mimopilot, monkeypatch, certified, old, new):
+    old = old | {"MIMO_SET_ID": old["MIMO_FW_ID"]}  # of an earlier upload
     vehicle = connect(monkeypatch, ScriptedCrazyflie(old))
+    sets = [on_vehicle({name: values[name] for name in new}) for values in (old, new)]
+    vehicle.stored = sets[0] | {"mimo.EN": 1.0}
     seen, write, store = [], vehicle.write, vehicle.store
 
     def watched(step, *arguments):
@@ -75,10 +78,10 @@ def test_a_part_of_a_set_never_flies_and_is_never_started_with(mimopilot, monkey
     for values, stored in seen:
         if values["mimo.EN"] == 1.0:
             assert {name: values[name] for name in on_vehicle(old)} in whole
-        # It starts with what is stored, if it starts with our controller at all.
-        assert not stored.get("mimo.EN") or stored == on_vehicle(new) | {"mimo.EN": 1.0}
-    assert any(0 < len(stored) < len(new) for _, stored in seen)
-    assert vehicle.stored["mimo.EN"] == 1.0
+        # It starts with what is stored, if its number is right, even if somebody switches it on.
+        assert stored["mimo.SET_ID"] == 0.0 or {name: stored[name] for name in sets[0]} in sets
+    assert any(stored["mimo.SET_ID"] == 0.0 for _, stored in seen)
+    assert vehicle.stored == sets[1] | {"mimo.EN": 1.0}
 
 
 @pytest.mark.parametrize(
@@ -129,7 +132,7 @@ def test_a_link_that_dies_in_between_leaves_the_stock_controller_and_says_what_i
     snapshot = certified.with_name("my.before-1.params")
     parts = [f"{name} holds" for name in (*changed, "MIMO_EN")]
     assert_one_clear_line(failed, "the link was lost", *parts, f"restore {snapshot} --connect {URI}", code=1)
-    assert (vehicle.values["mimo.EN"], vehicle.stored) == (0.0, {"mimo.EN": 0.0})
+    assert (vehicle.values["mimo.EN"], vehicle.stored) == (0.0, {"mimo.EN": 0.0, "mimo.SET_ID": 0.0})
     vehicle.fault = ""
     back = mimopilot("restore", snapshot, "--connect", URI, "--yes")
     assert back.returncode == 0, back.stderr
@@ -141,11 +144,11 @@ def test_a_vehicle_that_does_not_store_is_no_success_and_the_next_upload_stores_
 ):
     vehicle = connect(monkeypatch, ScriptedCrazyflie(old, "does not store"))
     failed = upload(mimopilot, certified)
-    assert_one_clear_line(failed, "not stored", "when it restarts, the stock PID flies", code=1)
-    assert vehicle.stored == {"mimo.EN": 0.0}
+    assert_one_clear_line(failed, "MIMO_EN: 0 was not stored; the old values were restored", code=1)
+    assert held(vehicle, new) == {name: old[name] for name in new}
     vehicle.fault = ""
     again = upload(mimopilot, certified)
-    assert f"{WRITTEN} parameters verified, 0 of them written" in again.stdout
+    assert f"{WRITTEN} parameters verified, {WRITTEN} of them written" in again.stdout
     assert vehicle.stored == on_vehicle(new) | {"mimo.EN": 1.0}
 
 

@@ -89,7 +89,7 @@ class FieldVehicle(FlyingVehicle):
         published = {**gains.identity(), FIRMWARE_NUMBER.name: 123456.0}
         values = {**make_plan(gains).values, SET_NUMBER.name: 0.0, **fixed, **published}
         super().__init__(**values, **keywords)
-        self.autopilot, self.free = 0, None
+        self.autopilot, self.free, self.own = 0, None, self.set
         self.stored_values = dict(self.values)
         self.logs = ScriptedLogs({})
         self.logs.now = lambda: self.clock
@@ -138,7 +138,10 @@ class FieldVehicle(FlyingVehicle):
 
     def execute(self, command, params):
         result = 0
-        if command == 400 and params[0] == 1:
+        bound = self.set == self.own or self.values[SET_NUMBER.name] == self.values[FIRMWARE_NUMBER.name]
+        if command == 400 and params[0] == 1 and not bound:
+            result = 1  # as PX4 with our module: the stored gains are for another firmware
+        elif command == 400 and params[0] == 1:
             self.armed, self.content = True, ""
         elif command == 22 and self.armed:
             above_sea = self.autopilot == 12  # as PX4 takes it

@@ -115,6 +115,10 @@ def test_a_parameter_file_holds_what_an_upload_writes(mimopilot, certified, gain
         differ = mimopilot(*arguments, "--connect", link.url)
         assert differ.returncode == 1 and "CC3_RP_RR" in differ.stdout
         vehicle.values.update(read)
+        unbound = mimopilot(*arguments, "--connect", link.url)
+        assert_one_clear_line(unbound, "1 of 49 parameters differ", code=1)
+        assert "CC3_SET_ID" in unbound.stdout
+        vehicle.values["CC3_SET_ID"] = vehicle.values["CC3_FW_ID"]  # as the file's comment says
         assert mimopilot(*arguments, "--connect", link.url).returncode == 0
         again = mimopilot("params", "--profile", PROFILE, "--connect", link.url, "--format", "mavproxy")
     assert again.stdout.splitlines()[1:] == [line for line in text.splitlines()[1:] if line[0] != "#"]

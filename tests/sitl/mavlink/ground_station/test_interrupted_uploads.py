@@ -93,6 +93,35 @@ def test_ctrl_c_between_any_two_writes_ends_with_the_old_values():
         assert "interrupted" in outcome.reason
 
 
+@pytest.mark.parametrize("stored", [0.0, 7.0])
+def test_the_number_of_the_firmware_never_stands_beside_a_part_of_a_set(stored):
+    """With any other number a vehicle does not fly its stored values: 7 is its own."""
+    old, new = OLD | {"LOCK": stored}, NEW | {"LOCK": 7.0}
+    states = set()
+    for count in (1, 4, len(NEW), len(NEW) + 1, 99):
+        for fault in ("", "disconnects"):
+            vehicle = ScriptedVehicle(old, fault, after=count)
+            link = SimulatedLink(vehicle, latency=0.05)
+            client = ParameterClient(link.now())
+            run_exchange(client.await_heartbeat(), link)
+            held = run_exchange(read_values(client, list(new)), link)
+            write, seen = vehicle.write, []
+
+            def noting(name, value, vehicle=vehicle, write=write, seen=seen, client=client, count=count, fault=fault):
+                answer = write(name, value)
+                client.interrupted = not fault and vehicle.writes >= count
+                seen.append(dict(vehicle.values))
+                return answer
+
+            vehicle.write = noting
+            outcome = run_exchange(write_and_verify(client, new, held, lock="LOCK"), link)
+            states.add(outcome.state)
+            assert all(values in (old, new) or {**values, "LOCK": 7.0} == new for values in seen if values["LOCK"] == 7)
+            assert all(value in outcome.held[name] for name, value in vehicle.values.items())
+            assert vehicle.values == {"verified": new, "rolled back": old}.get(outcome.state, vehicle.values)
+    assert states == {"verified", "rolled back", "mixed"}
+
+
 def test_no_new_value_is_written_after_the_vehicle_arms():
     vehicle = ScriptedVehicle(OLD, "arms", after=3)
     link = SimulatedLink(vehicle, latency=0.2)

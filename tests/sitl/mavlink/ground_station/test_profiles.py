@@ -8,7 +8,7 @@ import pytest
 
 from mimopilot.codegen.layout import to_array
 from mimopilot.sitl.errors import SitlError
-from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, law_of, make_plan, make_restore_plan, set_warning
+from mimopilot.sitl.mavlink.ground_station.profiles import PROFILES, law_of, make_plan, make_restore_plan
 from mimopilot.sitl.mavlink.wire.float32 import single
 from mimopilot.tuning.errors import TuningError
 from mimopilot.tuning.gains import Limits
@@ -120,13 +120,3 @@ def test_a_snapshot_must_be_complete_and_within_our_ranges(gains):
     assert (foreign.values, foreign.profile) == ({"MC_ROLL_P": 99.0}, "px4-stock")
     assert make_restore_plan({"ATC_ANG_RLL_P": 5.0}, "x").profile == "ardupilot-stock"
     assert make_restore_plan({"WPNAV_SPEED": 5.0}, "x").profile == ""
-
-
-def test_a_set_that_other_firmware_does_not_fly_is_told(gains):
-    values = make_plan(gains).values
-    assert set_warning(values).startswith("the set has no MIMO_SET_ID; firmware with other gains does not fly it")
-    for stored, fits in ((0.0, True), (5.0, True), (6.0, False)):
-        told = set_warning(values | {"MIMO_FW_ID": 5.0, "MIMO_SET_ID": stored})
-        assert told == "" if fits else "MIMO_SET_ID 6 of another firmware than MIMO_FW_ID 5" in told
-    assert set_warning({"CC3_RP_RR": 0.1}).startswith("the set has no CC3_SET_ID")
-    assert set_warning({"MC_ROLL_P": 6.5}) == ""

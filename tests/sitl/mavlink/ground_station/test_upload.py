@@ -266,7 +266,7 @@ def test_parameter_files_are_written_compared_and_read_from_a_vehicle(mimopilot,
         assert read_parameters(tmp_path / "held.params") == named(old, gains_only)
         differ = mimopilot("params", certified, "--connect", link.url)
         assert "MIMO_RP_RR" in differ.stdout
-        assert_one_clear_line(differ, f"{len(gains_only)} of {len(PARAMETERS)} parameters differ", code=1)
+        assert_one_clear_line(differ, f"{len(gains_only) + 1} of {len(PARAMETERS) + 1} parameters differ", code=1)
         link.vehicle.values.update(new)
         same = mimopilot("params", certified, "--connect", link.url, "--json")
         assert (same.returncode, json.loads(same.stdout)["equal"]) == (0, True)
@@ -291,7 +291,7 @@ def test_our_sitl_accepts_gains_in_flight_only_if_forced(mimopilot, tmp_path):
             assert found["parameters"][name]["held"] == [make_plan(tuned).values[name]]
         same = mimopilot("params", "tuned.gains.toml", "--connect", url, "--json")
         assert json.loads(same.stdout)["equal"]
-        assert len(json.loads(same.stdout)["parameters"]) == len(PARAMETERS)
+        assert len(json.loads(same.stdout)["parameters"]) == len(PARAMETERS) + 1  # and the number
         back = mimopilot("restore", found["snapshot"], "--connect", url, "--yes", "--force-armed")
         assert back.returncode == 0
         assert "4 of them written" in back.stdout  # with the number of the firmware

@@ -196,6 +196,10 @@ def test_an_incomplete_or_out_of_range_snapshot_is_refused_before_contacting_the
             refused = mimopilot("restore", "bad.params", "--connect", link.url, "--yes")
             assert_one_clear_line(refused, "bad.params", *parts)
             assert (vehicle.reads, vehicle.writes) == (reads, writes)
+        (tmp_path / "bad.params").write_text("".join(line for line in lines[1:] if "MIMO_FW_ID" not in line))
+        refused = mimopilot("restore", "bad.params", "--connect", link.url, "--yes")
+        assert_one_clear_line(refused, "our gains without MIMO_FW_ID", "mimopilot upload", "nothing was written")
+        assert vehicle.writes == writes
         (tmp_path / "unsealed.params").write_text(unsealed)
         assert mimopilot("restore", "unsealed.params", "--connect", link.url, "--yes").returncode == 0
         assert held_gains(vehicle, new) == {name: old[name] for name in new}

@@ -154,8 +154,8 @@ LINE = "1\t1\t{}\t{}\t9\n"
         (LINE.format("MIMO_RP_RR", "99"), "MIMO_RP_RR: got 99.0, expected 0.0001 to 5"),
         (LINE.format("MIMO_EX_SEED", "1.5"), "MIMO_EX_SEED: got 1.5, expected a whole number"),
         (LINE.format("MIMO_TS", "0.002"), "MIMO_TS is 0.002, the gains are for 0.004"),
-        (LINE.format("MIMO_SCALE_R", "1"), "belongs to another vehicle"),
-        (LINE.format("MIMO_FW_ID", "1"), "MIMO_FW_ID is 1, .*stored over other gains; start with those"),
+        (LINE.format("MIMO_SCALE_R", "1"), "of a vehicle with other gains"),
+        (LINE.format("MIMO_FW_ID", "7"), "of a vehicle with other gains"),
     ],
 )
 def test_an_invalid_file_is_one_clear_error_and_stays_unchanged(tmp_path, content, message):

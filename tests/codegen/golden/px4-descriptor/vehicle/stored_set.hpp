@@ -2,7 +2,6 @@
 // Stored parameters outlive a new firmware.
 #pragma once
 
-#include <math.h>
 #include <string.h>
 
 #include "gains.hpp"
@@ -10,15 +9,18 @@
 namespace mimopilot
 {
 
-// Of the gains compiled in, their unit of torque and the parameters' names.
+// Of the gains compiled in, their unit of torque and the parameters' names. Exact in single precision.
 constexpr float kFirmwareNumber = 972901.0F;
+
+// Whether a set of parameters with this number was written for this firmware.
+inline bool of_this_firmware(float number) { return memcmp(&number, &kFirmwareNumber, sizeof(number)) == 0; }
 
 // Whether a set of parameters may fly: it was written for this firmware, whose number is then stored with it, or it is the
 // firmware's own. Another one may be for another vehicle, period or unit of torque, and mixed with values of this firmware:
 // autopilots do not store what equals the value compiled in.
 inline bool for_this_firmware(const Gains &set, float number)
 {
-	return fabsf(number - kFirmwareNumber) < 0.5F || memcmp(&set, &kGains, sizeof(set)) == 0;
+	return of_this_firmware(number) || memcmp(&set, &kGains, sizeof(set)) == 0;
 }
 
 }  // namespace mimopilot

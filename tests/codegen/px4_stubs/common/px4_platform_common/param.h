@@ -18,7 +18,7 @@ param_t param_find(const char *name);
 const char *param_name(param_t handle);
 int param_type(param_t handle);
 void param_set_used(param_t handle);
-bool param_value_is_default(param_t handle);
+int param_get_default_value(param_t handle, void *value);
 int param_reset(param_t handle);
 int param_get(param_t handle, float *value);
 int param_get(param_t handle, int32_t *value);

@@ -38,13 +38,13 @@ constexpr float kPublished[] = {
 // Those that are no settings.
 constexpr int kLimited = kGainCount + 4;
 
-// Whether one of these may have this value; what is fixed in the firmware has one.
-inline bool allowed(int place, float value)
-{
-	if (place >= kGainCount) { return value >= kPublished[place - kGainCount] && value <= kPublished[place - kGainCount]; }
+// Whether the firmware alone sets it.
+inline bool published(int place) { return place >= kGainCount || fixed(place); }
 
-	const float only = (&kGains.kp_o[0][0])[place];
-	return fixed(place) ? value >= only && value <= only : accepted(place, value);
+// The value compiled in.
+inline float programmed(int place)
+{
+	return place < kGainCount ? (&kGains.kp_o[0][0])[place] : kPublished[place - kGainCount];
 }
 
 }  // namespace mimopilot

@@ -98,15 +98,18 @@ const char *Parameters::read(Gains &gains)
 	for (int i = 0; i < kNameCount; i++) {
 		const param_t handle = param_handle(kNames[i]);
 		param_set_used(handle);  // a log keeps no others
+		const float value = parameter_value(kNames[i]);
 
 		if (i < kGainCount ? fixed(i) : i >= kGainCount + kSettingCount) {
-			// Only published. A value that a parameter file has stored would tell of another firmware.
-			if (!param_value_is_default(handle)) { param_reset(handle); }
+			// Only published. A value that a parameter file has stored would tell of another firmware. (PX4's
+			// param_value_is_default() takes any smaller value for the default.)
+			float programmed;
+			param_get_default_value(handle, &programmed);
+
+			if (memcmp(&value, &programmed, sizeof(value)) != 0) { param_reset(handle); }
 
 			continue;
 		}
-
-		const float value = parameter_value(kNames[i]);
 
 		if (i >= kGainCount) {
 			_settings[i - kGainCount] = value;
@@ -118,8 +121,14 @@ const char *Parameters::read(Gains &gains)
 		if (!accepted(i, value) && wrong == nullptr) { wrong = param_name(handle); }
 	}
 
-	// PX4 stores values longer than a firmware.
-	return wrong != nullptr || for_this_firmware(gains, _settings[MIMO_SET_ID]) ? wrong : "MIMO_SET_ID";
+	// PX4 stores values longer than a firmware, but not those that equal a value of the present one: in the firmware that
+	// the set is for, it would not be whole.
+	const param_t set_number = param_handle(px4::params::MIMO_SET_ID);
+	const float number = _settings[MIMO_SET_ID];
+
+	if (number > 0.0F && !of_this_firmware(number)) { param_reset(set_number); }
+
+	return wrong != nullptr || for_this_firmware(gains, number) ? wrong : param_name(set_number);
 }
 
 ExcitationSettings Parameters::excitation() const

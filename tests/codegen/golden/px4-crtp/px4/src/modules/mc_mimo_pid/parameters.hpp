@@ -13,7 +13,7 @@ class Parameters
 public:
 	// Reads all. Returns null, or the name of the first gain out of its range, because PX4 stores any value, or
 	// MIMO_SET_ID if the gains were stored for another firmware; `gains` is then of no use. What is fixed in the firmware
-	// stays so, and shows its default again.
+	// stays so, and shows its default again; so does MIMO_SET_ID if it is the number of another firmware.
 	const char *read(Gains &gains);
 
 	// The gains in the firmware.

@@ -42,7 +42,7 @@ McMimoPid::~McMimoPid() { perf_free(_cycle_perf); }
 bool McMimoPid::init()
 {
 	if (!_vehicle_angular_velocity_sub.registerCallback()) {
-		PX4_ERR("callback registration failed");
+		PX4_ERR("no gyro callback");
 		return false;
 	}
 
@@ -58,7 +58,7 @@ void McMimoPid::update_parameters()
 		_wrong_gain = "MIMO_SP_SLEW or MIMO_M_OMEGA";  // too large for the period
 	}
 
-	if (_wrong_gain != nullptr) { PX4_ERR("%s is wrong: no gain changed", _wrong_gain); }
+	if (_wrong_gain != nullptr) { PX4_ERR("%s is wrong, gains kept", _wrong_gain); }
 
 	_excitation.configure(_parameters.excitation());
 	read(_settings);
@@ -371,7 +371,7 @@ int McMimoPid::task_spawn(int argc, char *argv[])
 int McMimoPid::print_status()
 {
 	PX4_INFO("%s, %u bad inputs, %u bad sample times",
-		 _hand_over.flies() ? "in control" : "PX4's own controllers fly",
+		 _hand_over.flies() ? "in control" : "PX4 flies",
 		 static_cast<unsigned>(_output.fault_count), static_cast<unsigned>(_clock.faults()));
 
 	if (_output.fault != 0) { PX4_INFO("only damping rates: invalid inputs 0x%x", static_cast<unsigned>(_output.fault)); }
