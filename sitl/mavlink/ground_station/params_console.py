@@ -12,7 +12,14 @@ from mimopilot.common.files import write_atomically
 from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
-from mimopilot.sitl.mavlink.ground_station.profiles import UploadPlan, make_plan, module_parameters
+from mimopilot.sitl.mavlink.ground_station.profiles import (
+    ARDUPILOT_CUSTOM,
+    CUSTOM_BINDING,
+    MODULE_BINDING,
+    UploadPlan,
+    make_plan,
+    module_parameters,
+)
 from mimopilot.sitl.mavlink.ground_station.session import LinkOptions, open_session
 from mimopilot.sitl.mavlink.ground_station.transaction import read_binding
 from mimopilot.sitl.mavlink.wire.float32 import shortest
@@ -106,6 +113,9 @@ def export(
     else:
         with open_session(options, crazyflie=True) as vehicle:
             held = vehicle.read(module_parameters(profile or MIMO), profile or "")
+            numbers = CUSTOM_BINDING if profile == ARDUPILOT_CUSTOM else MODULE_BINDING  # older firmware has none
+            found = vehicle.run(vehicle.client.read(numbers, "reading"))
+        held |= {name: answer.value for name, answer in found.items() if answer.value is not None}
         text = parameter_text(form, held, vehicle.vehicle.system, vehicle.vehicle.component)
     if out is None:
         sys.stdout.write(text)

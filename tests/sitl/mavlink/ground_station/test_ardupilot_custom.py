@@ -121,7 +121,9 @@ def test_a_parameter_file_holds_what_an_upload_writes(mimopilot, certified, gain
         vehicle.values["CC3_SET_ID"] = vehicle.values["CC3_FW_ID"]  # as the file's comment says
         assert mimopilot(*arguments, "--connect", link.url).returncode == 0
         again = mimopilot("params", "--profile", PROFILE, "--connect", link.url, "--format", "mavproxy")
-    assert again.stdout.splitlines()[1:] == [line for line in text.splitlines()[1:] if line[0] != "#"]
+    *held, number, stored = again.stdout.splitlines()[1:]
+    assert held == [line for line in text.splitlines()[1:] if line[0] != "#"]
+    assert [number.split()[0], stored.split()[0]] == ["CC3_FW_ID", "CC3_SET_ID"]
     assert vehicle.writes == 0
 
 
