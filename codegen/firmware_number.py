@@ -9,21 +9,20 @@ import numpy as np
 from mimopilot.codegen.layout import to_array
 from mimopilot.codegen.targets import TEMPLATES
 from mimopilot.tuning.gains import Gains
-from mimopilot.tuning.parameter_row import Row
 from mimopilot.tuning.parameters import LARGEST_NUMBER, ROWS
 
 #: These and the parameter table define the C interface.
 INTERFACE = ("core/mimo_pid.hpp", "native/mimo_pid_native.h")
 
 
-def _members(row: Row) -> str:
-    return f"{row.member}{row.dimensions};"
+def _members() -> bytes:
+    """The members of the gains in C++, in their order in memory."""
+    return "".join(f"{row.member}{row.dimensions};" for row in ROWS).encode()
 
 
 def interface_hash() -> int:
     """First 32 bits of the SHA-256 of the C interface: two headers and the members of the gains."""
-    members = "".join(map(_members, ROWS)).encode()
-    digest = hashlib.sha256(b"".join((TEMPLATES / name).read_bytes() for name in INTERFACE) + members)
+    digest = hashlib.sha256(b"".join((TEMPLATES / name).read_bytes() for name in INTERFACE) + _members())
     return int.from_bytes(digest.digest()[:4], "big")
 
 
@@ -39,6 +38,5 @@ def firmware_number(gains: Gains) -> int:
     gains : Gains
     """
     scale = np.array(gains.moment_scale or (), np.float32)
-    members = "".join(map(_members, ROWS)).encode()
-    digest = hashlib.sha256(members + np.asarray(to_array(gains), np.float32).tobytes() + scale.tobytes())
+    digest = hashlib.sha256(_members() + np.asarray(to_array(gains), np.float32).tobytes() + scale.tobytes())
     return 1 + int.from_bytes(digest.digest()[:8], "big") % LARGEST_NUMBER

@@ -19,7 +19,7 @@ from mimopilot.sitl.mavlink.ground_station.profiles import (
 )
 from mimopilot.sitl.mavlink.ground_station.session import Session
 from mimopilot.sitl.mavlink.ground_station.stock_parameters import read_stock_parameters
-from mimopilot.sitl.mavlink.ground_station.transaction import Upload, read_binding
+from mimopilot.sitl.mavlink.ground_station.transaction import Upload, check_firmware, read_binding
 from mimopilot.sitl.mavlink.ground_station.upload import write_and_verify
 from mimopilot.sitl.mavlink.wire.parameter_files import parameter_text, read_parameters
 from mimopilot.tuning.gains_file import load_gains
@@ -111,12 +111,7 @@ def write_set(run: AutotuneRun, plan: UploadPlan) -> None:
             session.run(wait_until_disarmed(session.run(start_watch(session.client))))
     with run.vehicle(armed=False) as session:
         held = session.read([*plan.values, *plan.fixed], run.options.profile)
-        for name, value in plan.fixed.items():
-            if held[name] != value:
-                raise SitlError(
-                    f"{name}: the vehicle has {held[name]:.6g}, the values are for {value:.6g}; nothing was written",
-                    exit_code=1,
-                )
+        check_firmware(plan, held)
         outcome = session.run(write_and_verify(session.client, plan.values, held, lock=plan.lock))
         done = Upload(plan, held, session.vehicle, outcome, run.file(SNAPSHOT), run.options.connect)
     done.check()

@@ -149,7 +149,7 @@ bool AC_CustomControl_MIMO::update_parameters()
 
 	for (int32_t i = kLimited - 1; i >= 0; i--) {
 		if (published(i)) {
-			// A value that a parameter file of another build has stored would tell of another firmware.
+			// Read-only for ground stations: restore the built-in value if a parameter file has stored another one.
 			_values[i].set(programmed(i));
 
 		} else if (!accepted(i, _values[i].get())) {

@@ -13,9 +13,6 @@ from mimopilot.common.verbosity import warn
 from mimopilot.sitl.errors import SitlError
 from mimopilot.sitl.mavlink.ground_station.betaflight_lines import betaflight_lines
 from mimopilot.sitl.mavlink.ground_station.profiles import (
-    ARDUPILOT_CUSTOM,
-    CUSTOM_BINDING,
-    MODULE_BINDING,
     UploadPlan,
     make_plan,
     module_parameters,
@@ -112,9 +109,9 @@ def export(
         raise SitlError(f"--format {form}: needs a gains file; a vehicle cannot be written in this format")
     else:
         with open_session(options, crazyflie=True) as vehicle:
-            held = vehicle.read(module_parameters(profile or MIMO), profile or "")
-            numbers = CUSTOM_BINDING if profile == ARDUPILOT_CUSTOM else MODULE_BINDING  # older firmware has none
-            found = vehicle.run(vehicle.client.read(numbers, "reading"))
+            names, binding = module_parameters(profile or MIMO)
+            held = vehicle.read(names, profile or "")
+            found = vehicle.run(vehicle.client.read(binding, "reading"))  # older firmware does not have it
         held |= {name: answer.value for name, answer in found.items() if answer.value is not None}
         text = parameter_text(form, held, vehicle.vehicle.system, vehicle.vehicle.component)
     if out is None:

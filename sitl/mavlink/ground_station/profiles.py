@@ -265,8 +265,8 @@ def make_plan(gains: Gains, profile: str = "mimo") -> UploadPlan:
     return replace(plan, settings=tuple(replace(s, value=single(s.value)) for s in plan.settings), profile=profile)
 
 
-def module_parameters(profile: str) -> list[str]:
-    """Names of the writable parameters of our module, or of our custom controller.
+def module_parameters(profile: str) -> tuple[list[str], Binding]:
+    """Names of the writable parameters of our module, or of our custom controller, and what binds them to a firmware.
 
     Raises
     ------
@@ -275,13 +275,13 @@ def module_parameters(profile: str) -> list[str]:
     """
     names = [p.name for p in PARAMETERS if p.writable]
     if profile == ARDUPILOT_CUSTOM:
-        return [ardupilot_name(name) for name in names]
+        return [ardupilot_name(name) for name in names], CUSTOM_BINDING
     if profile != MIMO:
         raise SitlError(
             f"--profile {profile}: expected {MIMO} or {ARDUPILOT_CUSTOM} without a gains file; gains of a stock "
             "controller: mimopilot import-params"
         )
-    return names
+    return names, MODULE_BINDING
 
 
 #: Our vehicles' parameters by name. The other profiles are recognised by the prefix of their names.

@@ -239,7 +239,14 @@ def _read_scale(plan: UploadPlan, vehicle: Session) -> dict[str, float]:
         ) from error
 
 
-def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session, options: LinkOptions) -> None:
+def check_firmware(plan: UploadPlan, held: Mapping[str, float]) -> None:
+    """Refuse a vehicle whose firmware was built with other values of what is fixed in it.
+
+    Raises
+    ------
+    SitlError
+        With what differs, and what to do.
+    """
     for name, value in plan.fixed.items():
         if held[name] != value:
             if name.endswith(FIRMWARE_NUMBER.code):
@@ -251,6 +258,10 @@ def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session
                 f"{name}: the vehicle has {held[name]:.6g}, the gains are for {value:.6g}; generate its firmware "
                 "again, or tune for what it has"
             )
+
+
+def _check_vehicle(plan: UploadPlan, held: Mapping[str, float], vehicle: Session, options: LinkOptions) -> None:
+    check_firmware(plan, held)
     for name in plan.values:
         if not abs(held[name]) < float("inf"):
             raise SitlError(

@@ -101,8 +101,8 @@ const char *Parameters::read(Gains &gains)
 		const float value = parameter_value(kNames[i]);
 
 		if (i < kGainCount ? fixed(i) : i >= kGainCount + kSettingCount) {
-			// Only published. A value that a parameter file has stored would tell of another firmware. (PX4's
-			// param_value_is_default() takes any smaller value for the default.)
+			// Read-only for ground stations: restore the built-in value if a parameter file has stored another one.
+			// PX4's param_value_is_default() cannot tell: it takes any smaller value for the default.
 			float programmed;
 			param_get_default_value(handle, &programmed);
 
